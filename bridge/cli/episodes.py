@@ -28,6 +28,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         episode: An episode file, recorded or derived.
         output: How to talk.
     """
+    from bridge.episode.contract import PRESENCE_RECORD, presence_lines
     from bridge.episode.reader import Episode
 
     opened = Episode.open(episode)
@@ -43,6 +44,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "parts": [str(path) for path in opened.parts],
         "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
+        "presence": opened.metadata_records.get(PRESENCE_RECORD),
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -66,12 +68,27 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         )
     if opened.missing_parts:
         lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
+    presence = opened.metadata_records.get(PRESENCE_RECORD, {})
+    lines += [f"  {text}" for text in presence_lines(presence)]
     width = max((len(topic) for topic in topics), default=0)
+    seen = presence.get("topics")
+    shown = seen if isinstance(seen, dict) else {}
     lines += [
-        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}" for item in topics.values()
+        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}{_when(shown.get(item.topic))}"
+        for item in topics.values()
     ]
     output.result(data, "\n".join(lines))
     return 0
+
+
+def _when(report: object) -> str:
+    """From when to when a topic was there, its longest silence, and how many were expected."""
+    if not isinstance(report, dict) or not isinstance(report.get("first_s"), int | float):
+        return ""
+    text = f"  {report['first_s']:.1f} to {report['last_s']:.1f} s"
+    if report.get("longest_silence_s"):
+        text += f", silent up to {report['longest_silence_s']:.2f} s"
+    return text + (f", {report['expected']} expected" if report.get("expected") else "")
 
 
 def _outcome(kind: str, outcome: "Outcome | None") -> str:
@@ -82,17 +99,27 @@ def _outcome(kind: str, outcome: "Outcome | None") -> str:
     return f"{outcome.result} ({outcome.detail})" if unknown else outcome.result
 
 
-def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTPUT) -> int:
-    """Verify episodes (CRCs, indexes, counts, decoding) and list dropped messages.
+def check(
+    episodes: list[Path],
+    /,
+    *,
+    rerun: bool = False,
+    contract: str | None = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Verify episodes (CRCs, indexes, counts, decoding); list dropped messages and silent topics.
 
-    Exit code 0: clean, 3: messages were dropped, 1: broken. Example: robot-gst check runs/demo
+    Exit code 0: clean, 3: messages were dropped or a contract was broken, 1: broken.
+    Example: robot-gst check runs/demo
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
         rerun: Let Rerun's own checker read each file too.
+        contract: Hold them to this TOML file or template, not to what they were recorded under.
         output: How to talk.
     """
     from bridge.episode.check import check_all
+    from bridge.episode.contract import find_contract
     from bridge.errors import UsageError
 
     files: list[Path] = []
@@ -113,7 +140,8 @@ def check(episodes: list[Path], /, *, rerun: bool = False, output: Output = OUTP
         raise UsageError(f"no episodes in {listed}. Record some: robot-gst record RUN.")
     reports = []
     with output.progress("check", len(files)) as advance:
-        for report in check_all(files, rerun=rerun):
+        asked = None if contract is None else find_contract(Path(), contract)
+        for report in check_all(files, rerun=rerun, contract=asked):
             reports.append(report)
             advance(min(len(reports), len(files)), report.path.name)
     data = {
@@ -302,6 +330,8 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:
         notes.append(f"unknown: {_shown(entry.cause)}")
+    if entry.presence:
+        notes.append(_shown(entry.presence, 400))
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
 
 

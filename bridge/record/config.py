@@ -71,6 +71,9 @@ class RecorderConfig:
     """Name of this recorder in its control keys ``rec/NAME/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
+    contract: str | None = None
+    """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
+    ``cell.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
     jpeg_quality: int = 90

@@ -48,9 +48,11 @@ class RecorderClient:
             raise WireError(f"{key} answered {answer!r:.80}, expected a JSON object.")
         return answer
 
-    def start(self, episode_id: str, info: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Begin an episode."""
-        return self.ask("start", {"id": episode_id, "info": info or {}})
+    def start(
+        self, episode_id: str, info: dict[str, Any] | None = None, *, anyway: bool = False
+    ) -> dict[str, Any]:
+        """Begin an episode; ``anyway`` also when required topics are missing."""
+        return self.ask("start", {"id": episode_id, "info": info or {}, "anyway": anyway})
 
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
@@ -73,8 +75,9 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     """Answer the control keys until the session closes."""
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "start", {"id", "info"})
-        return recorder.start(parse_info(request.get("id"), request.get("info", {})))
+        _only(request, "start", {"id", "info", "anyway"})
+        info = parse_info(request.get("id"), request.get("info", {}))
+        return recorder.start(info, anyway=request.get("anyway") is True)
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})

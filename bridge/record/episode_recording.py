@@ -11,6 +11,16 @@ from typing import Any
 
 from bridge.clock import ns_from_s
 from bridge.episode import metadata, schema
+from bridge.episode.contract import (
+    PRESENCE_RECORD,
+    RECORD_NAME,
+    Contract,
+    Span,
+    TopicReport,
+    breaches_of,
+    judge,
+    unknown_tails,
+)
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import part_name
 from bridge.episode.topics import DROPS, EVENT, cell_topic
@@ -138,8 +148,22 @@ def _from_ros(type_name: str, type_hash: str, folder: Path | None) -> schema.Sch
 class EpisodeFiles:
     """Opens one part after the other; a full one is finished on a thread of its own."""
 
-    def __init__(self, folder: Path, info: EpisodeInfo, config: DiskConfig, now_ns: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        info: EpisodeInfo,
+        config: DiskConfig,
+        now_ns: int,
+        contract: Contract | None,
+    ) -> None:
         """Create the first part.
+
+        Args:
+            folder: Where episodes lie.
+            info: What is being recorded.
+            config: How it lies on the disk.
+            now_ns: When the first part begins [ns].
+            contract: What the topics promise; each part holds it.
 
         Raises:
             UsageError: When the episode exists, or is being written.
@@ -147,6 +171,7 @@ class EpisodeFiles:
         """
         self._folder = folder
         self._info = info
+        self._contract = contract
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
         self._config = WriterConfig(flush_s=config.flush_s, sync_s=config.sync_s)
@@ -173,6 +198,8 @@ class EpisodeFiles:
         writer = EpisodeWriter(path, config=self._config)
         try:
             writer.describe(self._info)
+            if self._contract is not None:
+                writer.add_metadata(RECORD_NAME, self._contract.to_record())
         except OSError as error:
             writer.discard()
             raise BridgeError(
@@ -279,6 +306,7 @@ class EpisodeRecording:
         start_ns: int,
         latched: Callable[[], list[WireSample]],
         others: Mapping[str, Callable[[], object]],
+        contract: Contract | None = None,
     ) -> None:
         """Create the episode file and say in it who and what it is.
 
@@ -289,6 +317,7 @@ class EpisodeRecording:
             start_ns: When it begins [ns].
             latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
+            contract: What the topics promise.
 
         Raises:
             UsageError: When the episode exists already.
@@ -298,6 +327,9 @@ class EpisodeRecording:
         self.ledger = Ledger(config.queues.max_topics)
         self.start_ns = start_ns
         self.outcome: metadata.Outcome | None = None
+        self.presence: dict[str, TopicReport] = {}
+        """By topic, when it was there; known at the end."""
+        self._contract = contract
         self._config = config
         self._latched = latched
         self._others = others
@@ -308,7 +340,7 @@ class EpisodeRecording:
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
-        self._parts = EpisodeFiles(folder, info, config.disk, start_ns)
+        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract)
         try:
             self._repeat_latched(start_ns)
         except OSError as error:
@@ -438,7 +470,9 @@ class EpisodeRecording:
     def resume(self, command: Command) -> None:
         """Record and count again what comes after this command."""
         self.ledger.resume(command.ticket)
-        self._paused_ns[-1].append(command.received_ns)
+        span = self._paused_ns[-1]
+        span.append(command.received_ns)
+        self.ledger.pauses.append((span[0], span[1]))
         self.write_event("resumed", stamp_ns=command.received_ns)
 
     def refuse(self, entries: Iterable[Item | Dropped]) -> None:
@@ -472,6 +506,8 @@ class EpisodeRecording:
         if outcome is not None:
             writer.add_metadata("outcome", metadata.to_strings(outcome))
         writer.add_metadata("drops", self.ledger.to_metadata())
+        paused = [(span[0], span[1] if len(span) > 1 else end_ns) for span in self._paused_ns]
+        self._judge_presence(Span(self.start_ns, end_ns, paused))
         recorder = {
             "settings": asdict(self._config),
             "start_ns": self.start_ns,
@@ -479,12 +515,27 @@ class EpisodeRecording:
             "stopped_by": reason,
             "latched_messages_repeated": self._num_latched,
             "clock_steps_ns": self._clock_steps_ns,
-            "paused": [[*span, end_ns][:2] for span in self._paused_ns],
+            "paused": paused,
             "parts": self.num_parts,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}
         writer.add_metadata("recorder", values)
+
+    def _judge_presence(self, span: Span) -> None:
+        totals = self.ledger.totals()
+        lost = {topic: tally.lost for topic, tally in totals.items()}
+        self.presence = judge(
+            self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
+        )
+        record = {
+            "topics": {topic: asdict(report) for topic, report in self.presence.items()},
+            "breaches": breaches_of(self.presence),
+            "unknown_tails": unknown_tails(self.presence),
+            "unnumbered": self.ledger.unnumbered(),
+        }
+        values = {name: json.dumps(value) for name, value in record.items()}
+        self._parts.writer.add_metadata(PRESENCE_RECORD, values)
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""

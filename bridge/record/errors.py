@@ -4,6 +4,15 @@ from pathlib import Path
 
 from bridge.errors import BridgeError, UsageError
 
+MAX_NAMED = 4
+"""Topics that a sentence names."""
+
+
+def in_short(words: list[str]) -> str:
+    """Join a few of several sentences about topics, and say how many there are besides."""
+    more = f"; and {len(words) - MAX_NAMED} more" if len(words) > MAX_NAMED else ""
+    return "; ".join(words[:MAX_NAMED]) + more
+
 
 class LifecycleError(UsageError):
     """A control command does not fit the state the recorder is in."""
@@ -11,6 +20,18 @@ class LifecycleError(UsageError):
 
 class ControlError(UsageError):
     """A control command is malformed."""
+
+
+class MissingTopicsError(LifecycleError):
+    """An episode was not started: the contract of the cell requires topics that are not there."""
+
+    def __init__(self, *, episode: str, missing: list[str]) -> None:
+        """Remember what is not there."""
+        self.missing = missing
+        super().__init__(
+            f"{episode} was not started: {in_short(missing)}. The contract requires it. "
+            "Start its publisher, or start with --anyway."
+        )
 
 
 class NoSpaceError(BridgeError):

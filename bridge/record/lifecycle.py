@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
+from bridge.episode.contract import Contract, breaches_of, unknown_tails
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
@@ -175,6 +176,8 @@ class Lifecycle:
         self.latched = LatchedMessages(latched)
         self.others: dict[str, Callable[[], object]] = {}
         """What others have to say of each episode, by name."""
+        self.contract: Contract | None = None
+        """What the topics of the next episode promise."""
         self.ring = PreRoll(
             seconds=config.preroll_s,
             max_bytes=config.preroll_mb * BYTES_PER_MB,
@@ -312,6 +315,7 @@ class Lifecycle:
             start_ns=min([*first_ns, command.received_ns]),
             latched=self.latched.all,
             others=self.others,
+            contract=self.contract,
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take
@@ -430,4 +434,7 @@ def counts(take: EpisodeRecording) -> Answer:
         "unknown_type": total.unknown_type,
         "shed": total.shed,
         "parts": take.num_parts,
+        "unnumbered": take.ledger.unnumbered(),
+        "breaches": breaches_of(take.presence),
+        "unknown_tails": unknown_tails(take.presence),
     }

@@ -30,6 +30,7 @@ from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
@@ -151,6 +152,7 @@ class PublisherLiveliness:
     def __init__(self, session: WireSession, recorder: Recorder) -> None:
         """Begin to watch."""
         self._recorder = recorder
+        self._presence: PresenceMonitor = recorder.presence
         self._lock = threading.Lock()
         self._tokens: dict[str, str] = {}
         self._watching: list[Subscriber] = [
@@ -164,8 +166,12 @@ class PublisherLiveliness:
             subscriber.close()
 
     def _on_source(self, key: str, alive: bool) -> None:
-        if not alive and not key.startswith("rec/"):
-            self._recorder.forget(f"/{key.removesuffix(ALIVE)}/")
+        if key.startswith("rec/"):
+            return
+        prefix = f"/{key.removesuffix(ALIVE)}/"
+        self._presence.publisher(prefix, is_there=alive)
+        if not alive:
+            self._recorder.forget(prefix)
 
     def _on_ros(self, key: str, alive: bool) -> None:
         endpoint = rmw.parse_token(key)
@@ -174,10 +180,12 @@ class PublisherLiveliness:
         with self._lock:
             if alive:
                 self._tokens[key] = endpoint.topic
+                self._presence.publisher(endpoint.topic, is_there=True)
                 return
             was_there = self._tokens.pop(key, None) is not None
             is_last = endpoint.topic not in self._tokens.values()
         if was_there and is_last:
+            self._presence.publisher(endpoint.topic, is_there=False)
             self._recorder.forget(endpoint.topic)
 
 
@@ -226,6 +234,10 @@ class LiveRecorder:
         self._departures = PublisherLiveliness(session, core)
         self._graph = watch_ros2(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
+        core.also_tell("receive_errors", lambda: session.receive_errors)
+        core.also_tell("last_receive_error", lambda: session.last_receive_error)
+        self._links = session.watch_links(self._on_link)
+        self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -241,8 +253,16 @@ class LiveRecorder:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
 
+    def _on_link(self, is_open: bool) -> None:
+        if not is_open:
+            self.core.presence.link_closed()
+
     def _tell(self) -> None:
-        while not self._ended.wait(STATUS_PERIOD_S):
+        while True:
+            self.core.news_arrived.wait(STATUS_PERIOD_S)
+            self.core.news_arrived.clear()
+            if self._ended.is_set():
+                return
             with contextlib.suppress(WireError):  # the session is closing
                 self.core.input_queue.watched = self._previews.look(
                     self.core.input_queue.image_topics()
@@ -268,14 +288,19 @@ class LiveRecorder:
             data = json.dumps({**about, **entry}).encode()
             self._episodes.put(data, source_ns=self.session.now_ns())
 
-    def start(self, episode_id: str, **about: Any) -> dict[str, Any]:
-        """Begin an episode; ``about`` are fields of ``EpisodeInfo``: task, operator, tags ...
+    def start(self, episode_id: str, *, anyway: bool = False, **about: Any) -> dict[str, Any]:
+        """Begin an episode.
+
+        Args:
+            episode_id: Its name.
+            anyway: Warn of topics that are required and missing, instead of refusing.
+            about: Fields of ``EpisodeInfo``: task, operator, tags ...
 
         Raises:
             UsageError: When the id or a field is wrong, or another episode is open.
             BridgeError: When the disk has no space.
         """
-        return self.core.start(parse_info(episode_id, about))
+        return self.core.start(parse_info(episode_id, about), anyway=anyway)
 
     def stop(
         self, *, result: str | None = None, detail: str | None = None, discard: bool = False
@@ -312,6 +337,8 @@ class LiveRecorder:
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
         self._ended.set()
+        self.core.news_arrived.set()
+        self._heartbeat.close()
         if self.core.error is not None:  # whoever listens hears why, before the next second
             with contextlib.suppress(WireError):
                 self._say_status()
@@ -320,6 +347,8 @@ class LiveRecorder:
         for subscriber in self._subscribers:
             subscriber.close()
         self._departures.close()
+        if self._links is not None:
+            self._links.close()
         self._graph.close()
         self._thread.join(timeout=STATUS_PERIOD_S)
         return self.core.close()

@@ -8,6 +8,7 @@ import contextlib
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, replace
@@ -16,12 +17,14 @@ from pathlib import Path
 from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
+from bridge.episode.contract import find_contract
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.errors import DiskError, LifecycleError
+from bridge.record.errors import DiskError, LifecycleError, MissingTopicsError
 from bridge.record.lifecycle import Answer, Lifecycle
+from bridge.record.presence import News, PresenceMonitor
 from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
 from bridge.record.status import Status
 from bridge.wire.session import WireSample
@@ -31,6 +34,7 @@ POLL_S = 0.02
 IDLE_POLL_S = 0.1
 BARRIER_POLL_S = 0.002
 SECOND_S = 1.0
+MAX_NEWS = 1000
 LAST_IMAGES_S = 2.0
 """How long a failed disk waits for images in the encoders, to count them."""
 
@@ -55,6 +59,9 @@ class Recorder:
             config: Settings.
             preview: Called with images of which somebody wants a preview.
             wall_ns: The system clock, watched for steps.
+
+        Raises:
+            ContractError: When the contract of the cell cannot be used.
         """
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
@@ -67,7 +74,15 @@ class Recorder:
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
-        self._status = Status(run, self.config, self.input_queue, self._life, now_ns)
+        self.presence = PresenceMonitor(self.input_queue.seen, tell=self._note)
+        self.news: deque[str] = deque(maxlen=MAX_NEWS)
+        """What a person should hear of at once, for one reader who takes it out."""
+        self.news_arrived = threading.Event()
+        """Set with each piece of news; for one waiter, who clears it."""
+        self.read_contract()
+        self._status = Status(
+            run, self.config, self.input_queue, self._life, now_ns, self.presence.status
+        )
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
         self._tell: Callable[[Path], None] = lambda path: None
         self._next_second_s = 0.0
@@ -98,15 +113,60 @@ class Recorder:
     def _take_back(self, item: Item, saved: int) -> None:
         self.input_queue.put_image(item, saved)
 
-    def start(self, info: metadata.EpisodeInfo) -> Answer:
+    def read_contract(self) -> None:
+        """Read the contract of the cell anew; it may have been learned or edited.
+
+        Raises:
+            ContractError: When it cannot be used.
+        """
+        contract = find_contract(self._run.path, self.config.contract)
+        self._life.contract = self.presence.contract = contract
+
+    def start(self, info: metadata.EpisodeInfo, *, anyway: bool = False) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
+
+        Args:
+            info: What is being recorded.
+            anyway: Warn of topics that are required and missing, instead of refusing.
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
+            MissingTopicsError: When the contract requires topics that are not there.
             BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
-        return self._command(lambda command: self._life.start(info, command))
+        self.read_contract()
+        missing = self.presence.missing(self._life.contract)
+        if missing and not anyway:
+            raise MissingTopicsError(episode=info.id, missing=missing)
+
+        def act(command: Command) -> Answer:
+            answer = self._life.start(info, command)
+            if missing and self._life.take is not None:
+                self._life.take.ledger.warn(f"started without what is required: {missing}")
+            self.presence.begin(by_habit=not info.stand_in)
+            return answer
+
+        answer = self._command(act)
+        return {**answer, "missing": missing} if missing else answer
+
+    def _note(self, news: News) -> None:
+        """Tell people of something, and write it into the open episode."""
+        self.news.append(news.text)
+        self.news_arrived.set()
+
+        def act(command: Command) -> None:
+            take = self._life.take
+            if take is not None and not self._life.is_finishing:
+                stamp_ns = command.received_ns
+                take.write_event("note", stamp_ns=stamp_ns, text=news.text, data=news.data)
+
+        command = Command(
+            action=lambda command: self._guard(lambda: act(command)),
+            received_ns=self._now_ns(),
+            is_barrier=False,
+        )
+        self.input_queue.put_command(command)
 
     def stop(
         self,
@@ -116,9 +176,12 @@ class Recorder:
         reason: str = "command",
     ) -> Answer:
         """Finish the episode, or throw it away, after everything received so far."""
-        answer = self._command(
-            lambda command: self._life.stop(outcome, command, discard=discard, reason=reason)
-        )
+
+        def act(command: Command) -> Answer:
+            self.presence.end()
+            return self._life.stop(outcome, command, discard=discard, reason=reason)
+
+        answer = self._command(act)
         if not discard:
             self._enter(answer["episode"])
         return answer
@@ -136,11 +199,16 @@ class Recorder:
 
     def pause(self) -> Answer:
         """Leave messages out until ``resume``; what is latched is recorded all the same."""
-        return self._command(self._life.pause)
+        answer = self._command(self._life.pause)
+        self.presence.end()
+        return answer
 
     def resume(self) -> Answer:
         """Record again."""
-        return self._command(self._life.resume)
+        answer = self._command(self._life.resume)
+        take = self._life.take
+        self.presence.begin(by_habit=take is None or not take.info.stand_in)
+        return answer
 
     def snapshot(self, info: metadata.EpisodeInfo) -> Answer:
         """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""

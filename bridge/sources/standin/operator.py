@@ -492,7 +492,8 @@ class Operator:
         record = {key: value for key, value in asdict(info).items() if value is not None}
         record["tags"] = list(info.tags)
         del record["id"]
-        self._control("start", {"id": info.id, "info": record})
+        # A simulated cell publishes nothing before its episode begins: nothing can be missing yet.
+        self._control("start", {"id": info.id, "info": record, "anyway": True})
         self._open = True
         self._cell.announce()
 
