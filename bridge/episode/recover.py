@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from bridge.episode.chunk_queue import JOURNAL, journal_path
 from bridge.episode.mcap.damaged import RecordFile, finished_data_end
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
@@ -22,6 +23,7 @@ from bridge.episode.salvage import (
     InPlaceTarget,
     NeedsCopyError,
     RecoveryTally,
+    scan_with_journal,
     to_metadata,
 )
 from bridge.episode.salvage import RecoveryReport as RecoveryReport
@@ -67,15 +69,36 @@ def recover(path: Path, *, in_place: bool | None = None) -> RecoveryReport:
         source = RecordFile(descriptor)
         finished = _report_finished(path, source)
         if finished is not None:
+            _drop_journal(path, finished)
             return finished
         if in_place is None:
             has_room = shutil.disk_usage(path.parent).free >= source.size + SPARE_BYTES
             if not has_room and not is_part:
                 raise _no_room(path, source.size)
             in_place = not has_room
-        if in_place:
-            return _recover_in_place(path, source)
-        return _recover_copy(path, source)
+        with _journal_of(path) as journal:
+            if in_place:
+                report = _recover_in_place(path, source, journal)
+            else:
+                report = _recover_copy(path, source, journal)
+        _drop_journal(path, report)
+        return report
+
+
+@contextmanager
+def _journal_of(path: Path) -> Iterator[RecordFile | None]:
+    """Open the journal of a part, if there is one."""
+    if not path.name.endswith(PART) or not journal_path(path).is_file():
+        yield None
+        return
+    with journal_path(path).open("rb") as stream:
+        yield RecordFile(stream.fileno())
+
+
+def _drop_journal(path: Path, report: RecoveryReport) -> None:
+    """Remove the journal of a part that is finished: everything in it is there."""
+    if report.output is not None and path.name.endswith(PART):
+        journal_path(path).unlink(missing_ok=True)
 
 
 def recover_parts(run: RunFolder) -> list[RecoveryReport]:
@@ -96,6 +119,9 @@ def recover_parts(run: RunFolder) -> list[RecoveryReport]:
             if report.output is None:
                 _set_aside(path)
         reports.append(report)
+    for journal in run.episodes_dir.glob(f"*{SUFFIX}{JOURNAL}"):
+        if journal.with_suffix("").exists():  # killed between the last two steps of an end
+            journal.unlink(missing_ok=True)
     return reports
 
 
@@ -134,13 +160,13 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     return tally.report(path, output, finished=True)
 
 
-def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
+def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
     temporary = path.with_name(_final_name(path) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
     target: CopyTarget | None = None
     try:
-        for found in scan(source):
+        for found in scan_with_journal(source, journal):
             tally.take(found)
             if tally.has_data and target is None:
                 target = CopyTarget(source, temporary)
@@ -162,11 +188,11 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
         temporary.unlink(missing_ok=True)
 
 
-def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
+def _recover_in_place(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
     tally = RecoveryTally()
     target = InPlaceTarget(source, PartFile(path, source.descriptor))
     try:
-        for found in scan(source):
+        for found in scan_with_journal(source, journal):
             tally.take(found)
             target.take(found)
     except NeedsCopyError as error:

@@ -5,7 +5,8 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 """
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from bridge.episode import provenance
@@ -24,6 +25,7 @@ from bridge.episode.mcap.scan import (
     IndexSpan,
     Plain,
     TopMessage,
+    scan,
 )
 from bridge.episode.metadata import from_strings
 
@@ -201,6 +203,32 @@ def unknown_topic(channel_id: int) -> str:
 
 CHUNK_BYTES = 1 << 20
 LIBRARY = "robot-gst recover"
+
+
+def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
+    """What tells a chunk from every other: CRC and size of its records."""
+    return found.head.crc, found.head.uncompressed_size
+
+
+def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
+    """Return what a part holds, then the chunks that only its journal holds.
+
+    A chunk torn at the end of the part is left out where the journal has it whole.
+    """
+    if journal is None:
+        yield from scan(source)
+        return
+    kept = {key_of(found) for found in scan(journal) if isinstance(found, Chunk)}
+    there: set[tuple[int, int]] = set()
+    for found in scan(source):
+        if isinstance(found, Chunk):
+            there.add(key_of(found))
+        if not (isinstance(found, CutChunk) and key_of(found) in kept):
+            yield found
+    for found in scan(journal):
+        if isinstance(found, Chunk) and key_of(found) not in there:
+            there.add(key_of(found))
+            yield replace(found, is_journalled=True)
 
 
 class CopyTarget:
@@ -381,6 +409,7 @@ class InPlaceTarget:
         self._end = 0
         self._chunk: Chunk | None = None
         self._indexes: list[IndexSpan] = []
+        self._journalled: list[EncodedChunk] = []
         self._cut: CutChunk | None = None
 
     def take(self, found: Found) -> None:
@@ -401,6 +430,9 @@ class InPlaceTarget:
                 self._cut = found
             case CutChunk() | DataEnd():
                 pass
+            case Chunk() if found.is_journalled:
+                self._define(found.contents)
+                self._journalled.append(verbatim(replace(found, raw=memoryview(bytes(found.raw)))))
             case _:
                 self._close_chunk()
                 self._take_whole(found)
@@ -489,6 +521,8 @@ class InPlaceTarget:
             )
         elif self._chunk is not None:
             self.section.add_indexes(verbatim(self._chunk), self._chunk.offset)
+        for encoded in self._journalled:
+            self.section.add_chunk(encoded)
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
         file.sync_data()

@@ -10,6 +10,7 @@ from bridge.errors import refuse_outside
 
 BYTES_PER_MB = 1_000_000
 UNBOUNDED = float("inf")
+MAX_BACKLOG_BYTES = 16_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,12 @@ class DiskConfig:
         refuse_outside(self, dict.fromkeys(("min_free_mb", "footer_mb"), (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
+
+    @property
+    def backlog_bytes(self) -> int:
+        """What may wait for a slow disk; the reserve must take it when the disk is full."""
+        held = self.footer_mb * BYTES_PER_MB // 4
+        return min(MAX_BACKLOG_BYTES, held) if held else MAX_BACKLOG_BYTES
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -174,7 +174,9 @@ class EpisodeFiles:
         self._contract = contract
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
-        self._config = WriterConfig(flush_s=config.flush_s, sync_s=config.sync_s)
+        self._config = WriterConfig(
+            flush_s=config.flush_s, sync_s=config.sync_s, backlog_bytes=config.backlog_bytes
+        )
         self._full: list[EpisodeWriter] = []
         self._finisher: threading.Thread | None = None
         self._error: OSError | None = None
@@ -358,6 +360,17 @@ class EpisodeRecording:
     def path(self) -> Path:
         """The episode's file when it is finished; its first one if it is split."""
         return self._parts.first_path
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether little enough waits for the disk to give it more images."""
+        return self._parts.writer.backlog_bytes < self._config.disk.backlog_bytes
+
+    @property
+    def disk(self) -> dict[str, float]:
+        """How far the disk is behind, for the status."""
+        writer = self._parts.writer
+        return {"write_lag_s": writer.lag_s, "busy_s": writer.busy_s}
 
     @property
     def num_parts(self) -> int:

@@ -196,6 +196,11 @@ class Lifecycle:
         return (self.take is None or self.is_paused) and not self.ring.is_on
 
     @property
+    def keeps_up(self) -> bool:
+        """Whether the disk may be given images; small messages it is given at any time."""
+        return self.take is None or self.take.keeps_up
+
+    @property
     def state(self) -> str:
         """One word."""
         if self.error is not None:

@@ -70,7 +70,7 @@ class Recorder:
         encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
         self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
-        self._merge = Merge()
+        self._merge = Merge(lambda: self._life.keeps_up)
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )

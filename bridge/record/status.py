@@ -67,7 +67,8 @@ class Status:
         life = self._life
         take = life.take  # the writer thread may put another one there at any time
         error = str(life.error) if life.error else self.failing or None
-        stalled_s = time.monotonic() - self._beat_s
+        disk = take.disk if take else {"write_lag_s": 0.0, "busy_s": 0.0}
+        stalled_s = max(time.monotonic() - self._beat_s, disk["busy_s"])
         answer: dict[str, Any] = {
             "ok": error is None,
             "recorder": self._config.recorder,
@@ -79,6 +80,7 @@ class Status:
             "queue_bytes": self._input_queue.queued_bytes,
             "disk_free_bytes": life.free_bytes,
             "shedding": self._input_queue.shed.name.lower(),
+            "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
             "preroll_s": round(life.ring.seconds(self._now_ns()), 1),

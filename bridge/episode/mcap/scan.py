@@ -57,6 +57,8 @@ class Chunk(Span):
     """The whole record, until the walk goes on."""
     head: ChunkHead
     contents: Contents
+    is_journalled: bool = False
+    """It lies in the journal beside the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
