@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.chunk_queue import JOURNAL, journal_path
-from bridge.episode.mcap.damaged import RecordFile, finished_data_end
+from bridge.episode.mcap.damaged import RecordFile, finished_data
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
 from bridge.episode.run_folder import RunFolder
@@ -148,16 +149,25 @@ def _locked(path: Path, *, write: bool) -> Iterator[int]:
 
 def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     """Rename a file that is whole; None when it is not."""
-    data_end = finished_data_end(source)
-    if data_end is None:
+    data = finished_data(source)
+    if data is None:
+        return None
+    if not data.is_proved and _has_faults(path):  # then its indexes may be wrong all the same
         return None
     tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
-    if tally.losses or tally.reached_end != data_end:
+    if tally.losses or tally.reached_end != data.end:
         return None
     output = _publish(path) if path.name.endswith(PART) else path
     return tally.report(path, output, finished=True)
+
+
+def _has_faults(path: Path) -> bool:
+    faults = Faults()
+    for _ in FileCheck(path, faults).messages():
+        pass
+    return bool(faults.count)
 
 
 def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
@@ -172,6 +182,8 @@ def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) ->
                 target = CopyTarget(source, temporary)
             if target is not None:
                 target.take(found)
+        if target is not None:
+            tally.name(target.looked_up)
         report = tally.report(path, None, finished=False)
         if target is None:
             return report
@@ -213,7 +225,7 @@ def _recover_in_place(path: Path, source: RecordFile, journal: RecordFile | None
 def _prove(path: Path) -> None:
     """Read the copy back; its CRC covers every byte that was found whole before."""
     with path.open("rb") as stream:
-        if finished_data_end(RecordFile(stream.fileno())) is None:
+        if finished_data(RecordFile(stream.fileno())) is None:
             message = f"{path} does not hold what was written to it. Check the disk."
             raise RecoveryError(message)
 

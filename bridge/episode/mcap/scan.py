@@ -251,12 +251,13 @@ def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSp
     cursor = Cursor(file.read(offset, min(length, BLOCK_BYTES)), mcap.RECORD_HEAD.size)
     log_time_ns, create_time_ns = cursor.number(8), cursor.number(8)
     name, media_type, data_size = cursor.text(), cursor.text(), cursor.number(8)
-    if cursor.position + data_size + 4 != length:
+    end = cursor.position + data_size
+    if end + 4 > length:  # later versions of the format may add fields behind the CRC
         message = "the lengths of an attachment contradict each other"
         raise DamagedRecordError(message)
-    (crc,) = struct.unpack("<I", file.read(offset + length - 4, 4))
+    (crc,) = struct.unpack("<I", file.read(offset + end, 4))
     body = mcap.RECORD_HEAD.size
-    if crc and crc != file.crc(offset + body, length - body - 4):
+    if crc and crc != file.crc(offset + body, end - body):
         message = f"the CRC of the attachment {name!r} is wrong"
         raise DamagedRecordError(message)
     return AttachmentSpan(
