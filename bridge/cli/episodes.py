@@ -186,7 +186,8 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     Example: robot-gst recover runs/monday
 
     Args:
-        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
+        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``; of a run and its
+            --failover folder the halves of an episode are joined.
         in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
@@ -206,11 +207,11 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
             if len(files) == 1:
                 raise
             reports.append(recovery.RecoveryReport(path=path, output=None, reason=str(error)))
-    text = (
-        "\n".join(_describe(report) for report in reports)
-        or "nothing to recover: every file is finished"
-    )
-    output.result({"files": [asdict(report) for report in reports]}, text)
+    joined = recovery.join_failovers([path for path in paths if path.is_dir()])
+    lines = [_describe(report) for report in reports]
+    lines += [f"{path.name}: joined with the parts before it, now {path}" for path in joined]
+    text = "\n".join(lines) or "nothing to recover: every file is finished"
+    output.result({"files": [asdict(report) for report in reports], "joined": joined}, text)
     return 1 if any(report.output is None for report in reports) else 0
 
 

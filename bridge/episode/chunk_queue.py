@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk
@@ -43,6 +44,12 @@ class _Small:
     """When its first message came."""
     closed_s: float
     is_in_journal: bool = False
+
+
+class _Waiting(NamedTuple):
+    chunk: EncodedChunk
+    since_s: float | None
+    """Of small messages: when the first one came."""
 
 
 def _size(chunk: EncodedChunk) -> int:
@@ -135,6 +142,8 @@ class ChunkQueue:
         Raises:
             OSError: When the disk refuses; what waits is kept.
         """
+        if not self._waiting() or self._waiting() + num_bytes <= limit:
+            return
         self.raise_error()
         with self._changed:
             self._changed.wait_for(
@@ -264,6 +273,17 @@ class ChunkQueue:
             with self._changed:
                 for small in waiting:
                     small.is_in_journal = True
+
+    def give_up(self) -> "list[_Waiting]":
+        """End, and return what is in no file yet, for another disk."""
+        self.end()
+        waiting = [_Waiting(small.chunk, small.since_s) for small in self._small]
+        return waiting + [_Waiting(chunk, None) for chunk in self._bulk]
+
+    def add_all(self, waiting: "list[_Waiting]") -> None:
+        """Take what another queue gave up."""
+        for each in waiting:
+            self.add(each.chunk, is_small=each.since_s is not None, since_s=each.since_s or 0.0)
 
     def end(self) -> None:
         """End the threads after the write under way; what still waits is given up."""

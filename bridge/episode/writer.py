@@ -70,6 +70,12 @@ class Channels:
         self._channels: dict[tuple[str, str, int], Channel] = {}
         self._known: dict[tuple[str, int, str], tuple[Channel, schema.Schema | None]] = {}
 
+    def move_to(self, summary: Summary) -> None:
+        """Tell another summary from now on, and at once what there is already."""
+        summary.schemas.update(self._summary.schemas)
+        summary.channels.update(self._summary.channels)
+        self._summary = summary
+
     def find(self, topic: str, record: schema.Schema | None, message_encoding: str) -> Channel:
         """Return the channel of a topic.
 
@@ -184,10 +190,11 @@ class EpisodeWriter:
     after the other; the caller must not change its buffers afterwards.
 
     Every call may raise OSError for a disk that is full or broken, also on behalf of an earlier
-    call. The message of the failed call is not taken, everything before is kept: in the file up
-    to its last whole record, and in memory. When there is space again, calls and ``close`` succeed
-    and nothing is lost. After a failed background sync nothing succeeds any more, for the disk may
-    hold holes: ``abandon`` and ``recover`` what is there.
+    call; a live writer says it with ``tick``, and takes messages while it has room. The message of
+    the failed call is not taken, everything before is kept: in the file up to its last whole
+    record, and in memory. When there is space again, calls and ``close`` succeed and nothing is
+    lost. After a failed background sync nothing succeeds any more, for the disk may hold holes:
+    ``abandon`` and ``recover`` what is there.
     """
 
     def __init__(
@@ -297,9 +304,7 @@ class EpisodeWriter:
         """Append one message with the given schema, or none; the bytes are kept as they are."""
         channel = self._channels.find(topic, schema_record, message_encoding)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
-        if self._queue is not None:
-            self._refuse_failed()
-        elif self._pending or self._file.failed:
+        if self._pending or self._file.failed:
             self.wait_for_disk()
         group = channel.group
         if group is None or (length >= LARGE_BYTES and not channel.is_large):
@@ -350,7 +355,6 @@ class EpisodeWriter:
                 self._pending.append(group.encode())
             self.wait_for_disk()
             return
-        self._refuse_failed()
         if group.has_messages:
             self._queue.wait_for_room(group.size, 2 * self.config.backlog_bytes)
             since_s = group.opened_s
@@ -439,6 +443,48 @@ class EpisodeWriter:
         for group in self._groups:
             if group.has_messages and group.opened_s <= before_s:
                 self._flush(group)
+
+    def keep_name(self) -> bool:
+        """Write the file anew where somebody removed it, and say whether that was needed.
+
+        Raises:
+            OSError: When it cannot be written there.
+        """
+        if self._file.is_there():
+            return False
+        self.wait_for_disk()
+        self._file.restore()
+        return True
+
+    def continue_in(self, path: Path) -> "EpisodeWriter":
+        """Go on in another file, with everything that this one's disk has not taken.
+
+        This writer ends; its ``.part`` file stays for recovery.
+
+        Raises:
+            UsageError: When that episode exists.
+            BridgeError: When the other folder cannot be written; this writer is as it was.
+        """
+        other = EpisodeWriter(path, config=self.config, monotonic=self._monotonic)
+        try:
+            other._take_over(self._channels)
+        except OSError as error:
+            other.discard()
+            raise cannot_write(other.part_path, error) from error
+        other._small, other._groups = self._small, self._groups
+        if self._queue is not None and other._queue is not None:
+            other._queue.add_all(self._queue.give_up())
+        self._stop()
+        return other
+
+    def _take_over(self, channels: Channels) -> None:
+        """Use the channels of another writer under their numbers; raises OSError."""
+        channels.move_to(self._section.summary)
+        summary = self._section.summary
+        definitions = [*summary.schemas.values(), *summary.channels.values()]
+        if definitions:
+            self._file.append(definitions)
+        self._channels = channels
 
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""

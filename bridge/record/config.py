@@ -48,6 +48,9 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
+    failover: Path | None = None
+    """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
+    DIR`` joins the halves."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0

@@ -33,6 +33,8 @@ from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
+FAILOVER_RECORD = "failover"
+"""Of the metadata record of a part that lies on another disk than the parts before."""
 HASH_PREFIX = "RIHS01_"
 _SHOWN = len(HASH_PREFIX) + 12
 
@@ -170,10 +172,12 @@ class EpisodeFiles:
             BridgeError: When the folder cannot be written.
         """
         self._folder = folder
+        self._first_path = folder / part_name(info.id, 1)
         self._info = info
         self._contract = contract
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
+        self._is_split = bool(config.split_mb or config.split_s)
         self._config = WriterConfig(
             flush_s=config.flush_s, sync_s=config.sync_s, backlog_bytes=config.backlog_bytes
         )
@@ -188,7 +192,7 @@ class EpisodeFiles:
     @property
     def first_path(self) -> Path:
         """The finished first file; its name is the episode's."""
-        return self._folder / part_name(self._info.id, 1)
+        return self._first_path
 
     @property
     def open_path(self) -> Path:
@@ -238,8 +242,30 @@ class EpisodeFiles:
         self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
         self._finisher.start()
 
+    def fail_over(self, folder: Path, cause: str) -> Path:
+        """Go on in another folder, with all that the disk has not taken.
+
+        Raises:
+            UsageError: When the part exists there.
+            BridgeError: When that folder cannot be written either.
+            OSError: The same, a moment later.
+        """
+        before = self.writer
+        path = folder / part_name(self._info.id, self.index + 1)
+        self.writer = before.continue_in(path)
+        self.index += 1
+        self._is_split = True
+        self._paths.append(path)
+        self.writer.describe(self._info)
+        if self._contract is not None:
+            self.writer.add_metadata(RECORD_NAME, self._contract.to_record())
+        values = {"of": json.dumps(str(before.path)), "cause": json.dumps(cause)}
+        self.writer.add_metadata(FAILOVER_RECORD, values)
+        self._folder = folder
+        return path
+
     def _say_part(self, writer: EpisodeWriter, *, is_last: bool) -> None:
-        if (self._split_bytes or self._split_ns) and writer is not self._said:
+        if self._is_split and writer is not self._said:
             values = {"index": json.dumps(self.index), "last": json.dumps(is_last)}
             writer.add_metadata("split", values)
             self._said = writer
@@ -331,6 +357,8 @@ class EpisodeRecording:
         self.outcome: metadata.Outcome | None = None
         self.presence: dict[str, TopicReport] = {}
         """By topic, when it was there; known at the end."""
+        self.failovers: list[dict[str, str]] = []
+        """Where it went on when a disk failed."""
         self._contract = contract
         self._config = config
         self._latched = latched
@@ -360,6 +388,17 @@ class EpisodeRecording:
     def path(self) -> Path:
         """The episode's file when it is finished; its first one if it is split."""
         return self._parts.first_path
+
+    def keep_name(self) -> bool:
+        """Write the file anew where somebody removed it; raises OSError when that fails."""
+        return self._parts.writer.keep_name()
+
+    def fail_over(self, folder: Path, cause: str) -> Path:
+        """Go on in another folder; see ``EpisodeFiles.fail_over``."""
+        path = self._parts.fail_over(folder, cause)
+        self.failovers.append({"path": str(path), "cause": cause})
+        self.ledger.warn(f"the disk failed ({cause}); the rest is in {path}")
+        return path
 
     @property
     def keeps_up(self) -> bool:
@@ -530,6 +569,7 @@ class EpisodeRecording:
             "clock_steps_ns": self._clock_steps_ns,
             "paused": paused,
             "parts": self.num_parts,
+            "failovers": self.failovers,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}

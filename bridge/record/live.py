@@ -9,7 +9,9 @@ with open_recorder(Path("runs/monday")) as recorder:
 """
 
 import contextlib
+import fcntl
 import json
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +32,7 @@ from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
@@ -208,11 +211,13 @@ class LiveRecorder:
         """Recover what a crash left, then listen.
 
         Raises:
-            UsageError: When ``msg_folder`` holds no definitions, or one that is none.
+            UsageError: When ``msg_folder`` holds no definitions, or one that is none, or another
+                recorder writes into the folder.
         """
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         self.run = run
+        self._folder_lock = _lock_folder(run)
         self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
@@ -351,7 +356,11 @@ class LiveRecorder:
             self._links.close()
         self._graph.close()
         self._thread.join(timeout=STATUS_PERIOD_S)
-        return self.core.close()
+        try:
+            return self.core.close()
+        finally:
+            if self._folder_lock is not None:
+                os.close(self._folder_lock)
 
 
 @contextlib.contextmanager
@@ -384,6 +393,24 @@ def open_recorder(
             recorder.close()
         if recorder.core.error is not None:
             raise recorder.core.error
+
+
+def _lock_folder(run: RunFolder) -> int | None:
+    """Keep other recorders out of a run folder, until the process ends.
+
+    Raises:
+        FolderTakenError: When another one is at work there.
+    """
+    descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise FolderTakenError(run=run.path) from error
+    except OSError:  # some network file systems lock no folders
+        os.close(descriptor)
+        return None
+    return descriptor
 
 
 def _outcome(result: str | None, detail: str | None) -> Outcome | None:

@@ -22,7 +22,7 @@ from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.errors import DiskError, LifecycleError, MissingTopicsError
+from bridge.record.errors import DiskError, LifecycleError, MissingTopicsError, cause_of
 from bridge.record.lifecycle import Answer, Lifecycle
 from bridge.record.presence import News, PresenceMonitor
 from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
@@ -312,7 +312,7 @@ class Recorder:
             except GstError as error:
                 future.set_exception(error)
             except OSError as error:
-                future.set_exception(self._fail(error))
+                self._answer_failed(future, error, lambda: act(command))
             except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
                 future.set_exception(error)
 
@@ -344,6 +344,21 @@ class Recorder:
             if is_over:
                 self._life.end()
                 return
+
+    def _answer_failed(
+        self, future: "Future[Answer]", error: OSError, again: Callable[[], Answer]
+    ) -> None:
+        """Answer a command that the disk refused: by another disk, or with the error."""
+        failure = self._fail(error)
+        if failure is not None:
+            future.set_exception(failure)
+            return
+        try:
+            future.set_result(again())
+        except GstError as refusal:
+            future.set_exception(refusal)
+        except OSError as second:
+            future.set_exception(self._fail(second) or second)
 
     def _drain(self) -> None:
         for entry in self._merge.ready():
@@ -380,8 +395,10 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
+            if happened := self._life.look_at_file():
+                self._note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
-            if cause and not self._status.failing:
+            if cause and not self._status.failing and not self._take_over(cause):
                 self._end_because(cause)
 
     def _end_because(self, cause: str) -> None:
@@ -394,10 +411,22 @@ class Recorder:
         self._status.failing = cause
         self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
-    def _fail(self, error: OSError) -> DiskError:
-        cause = error.strerror or str(error)
+    def _take_over(self, cause: str) -> bool:
+        """Let another disk take over, if there is one."""
+        happened = self._life.fail_over(cause)
+        if not happened:
+            return False
+        self._run = self._life.run
+        self._note(News(text=happened, data={"kind": "failover"}))
+        return True
+
+    def _fail(self, error: OSError) -> DiskError | None:
+        """End the recording; None when another disk has taken over."""
+        cause = cause_of(error)
         if self._life.error is not None:
             return self._life.error
+        if self._take_over(cause):
+            return None
         self._status.failing = f"cannot write: {cause}. Finishing what there is."
         self._encoders.is_passing = True
         failure = self._life.fail(cause, self._now_ns(), self._rest)
