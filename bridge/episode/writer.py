@@ -474,6 +474,7 @@ class EpisodeWriter:
         other._small, other._groups = self._small, self._groups
         if self._queue is not None and other._queue is not None:
             other._queue.add_all(self._queue.give_up())
+            self._queue.remove_journal()  # what it holds goes along
         self._stop()
         return other
 

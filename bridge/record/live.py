@@ -24,6 +24,7 @@ from bridge.episode.catalogue import read_entry
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
 from bridge.episode.cdr.messages import CompressedColor
+from bridge.episode.contract import find_contract
 from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
@@ -211,11 +212,12 @@ class LiveRecorder:
         """Recover what a crash left, then listen.
 
         Raises:
-            UsageError: When ``msg_folder`` holds no definitions, or one that is none, or another
-                recorder writes into the folder.
+            UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
+                contract cannot be used, or when another recorder writes into the folder.
         """
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
+        find_contract(run.path, config.contract)  # the same
         self.run = run
         self._folder_lock = _lock_folder(run)
         self._recorder = config.recorder

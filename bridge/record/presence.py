@@ -91,8 +91,6 @@ class PresenceMonitor:
             now_s: A clock without steps [s].
         """
         self.contract: Contract | None = None
-        self.is_off = False
-        """The network does not let us hear ourselves; then every tick counts as heard."""
         self.starved_s = 0.0
         """How long the recorder stood still in all [s]."""
         self._seen = seen
@@ -134,8 +132,7 @@ class PresenceMonitor:
                 text = f"the recorder itself stood still for {late_s:.1f} s"
                 news += self._while_recording(text, {"kind": "starved", "for_s": late_s})
             elif not self._was_heard:
-                if now_s - self._begun_s > FIRST_BEAT_S:
-                    self.is_off = True
+                if now_s - self._begun_s > FIRST_BEAT_S:  # here every tick counts as heard
                     news += self._follow(min(late_s, MAX_STEP_S))
             elif now_s - self._heard_s > DEAF_S and self._deaf_since_s is None:
                 self._deaf_since_s = self._heard_s
