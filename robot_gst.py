@@ -25,6 +25,7 @@ RESUMED = ("demo", "rebuild", "replay", "evaluate")
 """Commands that keep what they did when they are interrupted, and go on from there."""
 
 EPISODES, PUBLISH = "bridge.cli.episodes", "bridge.cli.publish"
+TASKS = "bridge.cli.tasks"
 RECORDING, EXCHANGE = "bridge.cli.recording", "bridge.cli.exchange"
 
 Command = tuple[str, str, str, str]
@@ -137,6 +138,18 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "The stand-in cell: a simulated laboratory.",
                 "--trials 3 --seed 1",
             ),
+        ),
+    ),
+    "task": (
+        "Write and check task files.",
+        (
+            (
+                "check",
+                f"{TASKS}:check",
+                "Say what is wrong with task files, or what they ask for.",
+                "my_task.toml",
+            ),
+            ("new", f"{TASKS}:new", "Write a task file to start from.", "cube_onto_block"),
         ),
     ),
     "import": (

@@ -29,8 +29,8 @@ TEMPORARY = VENV / "tmp"
 """Wheels wait here until all are there; a /tmp in memory is too small for them."""
 
 TOOLS = TEMPORARY / "tools"
-"""What compiles the extension modules, removed afterwards: always the same place, so that a second
-build goes on where the first ended."""
+"""What compiles the extension modules and is not in .venv, removed afterwards: always the same
+place, so that a second build goes on where the first ended."""
 
 BUILD_TOOLS = ("scikit-build-core>=1.0", "nanobind>=2.4", "cmake", "ninja")
 BYTECODE = ("-W", "ignore", "-m", "compileall", "-qq", "-j", "0")
@@ -173,7 +173,8 @@ def install(stage: str, megabytes: int) -> int:
     pip += ["--disable-pip-version-check", "-c", "constraints.txt"]
     steps = [[*pip, *requirements(EXTRAS[stage])]]
     if stage == "demo":
-        steps.append([*pip, "--target", str(TOOLS), *BUILD_TOOLS])
+        if tools := [tool for tool in BUILD_TOOLS if not is_installed(tool.split(">")[0])]:
+            steps.append([*pip, "--target", str(TOOLS), *tools])
         steps.append([*pip, "--no-build-isolation", "--no-deps", "-e", "."])
     progress = Progress(megabytes)
     started = time.monotonic()
@@ -196,7 +197,8 @@ def run(command: list[str], progress: "Progress", log: TextIO) -> int:
     environment = {**os.environ, "TMPDIR": str(TEMPORARY), "PYTHONUNBUFFERED": "1"}
     if "--no-build-isolation" in command:
         environment["PYTHONPATH"] = str(TOOLS)
-        environment["PATH"] = os.pathsep.join([str(TOOLS / "bin"), os.environ["PATH"]])
+        places = [str(TOOLS / "bin"), str(VENV / "bin"), os.environ["PATH"]]
+        environment["PATH"] = os.pathsep.join(places)
     with subprocess.Popen(
         command,
         cwd=ROOT,

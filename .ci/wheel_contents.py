@@ -28,7 +28,7 @@ def wanted_in_wheel() -> set[str]:
         for name in tracked()
         if name.split("/")[0] in PACKAGES and not name.endswith(NOT_PACKAGED)
     }
-    datasets = {f"bridge/task/_{name}" for name in tracked() if name.startswith("datasets/")}
+    datasets = {f"bridge/_{name}" for name in tracked() if name.startswith("datasets/")}
     return files | datasets | {"robot_gst.py"}
 
 

@@ -13,6 +13,8 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
+import coverage_drawn as simulate
+import coverage_exact as exact
 import numpy as np
 from measure import ROOT, Target, report_targets
 
@@ -22,19 +24,20 @@ CHOSEN = [name for name in os.environ.get("COVERAGE_METHODS", "").split(",") if 
 if DRAWS != FULL_DRAWS or CHOSEN:  # a number that proves nothing does not replace one that does
     os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
 
-from evaluator.statistics import agreement as agreement_module  # noqa: E402
-from evaluator.statistics import bootstrap, intervals, prediction_powered, sequential  # noqa: E402
-from evaluator.statistics import differences as differences_module  # noqa: E402
-from evaluator.statistics.coverage import exact, simulate, stored  # noqa: E402
-from evaluator.statistics.coverage.simulate import (  # noqa: E402
+from coverage_drawn import (  # noqa: E402
     CLUSTERED,
     POPULATIONS,
     of_agreement,
     of_remeasurements,
 )
+
+from evaluator.statistics import agreement as agreement_module  # noqa: E402
+from evaluator.statistics import bootstrap, intervals, prediction_powered, sequential  # noqa: E402
+from evaluator.statistics import coverage as stored  # noqa: E402
+from evaluator.statistics import differences as differences_module  # noqa: E402
 from evaluator.statistics.weighted import STATISTICS  # noqa: E402
 
-SHIPPED = ROOT / "evaluator" / "statistics" / "coverage" / stored.MAP
+SHIPPED = ROOT / "evaluator" / "statistics" / stored.MAP
 SEED = 7
 ALL_N = list(range(1, 101))
 SOME_N = [*range(1, 21), 25, 30, 40, 50, 75, 100]
@@ -51,7 +54,7 @@ OVER_CLUSTERED = f"{OVER_GROUPS}; policies of 3 groups that share half of the va
 TWINS = "p = 0.05 .. 0.95, four twins from good to useless, 10 starts in the twin per robot trial"
 
 
-def entry(how: str, over: str, axis: str, points: Sequence[exact.Coverage]) -> dict[str, Any]:
+def entry(how: str, over: str, axis: str, points: Sequence[stored.Coverage]) -> dict[str, Any]:
     rounded = [
         asdict(point) | {"worst": round(point.worst, 6), "mean": round(point.mean, 6)}
         for point in points
@@ -143,7 +146,7 @@ def families() -> dict[str, Callable[[], dict[str, dict[str, Any]]]]:
         return by_method(found, f"the statistic of a second measurement; {OVER_GROUPS}", "groups")
 
     def by_method(
-        found: Sequence[dict[str, exact.Coverage]], over: str, axis: str
+        found: Sequence[dict[str, stored.Coverage]], over: str, axis: str
     ) -> dict[str, dict[str, Any]]:
         return {name: entry(how, over, axis, [sizes[name] for sizes in found]) for name in found[0]}
 

@@ -113,6 +113,7 @@ def judge_trial(run: Any, path: Path, config: Any, twin: Any) -> Judged:
 def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[Any, float]:
     """Let the gate see what came before the plan, and judge it."""
     from bridge.episode import streams
+    from bridge.task.task_file import load_task
     from twin.gate.service import make_gate
     from twin.scene.localise.live import LiveView
 
@@ -126,7 +127,7 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
         )
         if watched and not is_truth(message.topic):
             perception.take(message.topic, message.data, message.log_time_ns, message.type_name)
-    gate = make_gate(config, perception, lambda: stamp_ns, twin)
+    gate = make_gate(load_task(config.task), config, perception, lambda: stamp_ns, twin)
     before = time.monotonic()
     return gate.judge(plan.to_json()), time.monotonic() - before
 

@@ -25,11 +25,12 @@ import scanned_parts
 import shelf
 import table_scene
 from noisy_masks import spoil
+from overlap import mask_iou
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.associate import AssociateConfig
 from twin.scene.semantics.describe import scene_from_masks
-from twin.scene.semantics.lift import lift_features, mask_iou, render_labels
+from twin.scene.semantics.lift import lift_features, render_labels
 from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticScene
 from twin.scene.semantics.segment import SegmentConfig, points_of, segment_points
 

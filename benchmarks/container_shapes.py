@@ -21,7 +21,8 @@ from bridge.task.meshes.toys import basket_parts
 from bridge.task.task_file import ObjectModel, load_task
 from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.robot.collision import convex_hull, signed_distance
-from twin.scene.shape.files import read_parts
+from twin.scene.shape.files import COLLISION
+from twin.scene.shape.mesh import read_mesh
 
 NUM_POINTS = 3000
 BAND_M = 0.015
@@ -95,7 +96,8 @@ def rows_of(run: RunFolder, model: ObjectModel) -> Sequence[dict[str, object]]:
             for box in boxes
         ]
         found.append(row("parts of the design", pieces, points, truth))
-    parts = read_parts(run.scene_dir / "objects" / model.id)
+    folder = run.scene_dir / "objects" / model.id / COLLISION
+    parts = [read_mesh(path) for path in sorted(folder.glob("*.ply"))]
     if parts:
         pieces = [(convex_hull(vertices), coal.Transform3s()) for vertices, _ in parts]
         found.append(row("parts of the scan", pieces, points, truth))

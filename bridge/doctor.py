@@ -31,9 +31,10 @@ EXTRAS = {
         ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "cmaes"),
     ),
     "report": Extra(
-        "evaluate: tables, figures, report", ("pandas", "pyarrow", "scipy", "matplotlib", "pillow")
+        "evaluate: tables, figures, report",
+        ("jinja2", "pandas", "pyarrow", "scipy", "matplotlib", "pillow"),
     ),
-    "dashboard": Extra("review pages, Rerun view", ("starlette", "uvicorn", "jinja2", "rerun-sdk")),
+    "dashboard": Extra("review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk")),
     "standin": Extra(
         "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
     ),

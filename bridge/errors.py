@@ -38,6 +38,10 @@ def refuse_outside(
 ) -> None:
     """Check numbers of a settings record against what is allowed, ends included.
 
+    Args:
+        settings: A record whose fields are looked up by name; one that is None is not checked.
+        allowed: Least and most by field name; infinity for no upper end.
+
     Raises:
         OptionError: Naming the first one that is outside.
     """

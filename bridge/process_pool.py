@@ -107,7 +107,12 @@ class Failed:
 
 
 def do(function: Function, item: Any) -> Answer | Failed:
-    """Do one piece of work; whatever goes wrong with it is its answer."""
+    """Do one piece of work; whatever goes wrong with it is its answer.
+
+    Args:
+        function: What it raises becomes ``Failed``.
+        item: Its only argument.
+    """
     try:
         return function(item)
     except GstError as error:

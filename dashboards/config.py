@@ -35,7 +35,7 @@ class DemoConfig:
     seed: int = 1
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: str = "cube_into_box"
-    """Task of the trials: cube_into_box, sloth_into_basket or five_ducks_into_basket."""
+    """Task of the trials: cube_into_box, sloth_into_basket, five_ducks_into_basket or a file."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
@@ -63,6 +63,6 @@ class DemoConfig:
     @property
     def samples(self) -> int:
         """Varied replays behind each verdict; toys take seconds for each, and have none."""
-        from bridge.task.task_file import load_task  # noqa: PLC0415  # not for --help
+        from bridge.task.find import chosen_task_file  # noqa: PLC0415  # not for --help
 
-        return 0 if self.quick or load_task(self.task).soft_objects else 8
+        return 0 if self.quick or chosen_task_file(self.task).task().soft_objects else 8

@@ -26,7 +26,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
-from bridge.task.task_file import load_task
+from bridge.task.find import chosen_task_file
 from bridge.terminal import Output, how_to_activate
 from dashboards.config import DemoConfig
 from dashboards.errors import DashboardError
@@ -146,7 +146,7 @@ def _refuse_other(run: RunFolder, config: DemoConfig, episode: Episode) -> None:
     info = episode.info
     if not info.stand_in:
         found = f"{episode.path.name}, which is not from the stand-in cell"
-    elif info.task != config.task:
+    elif info.task != chosen_task_file(config.task).task().name:
         found = f"episodes of --task {info.task}"
     elif info.start_seed is not None and info.start_seed // SEEDS_PER_SESSION != config.seed:
         found = f"episodes of --seed {info.start_seed // SEEDS_PER_SESSION}"
@@ -191,15 +191,15 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
         DashboardError: When a step failed, or nothing could be measured.
     """
     started = time.monotonic()
-    load_task(config.task)  # refuse an unknown one before anything is made
+    chosen_task_file(config.task).task()  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
     with _ending_on_signals():
-        _record(run, config, output)
+        void = _record(run, config, output).void
         replay = ["replay", str(path), "--samples", str(config.samples)]
         _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
         _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
         _refuse_nothing(run)
-    _close(run, config, output, time.monotonic() - started)
+    _close(run, config, output, time.monotonic() - started, void)
     return 0
 
 
@@ -215,8 +215,8 @@ def _ending_on_signals() -> Iterator[None]:
             signal.signal(each, handler)
 
 
-def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
-    """Do the steps 1 to 4, as far as they have not been done."""
+def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
+    """Do the steps 1 to 4, as far as they have not been done, and say what there is then."""
     path = str(run.path)
     fit = ["--iterations", str(config.iterations), "--budget", config.limit]
     rebuild = ["rebuild", path, *fit]
@@ -231,7 +231,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
         output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
         if not _scene(run):
             _step(output, label, rebuild)
-        return
+        return found
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
@@ -258,6 +258,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> None:
         count = len(found.missing) + len(found.void)
         message = f"{count} of {2 * config.trials} trials have no outcome: {cause}. "
         raise DashboardError(f"{message}Start the demo again; it adds what is missing.")
+    return found
 
 
 def _record_trials(
@@ -363,8 +364,11 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _close(run: RunFolder, config: DemoConfig, output: Output, seconds: float) -> None:
-    path, fit, void = run.path, _scene(run).get("fit", {}), look(run, config).void
+def _close(
+    run: RunFolder, config: DemoConfig, output: Output, seconds: float, void: dict[Path, str]
+) -> None:
+    """Say what there is now and what to look at next, and serve it where that was asked for."""
+    path, fit = run.path, _scene(run).get("fit", {})
     summary = {
         "run": str(path),
         "seconds": round(seconds, 1),

@@ -23,7 +23,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.task.task_file import Task, load_task
+from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording, read_recording
 from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats
@@ -392,7 +392,7 @@ def _task(file: RerunFile, recording: Recording) -> Task | None:
     if not recording.info.task:
         return None
     try:
-        return load_task(recording.info.task)
+        return streams.task_file(Episode.open(recording.path)).task()
     except GstError as error:
         file.note(f"objects are shown as axes, not boxes: {error}")
         return None

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from bridge.task.verdict import Factor
+from evaluator.report.wording import noun
 from evaluator.result import Interval, Measurement
 
 MISSING = "missing"
@@ -113,13 +114,7 @@ def counted(measurement: Measurement) -> str:
     """Print what a value was counted over: "3 trials", "4 pairs of runs"."""
     if measurement.n is None:
         return ""
-    name = measurement.counted or "item"
-    return f"{measurement.n} {name if measurement.n == 1 else _plural(name)}"
-
-
-def _plural(name: str) -> str:
-    first, *rest = name.split(" ")
-    return " ".join([f"{first}s", *rest])
+    return f"{measurement.n} {noun(measurement.counted or 'item', measurement.n)}"
 
 
 def evidence(measurement: Measurement | None) -> str:
@@ -147,7 +142,7 @@ def headline_evidence(measurement: Measurement) -> str:
         return evidence(measurement)
     interval = measurement.interval
     ends = bounds(interval, shown_unit(measurement))
-    kind = _plural(measurement.counted or "item")
+    kind = noun(measurement.counted or "item", 0)
     return f"{measured(measurement)} of {kind}, {ends} ({method(interval)})"
 
 

@@ -457,6 +457,49 @@ NPV = _new(
     intervals.wilson,
     "negative predictive value: trials that failed / trials where {words} predicted failure",
 )
+_BESIDE = "over trials where {words}, the forecast and the labelled outcome are known"
+BASE_RATE = _new(
+    "baseline.{by}.base_rate",
+    "1",
+    "none",
+    intervals.wilson,
+    "trials that succeeded / trials where {words} and the labelled outcome are known: what always saying yes gets right",
+)
+BASELINE_ACCURACY = _new(
+    "baseline.{by}.{baseline}.rate",
+    "1",
+    "none",
+    intervals.wilson,
+    f"trials where the forecast without a twin ({{baseline}}) and the labelled outcome are the same / trials, {_BESIDE}",
+)
+BASELINE_PPV = _new(
+    "baseline.{by}.{baseline}.ppv",
+    "1",
+    "none",
+    intervals.wilson,
+    f"trials that succeeded / trials where the forecast without a twin ({{baseline}}) said success, {_BESIDE}",
+)
+BASELINE_NPV = _new(
+    "baseline.{by}.{baseline}.npv",
+    "1",
+    "none",
+    intervals.wilson,
+    f"trials that failed / trials where the forecast without a twin ({{baseline}}) said failure, {_BESIDE}",
+)
+BASELINE_GAIN = _new(
+    "baseline.{by}.{baseline}.twin_gain_pp",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    f"share of right answers of the twin minus that of the forecast ({{baseline}}), paired, {_BESIDE}",
+)
+BASELINE_GAIN_OF_TASK = _new(
+    "baseline.{by}.{baseline}.twin_gain_pp.{task}",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    BASELINE_GAIN.definition,
+)
 BREAK_EVEN_PRICE = _new(
     "gate.break_even_price",
     "1",

@@ -5,7 +5,7 @@ Undefined is undefined, with its reason; it is never 0, 1 or NaN.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
@@ -92,6 +92,12 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
+
+    @staticmethod
+    def of(rows: Sequence[Mapping[str, Cell]], *, id: str, title: str, note: str = "") -> "Table":
+        """Make a table of at least one row, each its cells by column, all with the same columns."""
+        lines = tuple(tuple(row.values()) for row in rows)
+        return Table(id=id, title=title, columns=tuple(rows[0]), rows=lines, note=note)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,6 @@ from pathlib import Path
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
-from bridge.task.task_file import load_task
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.replay.verdict import replay_plan
@@ -25,7 +24,7 @@ def main(path: Path) -> None:
     if urdf is None:
         sys.exit(f"{path} holds no robot description")
     poses = {name: se3.pose_from_record(pose) for name, pose in plan.entities.items()}
-    scene = ReplayScene(task=load_task(plan.task), Ts_base_object=poses, urdf=urdf)
+    scene = ReplayScene(task=streams.task_file(episode).task(), Ts_base_object=poses, urdf=urdf)
     result = replay_plan(plan, scene, ReplayConfig())
 
     verdict = result.verdict

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from measure import ROOT, Target
+from overlap import mask_iou
 from PIL import Image
 from scipy import ndimage
 
@@ -17,7 +18,7 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
-from twin.scene.semantics.lift import Viewpoint, mask_iou, render_labels
+from twin.scene.semantics.lift import Viewpoint, render_labels
 from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.settings import InitialiseConfig
 

@@ -30,6 +30,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     """
     from bridge.episode.contract import PRESENCE_RECORD, presence_lines
     from bridge.episode.reader import Episode
+    from bridge.task.find import HASH_DIGITS
 
     opened = Episode.open(episode)
     topics = opened.topics()
@@ -56,6 +57,9 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         + (f" in {len(opened.parts)} parts" if len(opened.parts) > 1 else ""),
         f"  outcome: {_outcome('replay' if opened.derived else about.kind, outcome)}",
     ]
+    if about.task and not opened.derived:
+        digits = about.task_sha256[:HASH_DIGITS]
+        lines.append(f"  task file: {f'attached, sha256 {digits}' if digits else 'none attached'}")
     if opened.derived:
         derived = opened.derived
         lines.append(

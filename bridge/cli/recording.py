@@ -1,15 +1,18 @@
 """Commands that record, and that control a recorder from anywhere."""
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from bridge.task.task_file import TaskFile
 
 OUTPUT = Output()
 ABOUT = EpisodeAbout()
@@ -62,6 +65,7 @@ def record(
         return _learn(run, learn, output)
     if duration_s is not None and (episode is None or duration_s <= 0):
         raise UsageError("--duration needs --episode ID and a time above zero.")
+    about, task = _with_task_file(about)
     info = None if episode is None else parse_info(episode, asdict(about))
     wire = WireConfig(mode="router", listen=listen, connect=connect, config=zenoh_config)
     with stop_signals() as stop:
@@ -75,6 +79,7 @@ def record(
             duration_s=duration_s,
             about=about,
             anyway=anyway,
+            task=task,
         )
     data = answer or {"ok": True, "episode": None}
     output.result(data, describe_answer(data) if answer else "stopped; no episode was open")
@@ -140,17 +145,19 @@ def ctl(
     from bridge.wire.config import WireConfig
     from bridge.wire.session import open_session
 
+    about, task = _with_task_file(about)
+    sent = {} if task is None else {"task_file": task.data.decode()}
     outcome = None
     if result is not None:
         outcome = {"result": result, "k": int(result == "success"), "n": 1, "detail": detail}
     requests: dict[str, dict[str, Any]] = {
-        "start": {"id": id, "info": asdict(about), "anyway": anyway},
+        "start": {"id": id, "info": asdict(about), "anyway": anyway, **sent},
         "stop": {"outcome": outcome, "discard": discard},
         "mark": {"text": text},
         "label": {"text": text, "outcome": outcome, "episode": id},
         "pause": {},
         "resume": {},
-        "snapshot": {"id": id, "info": asdict(about)},
+        "snapshot": {"id": id, "info": asdict(about), **sent},
         "list": {"last": last},
         "status": {},
     }
@@ -165,6 +172,16 @@ def ctl(
     describe = describers.get(action, describe_answer)
     output.result(answer, describe(answer))
     return 0
+
+
+def _with_task_file(about: EpisodeAbout) -> "tuple[EpisodeAbout, TaskFile | None]":
+    """Read the task file that ``about`` names by its path; what is left there is its name."""
+    from bridge.task.task_file import TaskFile
+
+    if not about.task.endswith(".toml"):
+        return about, None
+    file = TaskFile.read(Path(about.task))
+    return replace(about, task=file.task().name), file
 
 
 def _describe_list(answer: dict[str, Any]) -> str:

@@ -37,6 +37,10 @@ from bridge.whole_file import write_whole
 def write_parquet(entries: Sequence[Entry], path: Path) -> None:
     """Write one row per episode; columns are the fields of ``Entry``, times in ns.
 
+    Args:
+        entries: The episodes, one row each, in this order.
+        path: The file to write; an older one is replaced.
+
     Raises:
         MissingDependencyError: Without pa.
     """
@@ -135,12 +139,22 @@ def _change(store: CatalogueStore, rows: list[tuple[Entry, str]], gone: Iterable
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
-    """Where the label of an episode is kept."""
+    """Where the label of an episode is kept.
+
+    Args:
+        run: The run that has, or will have, the episode.
+        episode_id: Its id, which must be safe as a file name.
+    """
     return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
 
 
 def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
-    """Return the label given after the fact if there is one, else what the episode says."""
+    """Return the label given after the fact if there is one, else what the episode says.
+
+    Args:
+        run: The run whose ``notes/`` may hold a label.
+        episode: One of its episodes; the label is looked up by the name of its file.
+    """
     if not EPISODE_ID.fullmatch(episode.path.stem):
         return episode.outcome  # a file of another program; it cannot have been labelled here
     path = sidecar_path(run, episode.path.stem)
@@ -151,6 +165,11 @@ def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
 
 def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     """Write the sidecar of a finished episode.
+
+    Args:
+        run: The run that holds the episode.
+        episode_id: Id of a finished episode.
+        outcome: The label, in place of any that was there.
 
     Raises:
         PathNotFoundError: When there is no such episode; lists those that are there.
@@ -172,7 +191,12 @@ _LARGEST = 2**63 - 1
 
 
 def read_entry(run: RunFolder, path: Path) -> Entry:
-    """Open an episode and sum it up; a broken one is listed with its error."""
+    """Open an episode and sum it up; a broken one is listed with its error.
+
+    Args:
+        run: The run, for labels given after the fact.
+        path: The episode's file, the first part of a split one.
+    """
     parts: tuple[Path, ...] = (path,)
     name: dict[str, Any] = {"file": printable(path.name), "id": printable(path.stem)}
     try:
@@ -244,7 +268,13 @@ def list_episodes(run: RunFolder) -> list[Entry]:
 
 
 def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
-    """Write a label beside the run; the episode file is not touched."""
+    """Write a label beside the run; the episode file is not touched.
+
+    Args:
+        run: The run that holds the episode; its catalogue is brought up to date.
+        episode_id: Id of a finished episode.
+        outcome: The label, in place of any that was there.
+    """
     path = write_label(run, episode_id, outcome)
     note_finished(run, run.episodes_dir / f"{episode_id}.mcap")
     return path

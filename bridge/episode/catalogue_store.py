@@ -123,7 +123,12 @@ def trace(
 
 
 def stamp_of(files: Iterable[Path | str], now_ns: int) -> str:
-    """Return size, times and inode of each file; "" when one changed a moment ago."""
+    """Return size, times and inode of each file; "" when one changed a moment ago.
+
+    Args:
+        files: The parts of one episode; one that is not there counts as such.
+        now_ns: The system clock, which the files' change times are compared with [ns since 1970].
+    """
     marks = []
     for file in files:
         try:
@@ -312,14 +317,25 @@ class CatalogueStore:
         return found
 
     def change(self, rows: Iterable[tuple[Entry, str]], gone: Iterable[str] = ()) -> None:
-        """Put rows in, in place of those of the same file, and take others out, all or nothing."""
+        """Put rows in, in place of those of the same file, and take others out, all or nothing.
+
+        Args:
+            rows: Entries with the stamp of their files (see ``stamp_of``).
+            gone: File names whose rows are to go.
+        """
         values = [_values(entry, stamp) for entry, stamp in rows]
         with self._transaction():
             self._db.executemany("DELETE FROM episodes WHERE file = ?", [(name,) for name in gone])
             self._db.executemany(_INSERT, values)
 
     def select(self, clause: str, values: Sequence[Any]) -> list[Entry]:
-        """Return the rows a clause picks."""
+        """Return the rows a clause picks.
+
+        Args:
+            clause: SQL after ``FROM episodes``, with ``?`` where a value goes; never text of a
+                user.
+            values: One for each ``?``.
+        """
         try:
             return [_entry(row) for row in self._db.execute(_SELECT + clause, values)]
         except (TypeError, ValueError) as error:  # somebody wrote into the file

@@ -55,6 +55,10 @@ class Decoder:
     def decode(self, topic: str, message: ScannedMessage) -> None:
         """Read one message.
 
+        Args:
+            topic: Where it was sent; a topic of the contract decides how its message is read.
+            message: With its channel and schema; of an unknown type or encoding it is passed over.
+
         Raises:
             BridgeError: When it is not what its topic and type promise.
         """
@@ -210,6 +214,10 @@ class Pauses:
         """Say whether two messages of a topic lie on both sides of a pause [ns].
 
         A message on its way when the recorder was told may be on either side.
+
+        Args:
+            before_ns: Log time of the earlier message.
+            after_ns: Log time of the later one.
         """
         index = bisect_left(self._starts_ns, after_ns) - 1
         return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
@@ -254,7 +262,12 @@ class TopicWatch:
     latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
-        """Take the next message in the order of the file."""
+        """Take the next message in the order of the file.
+
+        Args:
+            message: The next of this topic.
+            decoder: Reads it; what it finds wrong is counted, and the first fault kept.
+        """
         head, result = message.head, self.result
         result.messages += 1
         result.type_name = message.schema.name if message.schema else ""

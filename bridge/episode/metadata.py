@@ -25,6 +25,8 @@ class EpisodeInfo:
     kind: str
     """One of scan, trial, probe, imported."""
     task: str = ""
+    task_sha256: str = ""
+    """Of the task file it was recorded with, which is attached; empty: not known."""
     instruction: str = ""
     condition: str = ""
     """without_replanning or with_replanning."""
@@ -86,6 +88,10 @@ def to_strings(record: object) -> dict[str, str]:
 
 def build(of_type: type[Record], record: Mapping[str, Any]) -> Record:
     """Make one of the records above from parsed values; fields of later versions are left out.
+
+    Args:
+        of_type: The class of the record, such as ``EpisodeInfo``.
+        record: Values by field name, as parsed from JSON; a list may stand for a tuple.
 
     Raises:
         TypeError: When a field is missing, or is a list, text or number and should not be.

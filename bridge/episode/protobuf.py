@@ -39,6 +39,10 @@ def bytes_field(number: int, value: bytes) -> bytes:
 def read_varint(data: memoryview, at: int) -> tuple[int, int]:
     """Return an unsigned integer and the place after it.
 
+    Args:
+        data: The message.
+        at: Where the number begins in it.
+
     Raises:
         ValueError: The bytes end inside the number, or it has more than 64 bits.
     """

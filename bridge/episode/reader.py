@@ -109,7 +109,12 @@ def _highest_part(path: Path, episode_id: str) -> int:
 
 
 def record_of(file: McapFile, name: str) -> dict[str, Any]:
-    """Return a metadata record of one file with its values parsed, empty where there is none."""
+    """Return a metadata record of one file with its values parsed, empty where there is none.
+
+    Args:
+        file: One part of an episode.
+        name: Of the record, such as ``episode`` or ``outcome``; the last of that name counts.
+    """
     values: dict[str, Any] = {}
     for record in file.metadata:
         if record.name == name:
@@ -401,8 +406,12 @@ class Episode:
     ) -> Iterator[RawMessage]:
         """Yield messages in log order with CRCs checked, optionally of some topics only.
 
-        ``start_ns`` (included) and ``end_ns`` (excluded) bound the log time. Chunks without a
-        wanted topic are not read; few are held in memory at a time.
+        Chunks without a wanted topic are not read; few are held in memory at a time.
+
+        Args:
+            topics: Topics wanted; None for all.
+            start_ns: First log time wanted, included [ns since 1970]; None: from the start.
+            end_ns: Log time to stop before, excluded; None: to the end.
 
         Raises:
             EpisodeError: When a file turns out to be damaged.

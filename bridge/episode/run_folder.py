@@ -23,7 +23,12 @@ def check_episode_id(episode_id: str) -> str:
 
 
 def part_name(episode_id: str, index: int) -> str:
-    """Return the file name of one part of an episode; the first, number 1, carries the bare id."""
+    """Return the file name of one part of an episode; the first, number 1, carries the bare id.
+
+    Args:
+        episode_id: The id all parts share.
+        index: Number of the part, from 1.
+    """
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
 
 
@@ -84,7 +89,7 @@ def first_part(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """``episodes/``, ``scene/``, ``derived/``, ``results/`` and ``notes/`` of one cell."""
+    """``episodes/``, ``tasks/``, ``scene/``, ``derived/``, ``results/`` and ``notes/``."""
 
     path: Path
 
@@ -135,6 +140,11 @@ class RunFolder:
     def results_dir(self) -> Path:
         """What the evaluator computed."""
         return self.path / "results"
+
+    @property
+    def tasks_dir(self) -> Path:
+        """Task files of the recorded episodes."""
+        return self.path / "tasks"
 
     @property
     def notes_dir(self) -> Path:

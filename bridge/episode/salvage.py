@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from mcap.records import Channel, Metadata, Schema
+
 from bridge.episode import provenance
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
     Contents,
-    Cursor,
     RecordFile,
-    parse_channel,
-    parse_schema_id,
+    read_plain,
     summary_definitions,
     walk_records,
 )
@@ -121,9 +121,8 @@ class RecoveryTally:
             self._define([found.raw])
         elif found.opcode == mcap.METADATA:
             self.metadata += 1
-            cursor = Cursor(found.raw, mcap.RECORD_HEAD.size)
-            if cursor.text() == RECORD_NAME:
-                self.earlier = from_strings(cursor.text_map())
+            if isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
+                self.earlier = from_strings(found.record.metadata)
 
     def _take_cut(self, found: CutChunk) -> None:
         lost = found.unpacked_size - found.contents.size
@@ -147,8 +146,8 @@ class RecoveryTally:
 
     def _define(self, definitions: list[bytes]) -> None:
         for raw in definitions:
-            if raw[0] == mcap.CHANNEL:
-                channel = parse_channel(raw)
+            channel = read_plain(raw)
+            if isinstance(channel, Channel):
                 self.topics.setdefault(channel.id, channel.topic)
 
     def name(self, definitions: list[bytes]) -> None:
@@ -174,7 +173,13 @@ class RecoveryTally:
         return "; ".join(parts)
 
     def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
-        """Say what was done with a file."""
+        """Say what was done with a file.
+
+        Args:
+            path: The file that was read.
+            output: The finished episode; None when there is none.
+            finished: The file was whole before; its reason is then that of an earlier recovery.
+        """
         counts: dict[str, int] = {}
         last: dict[str, int] = {}
         for channel_id, count in self.messages.items():
@@ -307,7 +312,12 @@ class CopyTarget:
         return records, walk_records(records)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
-        """Write the rest and sync; the caller verifies, renames and closes."""
+        """Write the rest and sync; the caller verifies, renames and closes.
+
+        Args:
+            metadata_name: Name of the record that says what recovery did.
+            values: What that record holds.
+        """
         self._flush_loose()
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
@@ -317,9 +327,8 @@ class CopyTarget:
     def _take_plain(self, found: Plain) -> None:
         if found.opcode == mcap.HEADER:
             return
-        if found.opcode == mcap.METADATA:
-            cursor = Cursor(found.raw, mcap.RECORD_HEAD.size)
-            name, values = cursor.text(), cursor.text_map()
+        if isinstance(found.record, Metadata):
+            name, values = found.record.name, found.record.metadata
             self.section.add_metadata(name if is_readable(name, values) else name + DAMAGED, values)
             return
         if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
@@ -331,25 +340,22 @@ class CopyTarget:
     def _contradicts(self, raw: bytes) -> bool:
         """Whether a definition is not the one that its id had before."""
         summary = self.section.summary
-        if raw[0] == mcap.SCHEMA:
-            known = summary.schemas.get(parse_schema_id(raw))
-        else:
-            known = summary.channels.get(parse_channel(raw).id)
-        return known not in (None, raw)
+        known = summary.schemas if raw[0] == mcap.SCHEMA else summary.channels
+        return known.get(_id_of(raw)) not in (None, raw)
 
     def _book(self, raw: bytes) -> None:
         """Tell the summary of a definition; the first one of an id counts."""
         summary = self.section.summary
-        if raw[0] == mcap.SCHEMA:
-            _define_once(summary.schemas, self._made_schemas, parse_schema_id(raw), raw)
-            return
-        channel = parse_channel(raw)
-        _define_once(summary.channels, self._made_channels, channel.id, raw)
-        if channel.schema_id and channel.schema_id not in summary.schemas:
-            if self._look_up(mcap.SCHEMA, channel.schema_id):
-                return
-            self._make(mcap.schema(channel.schema_id, "unknown", "", b""))
-            self._made_schemas.add(channel.schema_id)
+        match read_plain(raw):
+            case Schema(id=schema_id):
+                _define_once(summary.schemas, self._made_schemas, schema_id, raw)
+            case Channel(id=channel_id, schema_id=schema_id):
+                _define_once(summary.channels, self._made_channels, channel_id, raw)
+                if schema_id and schema_id not in summary.schemas:
+                    if self._look_up(mcap.SCHEMA, schema_id):
+                        return
+                    self._make(mcap.schema(schema_id, "unknown", "", b""))
+                    self._made_schemas.add(schema_id)
 
     def _look_up(self, opcode: int, number: int) -> bool:
         """Define what was lost here and stands in the summary or in another chunk."""
@@ -419,9 +425,14 @@ def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
                 records.append(found.raw)
     definitions: dict[tuple[int, int], bytes] = {}
     for raw in records:
-        number = parse_schema_id(raw) if raw[0] == mcap.SCHEMA else parse_channel(raw).id
-        definitions.setdefault((raw[0], number), raw)
+        definitions.setdefault((raw[0], _id_of(raw)), raw)
     return definitions
+
+
+def _id_of(raw: bytes) -> int:
+    """Return the number of a schema or channel."""
+    record = read_plain(raw)
+    return record.id if isinstance(record, Schema | Channel) else 0
 
 
 def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
@@ -464,7 +475,12 @@ def verbatim(found: Chunk) -> EncodedChunk:
 
 
 def salvaged_head(records: bytes, contents: Contents) -> bytes:
-    """Return the head of an unpacked chunk with the records that were saved from a cut one."""
+    """Return the head of an unpacked chunk with the records that were saved from a cut one.
+
+    Args:
+        records: The whole records from the chunk's front, unpacked.
+        contents: What is in them; its log times become the chunk's.
+    """
     start_ns, end_ns = contents.time_range()
     return mcap.chunk_head(
         start_ns=start_ns,
@@ -477,7 +493,12 @@ def salvaged_head(records: bytes, contents: Contents) -> bytes:
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one."""
+    """Return the records saved from a cut chunk as a whole one.
+
+    Args:
+        records: The whole records from the chunk's front, unpacked; they are written so.
+        contents: What is in them, with their message index.
+    """
     head = salvaged_head(records, contents)
     start_ns, end_ns = contents.time_range()
     return EncodedChunk(
@@ -548,8 +569,7 @@ class InPlaceTarget:
                     raise NeedsCopyError
                 self._define(found.contents)
                 self._chunk = found
-            case Plain() if found.opcode == mcap.METADATA:
-                name = Cursor(found.raw, mcap.RECORD_HEAD.size).text()
+            case Plain(record=Metadata(name=name)):
                 summary.add_metadata(name, offset=found.offset, length=found.length)
             case Plain() if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
                 self._book(found.raw)
@@ -570,13 +590,13 @@ class InPlaceTarget:
 
     def _book(self, raw: bytes) -> None:
         summary = self.section.summary
-        if raw[0] == mcap.SCHEMA:
-            summary.schemas.setdefault(parse_schema_id(raw), raw)
-            return
-        channel = parse_channel(raw)
-        if channel.schema_id and channel.schema_id not in summary.schemas:
-            raise NeedsCopyError
-        summary.channels.setdefault(channel.id, raw)
+        match read_plain(raw):
+            case Schema(id=schema_id):
+                summary.schemas.setdefault(schema_id, raw)
+            case Channel(id=channel_id, schema_id=schema_id):
+                if schema_id and schema_id not in summary.schemas:
+                    raise NeedsCopyError
+                summary.channels.setdefault(channel_id, raw)
 
     def _define(self, contents: Contents) -> None:
         for raw in contents.definitions:
@@ -607,6 +627,10 @@ class InPlaceTarget:
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Cut off what is torn, write the rest and sync.
+
+        Args:
+            metadata_name: Name of the record that says what recovery did.
+            values: What that record holds.
 
         Raises:
             OSError: When there is no room even for that; what was whole still is.

@@ -23,6 +23,7 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
     CAMERAS,
     COLOR_TOPIC,
@@ -37,8 +38,10 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
+from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Verdict
 
 PAIRING_TOLERANCE_NS = 20_000_000
@@ -113,7 +116,13 @@ def camera_ids(episode: Episode) -> list[str]:
 
 
 def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
-    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
+    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found.
+
+    Args:
+        episode: Whose topics are searched.
+        camera_id: Name of the camera in its topics.
+        tail: What follows the camera in the topic, without a leading slash.
+    """
     ending = f"{CAMERAS}{camera_id}/{tail}"
     found = (t for t in episode.topics() if t.endswith(ending) and not is_truth(t))
     return next(found, None)
@@ -131,7 +140,13 @@ def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
 
 
 def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
-    """Return the first intrinsics of ``color`` or ``depth``."""
+    """Return the first intrinsics of ``color`` or ``depth``.
+
+    Args:
+        episode: Where to look.
+        camera_id: Name of the camera in its topics.
+        stream: ``color`` or ``depth``.
+    """
     topic = _camera_topic(episode, camera_id, f"{stream}/info")
     for message in episode.messages([topic]):
         return CameraInfo.from_cdr(message.data)
@@ -141,7 +156,13 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
 def rgbd_frames(
     episode: Episode, camera_id: str, tree: TransformTree | None = None
 ) -> Iterator[RgbdFrame]:
-    """Yield posed frames in time order; colour without depth nearby is passed over."""
+    """Yield posed frames in time order; colour without depth nearby is passed over.
+
+    Args:
+        episode: Must have colour and depth of the camera.
+        camera_id: Name of the camera in its topics.
+        tree: The episode's frames where they are known; None reads them from it.
+    """
     tree = transform_tree(episode) if tree is None else tree
     color_info = camera_info(episode, camera_id, "color")
     depth_info = camera_info(episode, camera_id, "depth")
@@ -185,6 +206,10 @@ def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
 
     ROS lets several nodes publish on one topic, each its own joints in its own order: those who
     know the most joints are taken, in the order of the first of them.
+
+    Args:
+        episode: Where to look.
+        ending: How the topic ends, such as ``GRIPPER_STATE``.
     """
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
@@ -258,7 +283,12 @@ def localisations(episode: Episode) -> list[dict[str, Any]]:
 
 
 def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
-    """Source times between which a plan was executed, or None if it never was."""
+    """Source times between which a plan was executed, or None if it never was.
+
+    Args:
+        episode: Whose events say when plans were executed.
+        plan_id: The plan asked for.
+    """
     start, end = execution_ns(events(episode), plan_id)
     return None if start is None or end is None else (start, end)
 
@@ -266,7 +296,12 @@ def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | No
 def execution_ns(
     records: Iterable[Mapping[str, Any]], plan_id: str
 ) -> tuple[int | None, int | None]:
-    """Source times [ns] at which a plan's execution started and ended, as far as events say."""
+    """Source times [ns] at which a plan's execution started and ended, as far as events say.
+
+    Args:
+        records: Events in the order they were recorded.
+        plan_id: The plan asked for.
+    """
     start: int | None = None
     for event in records:
         if event.get("plan_id") != plan_id:
@@ -279,7 +314,12 @@ def execution_ns(
 
 
 def pose_track(episode: Episode, topic: str) -> PoseTrajectory:
-    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped."""
+    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped.
+
+    Args:
+        episode: Where to look.
+        topic: The whole topic, such as ``/lab/tcp/pose``.
+    """
     track = pose_track_of([message.data for message in episode.messages([topic])])
     if track is None:
         raise EpisodeError(
@@ -326,3 +366,20 @@ def robot_description(episode: Episode) -> str | None:
         return string_from_cdr(message.data)
     attached = episode.attachment("robot.urdf")
     return None if attached is None else attached.decode()
+
+
+def task_file(episode: Episode, name: str = "") -> TaskFile:
+    """Find the task file an episode was recorded with.
+
+    Args:
+        episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
+        name: Of the task, where the episode itself names none.
+
+    Raises:
+        MissingTaskError: Saying where it looked.
+        EpisodeError: When the attachment is damaged.
+    """
+    info = episode.info
+    attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)
+    tasks_dir = RunFolder(episode.path.absolute().parent.parent).tasks_dir
+    return find_task_file(info.task or name, tasks_dir=tasks_dir, attached=attached)

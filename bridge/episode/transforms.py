@@ -93,6 +93,10 @@ class TransformTree:
     def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
         """Pose of a frame in its root at one instant.
 
+        Args:
+            frame: Name of the frame.
+            stamp_ns: Source time [ns since 1970]; between recorded transforms it is interpolated.
+
         Raises:
             FrameNotFoundError: When no transform names the frame; lists those that exist.
             AmbiguousFrameError: When transforms lead to several places.
@@ -103,7 +107,12 @@ class TransformTree:
     def Ts_root_frame(
         self, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
     ) -> Float[np.ndarray, "num_stamps 4 4"]:
-        """Poses of a frame in its root at many instants; raises as ``T_root_frame``."""
+        """Poses of a frame in its root at many instants; raises as ``T_root_frame``.
+
+        Args:
+            frame: Name of the frame.
+            stamps_ns: Source times [ns since 1970], in any order.
+        """
         root = self.root_of(frame)
         Ts = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         while frame != root:

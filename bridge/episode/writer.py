@@ -139,7 +139,12 @@ _HEAD_BYTES = 512
 
 
 def is_large(type_name: str, length: int) -> bool:
-    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
+    """Say whether a message of this many bytes belongs to a stream with chunks of its own.
+
+    Args:
+        type_name: Of the message; some types, such as images, are large whatever they weigh.
+        length: Of this message [bytes].
+    """
     return type_name in _LARGE_TYPES or length >= LARGE_BYTES
 
 
@@ -154,6 +159,10 @@ def is_worth_compressing(type_name: str, front: bytes) -> bool:
     """Judge a stream by its type and the front of its first message: zstd for depth and unknown.
 
     Raw colour is left as it is: zstd takes a quarter off it for more CPU time than JPEG.
+
+    Args:
+        type_name: Of the stream's messages.
+        front: First bytes of its first message, with the encoding of an image in them.
     """
     if type_name in _PACKED_TYPES:
         return b"compressedDepth rvl" in front
@@ -244,11 +253,6 @@ class EpisodeWriter:
         return self._file.offset if self._queue is None else self._queue.position()
 
     @property
-    def has_failed(self) -> bool:
-        """True after a failed sync: no call will succeed any more."""
-        return self._file.failed is not None
-
-    @property
     def backlog_bytes(self) -> int:
         """Bytes of large messages that wait for the disk."""
         return 0 if self._queue is None else self._queue.bulk_bytes
@@ -276,7 +280,16 @@ class EpisodeWriter:
         publish_time_ns: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Append one serialised message of a type this project knows."""
+        """Append one serialised message of a type this project knows.
+
+        Args:
+            topic: With its leading slash.
+            data: The serialised message, in one buffer or several.
+            type_name: A type of ``bridge.episode.schema``.
+            log_time_ns: When it was received [ns since 1970].
+            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
+            sequence: The publisher's number of it; None counts on from the message before.
+        """
         known = schema.schema_for(type_name)
         if known is None:
             message = f"no schema for {type_name!r}; use write_foreign for other types"
@@ -301,7 +314,17 @@ class EpisodeWriter:
         publish_time_ns: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Append one message with the given schema, or none; the bytes are kept as they are."""
+        """Append one message with the given schema, or none; the bytes are kept as they are.
+
+        Args:
+            topic: With its leading slash.
+            data: The serialised message, in one buffer or several; not looked at.
+            schema_record: What it is; None where nobody knows.
+            message_encoding: Used where there is no schema, which else says it itself.
+            log_time_ns: When it was received [ns since 1970].
+            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
+            sequence: The publisher's number of it; None counts on from the message before.
+        """
         channel = self._channels.find(topic, schema_record, message_encoding)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:
@@ -386,7 +409,15 @@ class EpisodeWriter:
         log_time_ns: int,
         publish_time_ns: int | None = None,
     ) -> None:
-        """Append one JSON record."""
+        """Append one JSON record.
+
+        Args:
+            topic: With its leading slash.
+            record: Written as it is; not checked against its schema.
+            type_name: A type of ``bridge.episode.schema`` that travels as JSON.
+            log_time_ns: When it was received or made [ns since 1970].
+            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
+        """
         data = json.dumps(record, separators=(",", ":")).encode()
         self.write(
             topic,
@@ -397,7 +428,14 @@ class EpisodeWriter:
         )
 
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
-        """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
+        """Add an attachment, for example ``robot.urdf``; it is in the file at once.
+
+        Args:
+            name: Of the attachment, as readers will look for it.
+            data: Its contents.
+            media_type: Such as ``application/xml``.
+            log_time_ns: When it was recorded [ns since 1970]; taken as the time it was made, too.
+        """
         self.wait_for_disk()
         self._section.add_attachment(
             name,
@@ -419,7 +457,13 @@ class EpisodeWriter:
         outcome: metadata.Outcome | None = None,
         derived: metadata.Derived | None = None,
     ) -> None:
-        """Add the ``episode`` and ``software`` records, and the others where given."""
+        """Add the ``episode`` and ``software`` records, and the others where given.
+
+        Args:
+            info: What the episode is.
+            outcome: How it ended; None when that is not known yet.
+            derived: What it was made from; None for a recording.
+        """
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
         if outcome is not None:

@@ -108,7 +108,12 @@ class TableKind:
     not_ending: tuple[str, ...] = field(default=())
 
     def takes(self, topic: str, type_name: str) -> bool:
-        """Say whether a topic's messages belong into this file."""
+        """Say whether a topic's messages belong into this file.
+
+        Args:
+            topic: With its leading slash; the truth of a stand-in cell never belongs into a file.
+            type_name: Type of its messages.
+        """
         return (
             type_name == self.type_name
             and topic.endswith(self.ending)
@@ -252,6 +257,10 @@ class _Sheet:
 
 def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
     """Return the episode files of a run, or the one given, and the folder they are named from.
+
+    Args:
+        source: A run folder, or one episode file.
+        derived: Of a run, take the derived episodes too.
 
     Raises:
         UsageError: When there is nothing to export.

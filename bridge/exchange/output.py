@@ -19,6 +19,11 @@ from bridge.errors import BridgeError, EpisodeError, UsageError
 def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
     """Name the message in whatever goes wrong in the block; ``number`` counts from 1.
 
+    Args:
+        episode: Named by its path.
+        topic: Of the message.
+        number: The message's place among those read, from 1.
+
     Raises:
         EpisodeError: In place of the ``BridgeError`` that came out.
     """
@@ -99,7 +104,14 @@ def _sync(folder: Path) -> None:
 
 
 def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict[str, Any]) -> None:
-    """Write what the folder is made of: sources with their hashes, software, every choice."""
+    """Write what the folder is made of: sources with their hashes, software, every choice.
+
+    Args:
+        folder: Where the note goes.
+        made_by: The command, such as ``export tum``.
+        sources: The episode files; each is read once for its hash.
+        choices: Whatever else decided about the result; must be JSON.
+    """
     record = {
         "made_by": made_by,
         "software": software(),

@@ -74,7 +74,12 @@ class SourceRow:
         return (self.values.get(name) or "").strip()
 
     def refuse(self, found: str, hint: str) -> TableError:
-        """Build the error that names this row."""
+        """Build the error that names this row.
+
+        Args:
+            found: What is wrong, such as ``unit 'trial' in task 'a'``.
+            hint: What to do about it.
+        """
         return TableError(path=self.path, row=self.row, found=found, hint=hint)
 
     def whole(self, name: str) -> int | None:
@@ -116,6 +121,11 @@ class SourceRow:
 
 def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list[SourceRow]:
     """Read a CSV file with a header.
+
+    Args:
+        path: The file, in UTF-8.
+        required: Columns that must be there.
+        known: All columns that may be there.
 
     Raises:
         PathNotFoundError: When the file is not there.
@@ -175,6 +185,13 @@ def check_header(
 ) -> None:
     """Refuse a header that lacks a column, or has an unknown or doubled one.
 
+    Args:
+        path: The file, for the error.
+        row: Line number of the header, for the error.
+        header: Its column names.
+        required: Columns that must be there.
+        known: All columns that may be there.
+
     Raises:
         TableError: Naming the columns.
     """
@@ -213,6 +230,11 @@ def read_trials(path: Path) -> list[TrialRecord]:
 
 def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, int]]) -> None:
     """Refuse a second unit in one task; ``units`` remembers each task's unit and first row.
+
+    Args:
+        row: Where the trial was read, for the error.
+        trial: The trial to check.
+        units: By task: its unit and the row that gave it first; a new task is added.
 
     Raises:
         TableError: Naming both rows.
@@ -277,7 +299,12 @@ def read_trial(row: SourceRow) -> TrialRecord:
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
-    """Write a trials CSV that ``read_trials`` reads back as it was."""
+    """Write a trials CSV that ``read_trials`` reads back as it was.
+
+    Args:
+        path: The file to write; an older one is replaced.
+        trials: In the order of the rows.
+    """
     path.write_text(trials_text(trials), encoding="utf-8", newline="")
     return path
 

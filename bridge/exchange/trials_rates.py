@@ -60,6 +60,11 @@ def read_rates(path: Path) -> list[RateRecord]:
 def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecord]) -> None:
     """Refuse a cell that is there already, and a second unit in one task.
 
+    Args:
+        row: Where the rate was read, for the error.
+        record: The rate to check.
+        earlier: Those of the rows before it.
+
     Raises:
         TableError: Naming both rows.
     """

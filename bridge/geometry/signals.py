@@ -20,7 +20,6 @@ def lag_of_least_cost(
     lags_s: Float[np.ndarray, " num_lags"] = LAGS_S,
     *,
     equal: float = EQUAL_M,
-    between: bool = False,
 ) -> float:
     """Choose the lag at which two signals differ least [s].
 
@@ -28,13 +27,22 @@ def lag_of_least_cost(
 
     Args:
         costs: How much the signals differ at each lag.
-        lags_s: The lags, evenly spaced.
+        lags_s: The lags that were tried.
         equal: Costs above the least one by at most this count as equal to it.
-        between: Look between the lags too, where a parabola through three costs is lowest.
     """
-    if not between:
-        near = lags_s[costs <= costs.min() + equal]
-        return float(near[np.argmin(np.abs(near))])
+    near = lags_s[costs <= costs.min() + equal]
+    return float(near[np.argmin(np.abs(near))])
+
+
+def lag_between_steps(
+    costs: Float[np.ndarray, " num_lags"], lags_s: Float[np.ndarray, " num_lags"]
+) -> float:
+    """Find the lag where a parabola through the least cost and its neighbours is lowest [s].
+
+    Args:
+        costs: How much the signals differ at each lag, squared.
+        lags_s: The lags, evenly spaced.
+    """
     best = int(costs.argmin())
     if not 0 < best < len(costs) - 1:
         return float(lags_s[best])

@@ -63,10 +63,6 @@ class PoseTrajectory:
         """Return the poses as matrices."""
         return se3.transform_from(self.q_wxyz, self.p_m)
 
-    def path_length_m(self) -> float:
-        """Sum of the distances between neighbouring positions [m]."""
-        return float(np.linalg.norm(np.diff(self.p_m, axis=0), axis=1).sum())
-
     def normalised_time(self, num_samples: int) -> "PoseTrajectory":
         """Resample uniformly from the first to the last stamp; for runs without a common clock."""
         first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])

@@ -61,6 +61,11 @@ def psnr_db(
 
     Range: 0 dB and up for images in 0..1, higher is better. Undefined when: the images are equal.
 
+    Args:
+        recorded: In 0..1.
+        replayed: In 0..1.
+        mask: Pixels that count; None: all.
+
     Raises:
         ImageShapeError: When the sizes differ.
         UndefinedStatisticError: When the error is exactly zero, or the mask is empty.
@@ -86,6 +91,12 @@ def aligned(
     alignment: Alignment,
 ) -> Float[np.ndarray, "height width 3"]:
     """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
+
+    Args:
+        recorded_u8: The one to come near to: 8 bits, or numbers in 0..1.
+        replayed_u8: The one to brighten: 8 bits, or numbers in 0..1.
+        alignment: ``raw`` changes nothing, ``gain`` fits a factor, ``affine`` a factor and an
+            offset.
 
     Raises:
         ImageShapeError: When the sizes differ.
@@ -345,6 +356,10 @@ class SsimMaps:
     ) -> float:
         """Average over pixels and channels; with a mask, over window centres inside it.
 
+        Args:
+            padding: Custom at the border of the image.
+            mask: Pixels whose windows count; None: all.
+
         Raises:
             UndefinedStatisticError: When the mask holds no window centre.
         """
@@ -368,6 +383,10 @@ def ssim_maps(
     Gaussian window of 11 x 11 pixels with sigma 1.5, C1 1e-4, C2 9e-4 for images in 0..1,
     population covariance, each channel alone. Mirrored borders differ from zeros only within half
     a window of the border, so only these strips are computed twice.
+
+    Args:
+        recorded: In 0..1.
+        replayed: In 0..1.
 
     Raises:
         ImageShapeError: When the sizes differ.
@@ -395,6 +414,12 @@ def ssim(
     With a mask, the mean runs over window centres inside it; windows may reach over its edge.
 
     Range: -1 to 1, 1 is identical. Undefined when: the image is smaller than the window.
+
+    Args:
+        recorded: In 0..1.
+        replayed: In 0..1.
+        mask: Pixels whose windows count; None: all.
+        padding: Custom at the border of the image.
 
     Raises:
         ImageShapeError: When the sizes differ.

@@ -58,6 +58,10 @@ def _tokens(pixels: Int64[np.ndarray, " num_pixels"]) -> Int64[np.ndarray, " num
 def decode_rvl(stream: bytes | memoryview, num_pixels: int) -> UInt16[np.ndarray, " num_pixels"]:
     """Decode a nibble stream; what follows the last pixel is ignored.
 
+    Args:
+        stream: Little-endian words of 32 bits, the highest nibble of each first.
+        num_pixels: How many the image has, rows one after the other.
+
     Raises:
         ValueError: The stream ends early, or holds a number no encoder writes.
     """

@@ -121,7 +121,7 @@ class EpisodeAbout:
     kind: str = "trial"
     """scan, trial, probe or imported."""
     task: str = ""
-    """Id of the task file."""
+    """Task: its file (my_task.toml), or a name of the run's tasks/ or of datasets/tasks."""
     instruction: str = ""
     """What the robot was told, in words."""
     condition: str = ""

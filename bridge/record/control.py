@@ -14,6 +14,7 @@ from bridge.episode.run_folder import check_episode_id
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
 from bridge.task.record import check_record
+from bridge.task.task_file import MAX_BYTES, TaskFile
 from bridge.wire.errors import WireError
 from bridge.wire.session import Service, WireSession
 
@@ -37,6 +38,10 @@ class RecorderClient:
     def ask(self, verb: str, request: dict[str, Any] | None = None) -> dict[str, Any]:
         """Send one command and return the recorder's answer.
 
+        Args:
+            verb: One of the recorder's commands, such as ``status``.
+            request: Fields of the command; None for none.
+
         Raises:
             RemoteError: When the recorder refused.
             NoReplyError: When no recorder of that name answered.
@@ -49,15 +54,35 @@ class RecorderClient:
         return answer
 
     def start(
-        self, episode_id: str, info: dict[str, Any] | None = None, *, anyway: bool = False
+        self,
+        episode_id: str,
+        info: dict[str, Any] | None = None,
+        task: TaskFile | None = None,
+        *,
+        anyway: bool = False,
     ) -> dict[str, Any]:
-        """Begin an episode; ``anyway`` also when required topics are missing."""
-        return self.ask("start", {"id": episode_id, "info": info or {}, "anyway": anyway})
+        """Begin an episode, with its task file where there is one.
+
+        Args:
+            episode_id: Id of the new episode, which names its file.
+            info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
+                known.
+            task: What the episode is of; it is attached to it.
+            anyway: Also when topics are missing that the contract requires.
+        """
+        sent = {} if task is None else {"task_file": task.data.decode()}
+        request = {"id": episode_id, "info": info or {}, "anyway": anyway, **sent}
+        return self.ask("start", request)
 
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
     ) -> dict[str, Any]:
-        """Finish it after everything this session has sent so far."""
+        """Finish it after everything this session has sent so far.
+
+        Args:
+            outcome: Fields of ``Outcome``; None leaves it as it was labelled.
+            discard: Throw the episode away.
+        """
         return self.ask("stop", {"outcome": outcome, "discard": discard})
 
     def status(self) -> dict[str, Any]:
@@ -72,12 +97,18 @@ Record = TypeVar("Record")
 
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
-    """Answer the control keys until the session closes."""
+    """Answer the control keys until the session closes.
+
+    Args:
+        session: Where the keys are announced.
+        recorder: What the commands go to; its configured name is part of the keys.
+    """
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "start", {"id", "info", "anyway"})
+        _only(request, "start", {"id", "info", "anyway", "task_file"})
         info = parse_info(request.get("id"), request.get("info", {}))
-        return recorder.start(info, anyway=request.get("anyway") is True)
+        task = parse_task_file(request.get("task_file"))
+        return recorder.start(info, task, anyway=request.get("anyway") is True)
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})
@@ -98,8 +129,9 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
         )
 
     def snapshot(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "snapshot", {"id", "info"})
-        return recorder.snapshot(parse_info(request.get("id"), request.get("info", {})))
+        _only(request, "snapshot", {"id", "info", "task_file"})
+        info = parse_info(request.get("id"), request.get("info", {}))
+        return recorder.snapshot(info, parse_task_file(request.get("task_file")))
 
     def pause(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "pause", set())
@@ -168,7 +200,13 @@ def _text(request: dict[str, Any]) -> str:
 
 
 def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
-    """Build the episode's description from a request; unknown fields are refused."""
+    """Build the episode's description from a request; unknown fields are refused.
+
+    Args:
+        episode_id: As it arrived; must be a string that can name a file.
+        info: As it arrived; a JSON object with fields of ``EpisodeInfo``, ``kind`` a trial if left
+            out.
+    """
     if not isinstance(episode_id, str):
         raise ControlError(f"start needs an episode id as a string, got {episode_id!r:.80}.")
     check_episode_id(episode_id)
@@ -186,6 +224,22 @@ def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
     if made.cell:
         check_episode_id(made.cell)  # becomes part of a topic
     return made
+
+
+def parse_task_file(text: Any) -> TaskFile | None:
+    """Check a task file that came with a request; None stays None.
+
+    Raises:
+        ControlError: When it is not text, or too long.
+        TaskFileError: Listing what is wrong with it.
+    """
+    if text is None:
+        return None
+    if not isinstance(text, str) or len(text) > MAX_BYTES:
+        raise ControlError(f"task_file must be the text of a task file, at most {MAX_BYTES} bytes.")
+    file = TaskFile(text.encode(errors="replace"), "the task file of the command")
+    file.task()
+    return file
 
 
 def parse_outcome(outcome: Any) -> metadata.Outcome | None:

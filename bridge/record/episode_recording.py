@@ -30,6 +30,8 @@ from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
 from bridge.record.inspection import MessageState, inspector, resolve_type
 from bridge.record.ledger import Ledger
 from bridge.record.queue import Command, Dropped, Item, second_of
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
+from bridge.task.task_file import TaskFile
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
@@ -78,7 +80,12 @@ class Channels:
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
-        """Return the channel of a message, or None when there are too many."""
+        """Return the channel of a message, or None when there are too many.
+
+        Args:
+            sample: With the topic, the encoding and the hash of the type.
+            type_name: The type after ``resolve_type``; "" where nobody knows it.
+        """
         key = (sample.topic, type_name, sample.message_encoding, sample.type_hash)
         channel = self._channels.get(key)
         if channel is None and len(self._channels) < self._max_topics:
@@ -86,7 +93,13 @@ class Channels:
         return channel
 
     def later(self, topic: str, stamp_ns: int) -> int:
-        """Return a log time for a record of our own."""
+        """Return a log time for a record of our own.
+
+        Args:
+            topic: Where the record will go.
+            stamp_ns: Wanted log time [ns since 1970]; a later one is returned rather than one step
+                back.
+        """
         last_ns = self._last_ns.setdefault(topic, [0])
         last_ns[0] = max(last_ns[0], stamp_ns)
         return last_ns[0]
@@ -157,6 +170,7 @@ class EpisodeFiles:
         config: DiskConfig,
         now_ns: int,
         contract: Contract | None,
+        task: TaskFile | None,
     ) -> None:
         """Create the first part.
 
@@ -164,8 +178,9 @@ class EpisodeFiles:
             folder: Where episodes lie.
             info: What is being recorded.
             config: How it lies on the disk.
-            now_ns: When the first part begins [ns].
+            now_ns: When the first part begins [ns], by the recorder's clock.
             contract: What the topics promise; each part holds it.
+            task: Attached to every part.
 
         Raises:
             UsageError: When the episode exists, or is being written.
@@ -175,6 +190,7 @@ class EpisodeFiles:
         self._first_path = folder / part_name(info.id, 1)
         self._info = info
         self._contract = contract
+        self._task = task
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
         self._is_split = bool(config.split_mb or config.split_s)
@@ -201,19 +217,25 @@ class EpisodeFiles:
 
     def _open(self, now_ns: int) -> EpisodeWriter:
         path = self._folder / part_name(self._info.id, self.index)
+        self._opened_ns = now_ns
         writer = EpisodeWriter(path, config=self._config)
         try:
-            writer.describe(self._info)
-            if self._contract is not None:
-                writer.add_metadata(RECORD_NAME, self._contract.to_record())
+            self._say_what_it_is(writer)
         except OSError as error:
             writer.discard()
             raise BridgeError(
                 f"cannot write {writer.part_path}: {error.strerror}. Choose another folder."
             ) from error
-        self._opened_ns = now_ns
         self._paths.append(path)
         return writer
+
+    def _say_what_it_is(self, writer: EpisodeWriter) -> None:
+        writer.describe(self._info)
+        if self._contract is not None:
+            writer.add_metadata(RECORD_NAME, self._contract.to_record())
+        if self._task is not None:
+            data = self._task.data
+            writer.attach(ATTACHMENT, data, media_type=MEDIA_TYPE, log_time_ns=self._opened_ns)
 
     def is_full(self, now_ns: int) -> bool:
         """Say whether the next message belongs into the next part."""
@@ -256,9 +278,7 @@ class EpisodeFiles:
         self.index += 1
         self._is_split = True
         self._paths.append(path)
-        self.writer.describe(self._info)
-        if self._contract is not None:
-            self.writer.add_metadata(RECORD_NAME, self._contract.to_record())
+        self._say_what_it_is(self.writer)
         values = {"of": json.dumps(str(before.path)), "cause": json.dumps(cause)}
         self.writer.add_metadata(FAILOVER_RECORD, values)
         self._folder = folder
@@ -335,6 +355,7 @@ class EpisodeRecording:
         latched: Callable[[], list[WireSample]],
         others: Mapping[str, Callable[[], object]],
         contract: Contract | None = None,
+        task: TaskFile | None = None,
     ) -> None:
         """Create the episode file and say in it who and what it is.
 
@@ -346,6 +367,7 @@ class EpisodeRecording:
             latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
             contract: What the topics promise.
+            task: The task file, to be attached.
 
         Raises:
             UsageError: When the episode exists already.
@@ -370,7 +392,7 @@ class EpisodeRecording:
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
-        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract)
+        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract, task)
         try:
             self._repeat_latched(start_ns)
         except OSError as error:
@@ -496,7 +518,15 @@ class EpisodeRecording:
         outcome: metadata.Outcome | None = None,
         data: dict[str, Any] | None = None,
     ) -> None:
-        """Append a mark or a label to the cell's events; a label is the outcome from now on."""
+        """Append a mark or a label to the cell's events; a label is the outcome from now on.
+
+        Args:
+            kind: One of the types of the event schema, such as ``mark`` or ``label``.
+            stamp_ns: When it happened [ns since 1970].
+            text: Free text; "" for none.
+            outcome: Of a label; None leaves the episode's outcome as it is.
+            data: Fields of this kind of event; None for none.
+        """
         record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
         if text:
             record["text"] = text
@@ -509,7 +539,12 @@ class EpisodeRecording:
         self.outcome = outcome or self.outcome
 
     def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
-        """Write down that the system clock has jumped; log times have not."""
+        """Write down that the system clock has jumped; log times have not.
+
+        Args:
+            step_ns: How far it jumped, forwards positive.
+            stamp_ns: When that was seen, on the clock that does not jump [ns since 1970].
+        """
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
@@ -546,6 +581,12 @@ class EpisodeRecording:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
+
+        Args:
+            end_ns: When recording ended [ns since 1970].
+            reason: Who or what stopped it, for the metadata.
+            outcome: How it ended; None: as it was labelled last.
+            health: Counts of what went wrong in the recorder, by name.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:

@@ -35,18 +35,34 @@ GOOD = MessageState.GOOD
 
 
 def resolve_type(topic: str, type_name: str) -> str:
-    """Trust the publisher's type name; without one, go by the topic."""
+    """Trust the publisher's type name; without one, go by the topic.
+
+    Args:
+        topic: With its leading slash; one of ours has a type of its own.
+        type_name: As the publisher says; "" for unknown.
+    """
     return type_name or type_of_topic(topic) or ""
 
 
 def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
-    """Check a message without building anything from it."""
+    """Check a message without building anything from it.
+
+    Args:
+        type_name: As ``resolve_type`` gives it.
+        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
+        data: The payload.
+    """
     return inspector(type_name, message_encoding)(data)
 
 
 @lru_cache(maxsize=4096)
 def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], MessageState]:
-    """Return the check for the messages of one type."""
+    """Return the check for the messages of one type.
+
+    Args:
+        type_name: As ``resolve_type`` gives it; "" for unknown.
+        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
+    """
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
         return lambda data: MessageState.UNKNOWN_TYPE

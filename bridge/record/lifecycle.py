@@ -26,6 +26,7 @@ from bridge.record.queue import (
     LatchedMessages,
     LatchedTopics,
 )
+from bridge.task.task_file import TaskFile
 
 
 class DiskReserve:
@@ -300,23 +301,39 @@ class Lifecycle:
 
     # Commands
 
-    def start(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
-        """Begin an episode, with the pre-roll if there is one."""
+    def start(
+        self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
+    ) -> Answer:
+        """Begin an episode, with the pre-roll if there is one.
+
+        Args:
+            info: What the episode is; its id must be new in the run.
+            command: When it was asked for, which is when the episode begins but for its pre-roll.
+            task: The task file to attach.
+        """
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command)
+        self.take = self._open(info, held, command, task)
         self.is_paused = False
         self._write_held(self.take, held)
         self.ring.empty()
         return {"ok": True, "episode": info.id, **self._preroll(held, command.received_ns)}
 
-    def snapshot(self, info: metadata.EpisodeInfo, command: Command) -> Answer:
-        """Write the pre-roll as an episode of its own; it is kept as well."""
+    def snapshot(
+        self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
+    ) -> Answer:
+        """Write the pre-roll as an episode of its own; it is kept as well.
+
+        Args:
+            info: What the episode is; its id must be new in the run.
+            command: When it was asked for, which is when the pre-roll ends.
+            task: The task file to attach.
+        """
         if not self.ring.is_on:
             raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
-        self.take = self._open(info, held, command)
+        self.take = self._open(info, held, command, task)
         self._write_held(self.take, held)
         return self.stop(None, command, discard=False, reason="snapshot")
 
@@ -345,7 +362,11 @@ class Lifecycle:
             )
 
     def _open(
-        self, info: metadata.EpisodeInfo, held: list[Item | Dropped], command: Command
+        self,
+        info: metadata.EpisodeInfo,
+        held: list[Item | Dropped],
+        command: Command,
+        task: TaskFile | None,
     ) -> EpisodeRecording:
         self._reserve.hold()
         first_ns = [entry.received_ns for entry in held]
@@ -357,6 +378,7 @@ class Lifecycle:
             latched=self.latched.all,
             others=self.others,
             contract=self.contract,
+            task=task,
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take
@@ -387,7 +409,14 @@ class Lifecycle:
         discard: bool,
         reason: str,
     ) -> Answer:
-        """Finish the episode, or throw it away."""
+        """Finish the episode, or throw it away.
+
+        Args:
+            outcome: How it ended; None: as it was labelled last.
+            command: When it was asked for, which is when the episode ends.
+            discard: Throw it away.
+            reason: Who or what stopped it, for the metadata.
+        """
         take = self._open_take()
         end_ns = command.received_ns
         self.is_finishing = True
@@ -405,7 +434,14 @@ class Lifecycle:
     def event(
         self, kind: str, command: Command, text: str, outcome: metadata.Outcome | None
     ) -> Answer:
-        """Note this instant in the episode."""
+        """Note this instant in the episode.
+
+        Args:
+            kind: One of the types of the event schema: ``mark`` or ``label``.
+            command: When it was asked for, which is the event's time.
+            text: Free text; "" for none.
+            outcome: Of a label; None leaves the episode's outcome as it is.
+        """
         take = self._open_take()
         take.write_event(kind, stamp_ns=command.received_ns, text=text, outcome=outcome)
         return {"ok": True, "episode": take.info.id}

@@ -38,6 +38,7 @@ from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
+from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
@@ -102,7 +103,12 @@ class Previews:
         return name
 
     def show(self, sample: WireSample, kind: str) -> None:
-        """Send a small copy of an image, if somebody looks and it is time for one."""
+        """Send a small copy of an image, if somebody looks and it is time for one.
+
+        Args:
+            sample: An image as it arrived.
+            kind: ``color``, ``depth`` (never shown) or "" for unknown.
+        """
         topic = sample.topic
         if topic not in self._watched or kind == "depth" or self._shed() >= LoadShedding.PREVIEWS:
             return
@@ -208,8 +214,16 @@ class LiveRecorder:
         run: RunFolder,
         config: RecorderConfig,
         say: Callable[[str], None],
+        task: TaskFile | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
+
+        Args:
+            session: Where to listen.
+            run: Where episodes go.
+            config: Settings.
+            say: Told what a person should know.
+            task: The task file of episodes that name this task or none.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
@@ -229,7 +243,7 @@ class LiveRecorder:
             session, config.recorder, config.preview_hz, lambda: core.input_queue.shed
         )
         core = self.core = Recorder(
-            run, now_ns=session.now_ns, config=config, preview=previews.show
+            run, now_ns=session.now_ns, config=config, preview=previews.show, task=task
         )
         core.note_recovered([_recovery_record(report) for report in reports])
         self._previews = previews
@@ -312,7 +326,13 @@ class LiveRecorder:
     def stop(
         self, *, result: str | None = None, detail: str | None = None, discard: bool = False
     ) -> dict[str, Any]:
-        """Finish the episode; ``result`` is success, failure or unknown."""
+        """Finish the episode; ``result`` is success, failure or unknown.
+
+        Args:
+            result: ``success``, ``failure`` or ``unknown``; None leaves it as it was labelled.
+            detail: Why, in a few words; None for none.
+            discard: Throw the episode away.
+        """
         return self.core.stop(outcome=_outcome(result, detail), discard=discard)
 
     def mark(self, text: str = "") -> dict[str, Any]:
@@ -322,7 +342,13 @@ class LiveRecorder:
     def label(
         self, result: str, *, detail: str | None = None, episode: str | None = None
     ) -> dict[str, Any]:
-        """Say how the open episode went, or a finished one by its id."""
+        """Say how the open episode went, or a finished one by its id.
+
+        Args:
+            result: ``success``, ``failure`` or ``unknown``.
+            detail: Why, in a few words; None for none.
+            episode: Id of a finished episode; None: the open one, else the last.
+        """
         return self.core.label(outcome=_outcome(result, detail), episode=episode)
 
     def pause(self) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from bridge.record.errors import MissingTopicsError, in_short
 from bridge.record.live import LiveRecorder
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
+from bridge.task.task_file import TaskFile
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import is_loopback
@@ -57,7 +58,12 @@ def pressed_key() -> str:
 
 
 def next_info(run: RunFolder, about: EpisodeAbout) -> EpisodeInfo:
-    """Describe the next episode: the first free number after the kind's name."""
+    """Describe the next episode: the first free number after the kind's name.
+
+    Args:
+        run: Whose episodes have taken numbers already.
+        about: What all episodes of this process have in common; its kind names them.
+    """
     taken = {path.name.split(".")[0] for path in run.episodes_dir.iterdir()}
     number = 1
     while f"{about.kind}_{number:04d}" in taken:
@@ -129,6 +135,7 @@ def run_recorder(
     duration_s: float | None = None,
     about: EpisodeAbout | None = None,
     anyway: bool = False,
+    task: TaskFile | None = None,
 ) -> dict[str, Any] | None:
     """Record until ``stop`` is set, the duration is over, or the disk fails.
 
@@ -143,6 +150,7 @@ def run_recorder(
         about: What episodes started from the keyboard are.
         anyway: Start ``episode`` although topics are missing that the contract requires; else it
             waits for them.
+        task: The task file of episodes that name this task or none.
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
@@ -152,7 +160,7 @@ def run_recorder(
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)
-        recorder = LiveRecorder(session, run, config, output.say)
+        recorder = LiveRecorder(session, run, config, output.say, task)
         _say_where(output, wire, config.recorder, run)
         try:
             if episode is not None and not _start(recorder.core, episode, stop, output, anyway):
@@ -182,6 +190,8 @@ def _start(
             if stop.wait(WAIT_S):
                 return False
         else:
+            if remark := answer.get("task_remark"):
+                output.say(str(remark))
             if answer.get("missing"):
                 output.say(f"warning: started although {in_short(answer['missing'])}")
             return True

@@ -121,7 +121,12 @@ REDUCED_QUALITY = 60
 
 
 def next_level(level: LoadShedding, fill: float) -> LoadShedding:
-    """Return the level that belongs to a fill of 0 to 1, given the level so far."""
+    """Return the level that belongs to a fill of 0 to 1, given the level so far.
+
+    Args:
+        level: What is left out now.
+        fill: Share of the budget for bulk that is taken, 0 to 1.
+    """
     wanted = max(item for item in LoadShedding if fill >= BEGINS_AT[item])
     if wanted < level and fill >= BEGINS_AT[level] * ENDS_BELOW:
         return level
@@ -129,7 +134,12 @@ def next_level(level: LoadShedding, fill: float) -> LoadShedding:
 
 
 def keep_every(level: LoadShedding, kind: str) -> int:
-    """Return n when only every n-th image of a kind (color, depth or "") is to be kept."""
+    """Return n when only every n-th image of a kind (color, depth or "") is to be kept.
+
+    Args:
+        level: What is left out now.
+        kind: ``color``, ``depth``, or "" for what no encoder knows as an image.
+    """
     if kind == "color":
         return {LoadShedding.COLOR_RATE: 2, LoadShedding.DEPTH_RATE: 4}.get(level, 1)
     if kind == "depth":

@@ -22,11 +22,19 @@ from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.errors import DiskError, LifecycleError, MissingTopicsError, cause_of
+from bridge.record.errors import (
+    ControlError,
+    DiskError,
+    LifecycleError,
+    MissingTopicsError,
+    cause_of,
+)
 from bridge.record.lifecycle import Answer, Lifecycle
 from bridge.record.presence import News, PresenceMonitor
 from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
 from bridge.record.status import Status
+from bridge.task.find import MissingTaskError, find_task_file, keep_task_file
+from bridge.task.task_file import TaskFile
 from bridge.wire.session import WireSample
 
 POLL_S = 0.02
@@ -49,6 +57,7 @@ class Recorder:
         now_ns: Callable[[], int],
         config: RecorderConfig | None = None,
         preview: Preview = lambda sample, kind: None,
+        task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the writer thread.
@@ -58,6 +67,7 @@ class Recorder:
             now_ns: The clock that also stamps received messages.
             config: Settings.
             preview: Called with images of which somebody wants a preview.
+            task: The task file of episodes that name this task or none.
             wall_ns: The system clock, watched for steps.
 
         Raises:
@@ -67,6 +77,7 @@ class Recorder:
         self.failed = threading.Event()
         self._now_ns = now_ns
         self._run = run
+        self._task = task
         encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
         self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
@@ -122,11 +133,15 @@ class Recorder:
         contract = find_contract(self._run.path, self.config.contract)
         self._life.contract = self.presence.contract = contract
 
-    def start(self, info: metadata.EpisodeInfo, *, anyway: bool = False) -> Answer:
+    def start(
+        self, info: metadata.EpisodeInfo, task: TaskFile | None = None, *, anyway: bool = False
+    ) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
 
         Args:
             info: What is being recorded.
+            task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked
+                up by the name in ``info`` when it is not given.
             anyway: Warn of topics that are required and missing, instead of refusing.
 
         Raises:
@@ -136,19 +151,48 @@ class Recorder:
         """
         check_episode_id(info.id)
         self.read_contract()
+        task = self._task_of(info) if task is None else task
+        info = described_by(info, task)
         missing = self.presence.missing(self._life.contract)
         if missing and not anyway:
             raise MissingTopicsError(episode=info.id, missing=missing)
 
         def act(command: Command) -> Answer:
-            answer = self._life.start(info, command)
+            answer = self._life.start(info, command, task)
             if missing and self._life.take is not None:
                 self._life.take.ledger.warn(f"started without what is required: {missing}")
             self.presence.begin(by_habit=not info.stand_in)
             return answer
 
-        answer = self._command(act)
+        answer = {**self._command(act), **self._keep(task)}
         return {**answer, "missing": missing} if missing else answer
+
+    def _task_of(self, info: metadata.EpisodeInfo) -> TaskFile | None:
+        """The recorder's own task file, or the one there is of the name; None for other names."""
+        if self._task is not None and info.task in ("", self._task.task().name):
+            return self._task
+        if not info.task:
+            return None
+        try:
+            return find_task_file(info.task, tasks_dir=self._run.tasks_dir)
+        except MissingTaskError:
+            return None
+
+    def _keep(self, task: TaskFile | None) -> Answer:
+        """Copy the task file into the run, for people and for episodes without attachments."""
+        if task is None:
+            return {}
+        name = task.task().name
+        try:
+            path = keep_task_file(self._run.tasks_dir, name, task.data)
+        except OSError as error:  # the episode carries it all the same
+            return {"task_file": None, "task_remark": f"tasks/ cannot be written: {error.strerror}"}
+        answer = {"task_file": str(path)}
+        if path.name != f"{name}.toml":
+            answer["task_remark"] = (
+                f"{name}.toml in {path.parent} is another file; kept as {path.name}"
+            )
+        return answer
 
     def _note(self, news: News) -> None:
         """Tell people of something, and write it into the open episode."""
@@ -175,7 +219,13 @@ class Recorder:
         discard: bool = False,
         reason: str = "command",
     ) -> Answer:
-        """Finish the episode, or throw it away, after everything received so far."""
+        """Finish the episode, or throw it away, after everything received so far.
+
+        Args:
+            outcome: How it ended; None: as it was labelled last.
+            discard: Throw it away.
+            reason: Who or what stopped it, for the metadata.
+        """
 
         def act(command: Command) -> Answer:
             self.presence.end()
@@ -210,17 +260,25 @@ class Recorder:
         self.presence.begin(by_habit=take is None or not take.info.stand_in)
         return answer
 
-    def snapshot(self, info: metadata.EpisodeInfo) -> Answer:
+    def snapshot(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
         """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
         check_episode_id(info.id)
-        answer = self._command(lambda command: self._life.snapshot(info, command))
+        task = self._task_of(info) if task is None else task
+        info = described_by(info, task)
+        answer = self._command(lambda command: self._life.snapshot(info, command, task))
         self._enter(info.id)
-        return answer
+        return {**answer, **self._keep(task)}
 
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
     ) -> Answer:
-        """Say how the open episode went, or, by its id, a finished one (kept under notes/)."""
+        """Say how the open episode went, or, by its id, a finished one (kept under notes/).
+
+        Args:
+            text: Free text; "" for none.
+            outcome: How it went; None for text alone.
+            episode: Id of an episode; None: the open one, else the last.
+        """
 
         def act(command: Command) -> Answer:
             take = self._life.take
@@ -279,7 +337,12 @@ class Recorder:
         self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
-        """Add something to every status and episode; ``ask`` must answer at once."""
+        """Add something to every status and episode; ``ask`` must answer at once.
+
+        Args:
+            name: Its key in the status and in the metadata.
+            ask: Returns what to tell, something JSON can hold; called from several threads.
+        """
         self._status.others[name] = ask
         self._life.others[name] = ask
 
@@ -441,3 +504,25 @@ class Recorder:
             if self._merge.images_seen == self.input_queue.images_in or time.monotonic() > end_s:
                 return self._merge.rest()
             time.sleep(BARRIER_POLL_S)
+
+
+def described_by(info: metadata.EpisodeInfo, task: TaskFile | None) -> metadata.EpisodeInfo:
+    """Add to a description which task file the episode is recorded with.
+
+    Raises:
+        TaskFileError: When the file is no task.
+        ControlError: When name or hash belong to another file.
+    """
+    if task is None:
+        if info.task_sha256:
+            raise ControlError(
+                "task_sha256 is written by the recorder. Send the task file instead."
+            )
+        return info
+    about = task.task()
+    if info.task not in ("", about.name):
+        raise ControlError(f"the episode's task is {info.task!r}, and the file's {about.name!r}.")
+    if info.task_sha256 not in ("", task.sha256):
+        raise ControlError(f"task_sha256 {info.task_sha256!r:.80} is not that of the task file.")
+    instruction = info.instruction or about.instruction
+    return replace(info, task=about.name, task_sha256=task.sha256, instruction=instruction)

@@ -100,7 +100,12 @@ class Status:
 
 
 def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
-    """One line about a recorder."""
+    """One line about a recorder.
+
+    Args:
+        status: As the recorder answers ``status``.
+        rate_hz: Messages per second, where the caller has counted them.
+    """
     free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
     if status["state"] == "failed":
         return f"failed: {status['error']}"
@@ -151,6 +156,7 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
         return "\n  ".join([line, *presence_lines(answer)])
+    remark = f"; {text}" if (text := answer.get("task_remark")) else ""
     if answer.get("missing"):
-        return f"{answer['episode']}: ok, although {in_short(answer['missing'])}"
-    return f"{answer['episode']}: ok"
+        remark += f", although {in_short(answer['missing'])}"
+    return f"{answer['episode']}: ok{remark}"

@@ -149,7 +149,12 @@ class Announcer:
         self._queue.put(_Entry(message, None))
 
     def fact(self, key: object, message: StampedMessage) -> None:
-        """Send now and every few seconds, until another fact takes the key."""
+        """Send now and every few seconds, until another fact takes the key.
+
+        Args:
+            key: Names the fact, not None; a later one with an equal key takes its place.
+            message: What is sent; the source time of a repetition is that of its sending.
+        """
         self._queue.put(_Entry(message, key))
 
     def close(self) -> None:

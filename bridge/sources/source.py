@@ -29,7 +29,13 @@ class Source(Protocol):
         """The topics it publishes, or some of them where the device lacks a signal."""
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
-        """Publish until ``stop`` is set or there is nothing left, and count what was sent."""
+        """Publish until ``stop`` is set or there is nothing left, and count what was sent.
+
+        Args:
+            session: Where the messages go.
+            stop: Set from elsewhere, by a signal or when the time is over.
+            output: For progress and remarks.
+        """
 
 
 def run_source(

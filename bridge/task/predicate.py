@@ -64,7 +64,12 @@ class PredicateResult:
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
-    """Evaluate every success predicate of a task on a rollout's final state."""
+    """Evaluate every success predicate of a task on a rollout's final state.
+
+    Args:
+        task: Whose ``success`` lists the predicates.
+        rollout: Poses of the objects over time, with contacts where a predicate asks for them.
+    """
     return [_evaluate(spec, task, rollout) for spec in task.success]
 
 
@@ -91,17 +96,27 @@ def all_hold(findings: list[PredicateResult]) -> bool | None:
     return None if None in values or not values else True
 
 
+def is_goal(spec: Mapping[str, Any]) -> bool:
+    """Say whether a predicate asks for a change of place: it does not hold by doing nothing."""
+    return spec["kind"] in ("inside", "on") or (
+        spec["kind"] == "moved" and ("at_least_m" in spec or "target_m" in spec)
+    )
+
+
 def already_true_at_start(task: Task, rollout: Rollout) -> bool:
-    """Say whether the geometric part of the goal held before anything moved (a useless trial)."""
+    """Say whether the geometric part of the goal held before anything moved (a useless trial).
+
+    Args:
+        task: Of its predicates only those of kind ``inside`` are looked at.
+        rollout: Of its poses only the first.
+    """
     start = Rollout(
         stamps_ns=rollout.stamps_ns[:1],
         Ts_base_object={key: Ts[:1] for key, Ts in rollout.Ts_base_object.items()},
         finger_contact={},
     )
-    inside = [
-        _evaluate(spec, task, start).value for spec in task.success if spec["kind"] == "inside"
-    ]
-    return bool(inside) and all(value is True for value in inside)
+    goals = [_evaluate(spec, task, start).value for spec in task.success if is_goal(spec)]
+    return bool(goals) and all(value is True for value in goals)
 
 
 def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
@@ -143,6 +158,80 @@ def _cavity_excess_m(
     inner = np.array(container.inner_m)
     centre = np.array([0.0, 0.0, container.wall_m + inner[2] / 2])
     return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
+
+
+ON_TOLERANCE_M = 0.008
+"""Of a resting object's underside from the top below it, where a task says nothing else [m]."""
+
+
+def _on(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+    """Whether an object rests on another: at the height of its top, and not over its edge.
+
+    The bodies are the boxes of their outer extents. Their heights are along z of the base frame,
+    against gravity: the underside of the object may be ``tolerance_m`` above or below the top of
+    the support. The middle of the object, at the height of the contact, must lie within the
+    support's uppermost face, ``margin_m`` away from its edges: it would tip otherwise.
+    """
+    object_id, support_id = spec["object"], spec["support"]
+    if support_id not in rollout.Ts_base_object:
+        return PredicateResult(kind="on", value=None, detail=f"{support_id} was not localised")
+    T_object, half = _box_of(object_id, task, rollout)
+    T_support, half_support = _box_of(support_id, task, rollout)
+    bottom = T_object[2, 3] - float(np.abs(T_object[2, :3]) @ half)
+    top = T_support[2, 3] + float(np.abs(T_support[2, :3]) @ half_support)
+    gap_m = bottom - top
+    contact = np.array([T_object[0, 3], T_object[1, 3], top])
+    excess = np.abs(se3.apply(se3.invert(T_support), contact)) - half_support
+    upward = int(np.argmax(np.abs(T_support[2, :3])))  # the face that looks up is no edge
+    over_m = float(np.max(np.delete(excess, upward))) + float(spec.get("margin_m", 0.0))
+    high = abs(gap_m) <= float(spec.get("tolerance_m", ON_TOLERANCE_M))
+    detail = (
+        f"{object_id} is {abs(gap_m) * 1e3:.0f} mm {'above' if gap_m >= 0 else 'below'} the top of "
+        f"{support_id}, its middle {abs(over_m) * 1e3:.0f} mm {'over' if over_m > 0 else 'within'} "
+        "the edge"
+    )
+    return PredicateResult(kind="on", value=bool(high and over_m <= 0), detail=detail)
+
+
+def _box_of(
+    object_id: str, task: Task, rollout: Rollout
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
+    """The box around an object at the end: its middle with its axes, and half its extents [m]."""
+    model = task.objects[object_id]
+    T = rollout.Ts_base_object[object_id][-1].copy()
+    if not model.origin_at_centre:
+        T[:3, 3] += T[:3, 2] * model.size_m[2] / 2
+    extents = rollout.extents_m.get(object_id)
+    return T, np.array(model.size_m if extents is None else extents[-1]) / 2
+
+
+def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+    """Whether an object is where it should be compared with its own start.
+
+    The way from the first state to the last one is measured straight, or, with ``direction`` (in
+    the base frame), along that direction, backwards counting as negative. It must be
+    ``at_least_m`` and ``at_most_m`` long. With ``target_m`` the origin must end within
+    ``tolerance_m`` of that point of the base frame; of a point with two numbers, seen from above.
+    """
+    object_id = spec["object"]
+    first, last = rollout.Ts_base_object[object_id][[0, -1], :3, 3]
+    if not np.isfinite(first).all():
+        detail = f"{object_id} was not localised before"
+        return PredicateResult(kind="moved", value=None, detail=detail)
+    way = last - first
+    direction = np.array(spec.get("direction", (0.0, 0.0, 0.0)), dtype=np.float64)
+    if direction.any():
+        length_m = float(way @ direction / np.linalg.norm(direction))
+    else:
+        length_m = float(np.linalg.norm(way))
+    value = spec.get("at_least_m", -np.inf) <= length_m <= spec.get("at_most_m", np.inf)
+    detail = f"{object_id} moved {length_m * 1e3:.0f} mm"
+    if "target_m" in spec:
+        target = np.array(spec["target_m"], dtype=np.float64)
+        off_m = float(np.linalg.norm(last[: len(target)] - target))
+        value = value and off_m <= spec["tolerance_m"]
+        detail += f" and is {off_m * 1e3:.0f} mm from its target"
+    return PredicateResult(kind="moved", value=bool(value), detail=detail)
 
 
 def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
@@ -225,7 +314,12 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
 def objects_done(
     findings: list[PredicateResult], manipulated: tuple[str, ...]
 ) -> dict[str, bool | None]:
-    """Per manipulated object: whether everything asked of it holds."""
+    """Per manipulated object: whether everything asked of it holds.
+
+    Args:
+        findings: Results of all predicates.
+        manipulated: Ids of the objects asked about.
+    """
     return {
         key: all_hold([finding for finding in findings if finding.object_id == key])
         for key in manipulated
@@ -234,6 +328,8 @@ def objects_done(
 
 _RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], PredicateResult]] = {
     "inside": _inside,
+    "on": _on,
+    "moved": _moved,
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,
     "shape": _shape,

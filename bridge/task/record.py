@@ -11,6 +11,7 @@ from bridge.errors import InvalidRecordError
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator
+    from jsonschema.exceptions import ValidationError
 import operator
 import re
 from collections.abc import Callable, Sequence, Sized
@@ -128,6 +129,10 @@ class _Compiler:
     def any_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
         checks = [self.compile(inner) for inner in wanted]
         return lambda value: any(fits(value) for fits in checks)
+
+    def all_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
+        checks = [self.compile(inner) for inner in wanted]
+        return lambda value: all(fits(value) for fits in checks)
 
     def one_of(self, wanted: Sequence[Any], _: Mapping[str, Any]) -> Check:
         """Sure where no value can fit two of the options, because their types differ."""
@@ -254,6 +259,7 @@ _KEYWORDS: dict[str, Keyword] = {
     "properties": _Compiler.properties,
     "additionalProperties": _Compiler.additional,
     "items": _Compiler.items,
+    "allOf": _Compiler.all_of,
     "anyOf": _Compiler.any_of,
     "oneOf": _Compiler.one_of,
     "if": _Compiler.condition,
@@ -294,6 +300,11 @@ def check_record(
 ) -> Mapping[str, Any]:
     """Return the record if it fits ``schemas/<name>.schema.json``.
 
+    Args:
+        record: As parsed from JSON.
+        name: Of the schema, such as ``plan``.
+        package: Where its folder ``schemas`` is.
+
     Raises:
         InvalidRecordError: With the place and the value that does not fit.
     """
@@ -315,6 +326,17 @@ def check_record(
     return record
 
 
+def find_problems(
+    record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
+) -> list["ValidationError"]:
+    """List everything in a record that does not fit ``schemas/<name>.schema.json``, by place."""
+    path = f"schemas/{name}.schema.json"
+    if _quick_check(package, path)(record):
+        return []
+    errors = _validator(package, path).iter_errors(record)
+    return sorted(errors, key=lambda error: [str(part) for part in error.absolute_path])
+
+
 def _refuse(text: str) -> float:
     message = f"{text} is not a number in JSON"
     raise ValueError(message)
@@ -326,12 +348,23 @@ def _finite(text: str) -> float:
 
 
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
-    """Parse JSON bytes and check them."""
+    """Parse JSON bytes and check them.
+
+    Args:
+        data: UTF-8 text.
+        name: Of the schema, such as ``plan``.
+        package: Where its folder ``schemas`` is.
+    """
     return dict(check_record(load_record(data, name=name), name=name, package=package))
 
 
 def load_record(data: bytes, *, name: str) -> dict[str, Any]:
-    """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
+    """Parse JSON bytes that hold one object of finite numbers, and check no more than that.
+
+    Args:
+        data: UTF-8 text.
+        name: What the record is, for the error.
+    """
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:

@@ -1,5 +1,6 @@
 """A task as data: objects, stages, start distribution and success predicate."""
 
+import hashlib
 import tomllib
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,14 +13,12 @@ from jaxtyping import Float
 from bridge.data_files import dataset_file
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.meshes.toys import DESIGNS
+from bridge.task.check import TaskFileError, task_problems
 
-SCHEMA_VERSION = 1
 BASKET = "basket"
 SCANNED = "scanned"
-SHAPES = ("box", "open_box", "mesh", SCANNED)
-MESHES = (*sorted(DESIGNS), BASKET)
-"""Names an object of shape ``mesh`` may give."""
+MAX_BYTES = 64 * 1024
+"""Of a task file; one travels in every episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,10 +136,60 @@ class Task:
             poses[object_id] = se3.transform_from(q, p)
         return poses
 
+    def goal_of(self, object_id: str) -> tuple[str, str] | None:
+        """Where an object belongs: ``inside`` a container or ``on`` a support; None: nowhere said.
+
+        The first success predicate that says so counts.
+        """
+        for spec in self.success:
+            if spec.get("object") == object_id and spec["kind"] in ("inside", "on"):
+                return spec["kind"], spec["container" if spec["kind"] == "inside" else "support"]
+        return None
+
     @property
     def soft_objects(self) -> tuple[str, ...]:
         """Objects that deform."""
         return tuple(key for key, model in self.objects.items() if model.soft is not None)
+
+
+@dataclass(frozen=True)
+class TaskFile:
+    """The text of a task file, and where it was found."""
+
+    data: bytes
+    """TOML in UTF-8."""
+    origin: str
+    """A path, or which attachment of which episode."""
+
+    @staticmethod
+    def read(path: Path) -> "TaskFile":
+        """Read a file.
+
+        Raises:
+            UsageError: When it cannot be read.
+        """
+        try:
+            with path.open("rb") as stream:
+                return TaskFile(stream.read(MAX_BYTES + 1), str(path))
+        except OSError as error:
+            message = f"{path} cannot be read: {error.strerror}."
+            raise UsageError(message) from error
+
+    @property
+    def sha256(self) -> str:
+        """Of the text as it is: comments count."""
+        return hashlib.sha256(self.data).hexdigest()
+
+    def task(self) -> Task:
+        """Parse and check the file; each text once.
+
+        Raises:
+            TaskFileError: Listing everything that is wrong with it.
+        """
+        found = _parsed(self.data)
+        if isinstance(found, Task):
+            return found
+        raise TaskFileError(origin=self.origin, problems=found)
 
 
 def load_task(name: str) -> Task:
@@ -149,28 +198,23 @@ def load_task(name: str) -> Task:
     Raises:
         UsageError: Unknown name (lists those that exist), or a file that is no task.
     """
-    path = dataset_file("tasks", name)
-    try:
-        status = path.stat()
-    except OSError:
-        return _load(path)  # which says why
-    return _load_once(path.absolute(), status.st_mtime_ns, status.st_size)
+    return TaskFile.read(dataset_file("tasks", name)).task()
 
 
 @lru_cache(maxsize=64)
-def _load_once(path: Path, mtime_ns: int, size: int) -> Task:
-    """Parse a task file again only when it has changed: every replay job asks for its task."""
-    del mtime_ns, size  # only tell one version from another
-    return _load(path)
-
-
-def _load(path: Path) -> Task:
-    table = read_tables(path)
+def _parsed(data: bytes) -> Task | tuple[str, ...]:
+    """Return the task of a file, or what is wrong with it: every replay job asks for its task."""
+    if len(data) > MAX_BYTES:
+        return (f"longer than {MAX_BYTES // 1024} KiB",)
     try:
-        return _task_from(table)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        message = f"{path} is not a task file: {type(error).__name__} {error}. See docs/tasks.md."
-        raise UsageError(message) from error
+        table = tomllib.loads(data.decode())
+    except (ValueError, RecursionError) as error:  # not TOML, not text
+        return (f"cannot be read as TOML: {error}",)
+    try:
+        problems = tuple(task_problems(table))
+    except RecursionError:
+        return ("nested too deeply",)
+    return problems or _task_from(table)
 
 
 def read_tables(path: Path) -> dict[str, Any]:
@@ -183,70 +227,55 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def _task_from(table: dict[str, Any]) -> Task:
-    if table["schema_version"] > SCHEMA_VERSION:
-        message = f"schema_version {table['schema_version']} is newer than {SCHEMA_VERSION}"
-        raise ValueError(message)
+    """Make a task of a table in which nothing is wrong."""
     return Task(
         name=table["name"],
         instruction=table["instruction"],
         objects={key: _object_from(key, value) for key, value in table["objects"].items()},
         manipulated=tuple(table["manipulated"]),
-        containers=tuple(table["containers"]),
+        containers=tuple(table.get("containers", ())),
         start={key: _start_from(value) for key, value in table["start"].items()},
         stages=tuple(table["stages"]),
         success=tuple(table["success"]),
         cell=table.get("cell", "standin"),
-        grip_force_N=_grip_force_from(table.get("grip_force_N")),
+        grip_force_N=None if (force := table.get("grip_force_N")) is None else float(force),
     )
-
-
-def _grip_force_from(value: Any) -> float | None:
-    if value is None:
-        return None
-    if not 0 < float(value) < 1000:
-        message = f"grip_force_N {value!r}; a force of one finger, above 0 and below 1000 N"
-        raise ValueError(message)
-    return float(value)
 
 
 def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:
     shape, mesh = table["shape"], table.get("mesh")
-    if shape not in SHAPES:
-        message = f"objects.{object_id}.shape {shape!r}; known: {', '.join(SHAPES)}"
-        raise ValueError(message)
-    if (shape == "mesh") != (mesh is not None) or (mesh is not None and mesh not in MESHES):
-        message = (
-            f"objects.{object_id}: shape {shape!r} with mesh {mesh!r}; "
-            f'shape "mesh" takes one of {", ".join(MESHES)}, other shapes take none'
-        )
-        raise ValueError(message)
     wall = 0.0
     if shape == "open_box" or mesh == BASKET:
-        wall = table["wall_m"]
-        x, y, z = table["inner_m"]
+        wall = float(table["wall_m"])
+        x, y, z = _floats(table["inner_m"])
         size = (x + 2 * wall, y + 2 * wall, z + wall)
     else:
-        size = tuple(table["size_m"])
-    # The cell moves boxes as rigid bodies and toys as soft ones; nothing else is modelled.
-    if (mesh is not None and mesh != BASKET) != ("soft" in table):
-        message = f"objects.{object_id}: toys need a soft table, boxes and baskets have none"
-        raise ValueError(message)
+        size = _floats(table["size_m"])
     return ObjectModel(
         id=object_id,
         shape=shape,
         size_m=size,
         wall_m=wall,
         color_srgb=tuple(table["color_srgb"]),
-        mass_kg=table.get("mass_kg", 0.1),
+        mass_kg=float(table.get("mass_kg", 0.1)),
         fixed=table.get("fixed", False),
         symmetry=table.get("symmetry", "none"),
         mesh=mesh,
-        soft=SoftMaterial(**table["soft"]) if "soft" in table else None,
-        grasp_m=tuple(table.get("grasp_m", (0.0, 0.0, 0.004))),
+        soft=_soft_from(table.get("soft")),
+        grasp_m=_floats(table.get("grasp_m", (0.0, 0.0, 0.004))),
     )
+
+
+def _soft_from(table: dict[str, float] | None) -> SoftMaterial | None:
+    if table is None:
+        return None
+    return SoftMaterial(**{key: float(value) for key, value in table.items()})
 
 
 def _start_from(table: dict[str, Any]) -> StartRange:
-    return StartRange(
-        x_m=tuple(table["x_m"]), y_m=tuple(table["y_m"]), yaw_rad=tuple(table["yaw_rad"])
-    )
+    return StartRange(**{key: _floats(values) for key, values in table.items()})
+
+
+def _floats(values: Any) -> tuple[Any, ...]:
+    """Lengths may be written without a point: 1 for 1.0."""
+    return tuple(map(float, values))

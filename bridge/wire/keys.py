@@ -67,7 +67,12 @@ def ros_type(dds_name: str) -> str:
 
 
 def encoding_of(type_name: str, message_encoding: str) -> str:
-    """Name a type in a zenoh encoding."""
+    """Name a type in a zenoh encoding.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/JointState``; "" for unknown.
+        message_encoding: Such as ``cdr`` or ``json``; one not known is written as CDR.
+    """
     kind = next((k for k, name in _ENCODINGS.items() if name == message_encoding), _CDR)
     return f"{kind};{type_name}" if type_name else kind
 

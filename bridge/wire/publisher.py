@@ -115,7 +115,12 @@ class WirePublisher:
         """Messages that found the shared memory full and went over the network instead."""
 
     def put(self, data: bytes | bytearray, *, source_ns: int) -> None:
-        """Send one serialised message made at ``source_ns``."""
+        """Send one serialised message made at ``source_ns``.
+
+        Args:
+            data: The serialised message; large ones go through shared memory where that is on.
+            source_ns: Source time of the message [ns since 1970].
+        """
         note = Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
         self._sequence += 1
         payload: Any = data

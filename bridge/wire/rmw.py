@@ -47,6 +47,10 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
 def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
     """Return the RIHS01 hash of the newest definition of a type, or None when none is known.
 
+    Args:
+        type_name: Such as ``sensor_msgs/msg/JointState``.
+        folder: Message definitions of the user's own, looked at as well; None for none.
+
     Raises:
         MissingDependencyError: When rosbags is not installed.
         UsageError: When a file in the folder is not a message definition.
@@ -55,7 +59,13 @@ def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
 
 
 def is_known_definition(type_name: str, type_hash: str, *, folder: Path | None = None) -> bool:
-    """Say whether any release, or the folder, has the type with exactly this hash."""
+    """Say whether any release, or the folder, has the type with exactly this hash.
+
+    Args:
+        type_name: Such as ``sensor_msgs/msg/JointState``.
+        type_hash: RIHS01, as publishers state it.
+        folder: Message definitions of the user's own, looked at as well; None for none.
+    """
     return any(found == type_hash for found, _ in _hashes(type_name, folder))
 
 

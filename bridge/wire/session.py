@@ -131,7 +131,13 @@ class WireSample:
 
 
 def copy_sample(sample: Any, received_ns: int, *, max_bytes: int = sys.maxsize) -> WireSample:
-    """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
+    """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory.
+
+    Args:
+        sample: A ``zenoh.Sample``.
+        received_ns: When it came in [ns since 1970].
+        max_bytes: A larger payload is left out, its size stands in ``oversize_bytes``.
+    """
     size = len(sample.payload)
     is_oversize = size > max_bytes
     named = keys.read_key(str(sample.key_expr))
@@ -248,7 +254,10 @@ class WireSession:
     ) -> Subscriber:
         """Receive what matches, for example ``standin/**``, on the network thread.
 
-        Larger payloads than ``max_bytes`` are told of (``oversize_bytes``) and not copied.
+        Args:
+            key_expression: zenoh keys, where ``*`` stands for one part and ``**`` for any number.
+            callback: Gets each message, in order; must be quick.
+            max_bytes: Larger payloads are told of (``oversize_bytes``) and not copied.
         """
 
         def on_sample(sample: Any) -> None:
@@ -326,6 +335,11 @@ class WireSession:
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer.
 
+        Args:
+            key: Whom to ask.
+            payload: The request.
+            timeout_s: How long to wait for the answer [s].
+
         Raises:
             RemoteError: When the other side refused; carries its message.
             NoReplyError: When nobody answered in time.
@@ -351,6 +365,11 @@ class WireSession:
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
         listened. Whoever has not answered in time is left out, and so is what comes after
         ``max_mb`` [MB], for nobody knows what a cache holds.
+
+        Args:
+            key_expression: Whom to ask.
+            timeout_s: How long to wait [s].
+            max_mb: Bound on all answers together [MB].
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
@@ -383,7 +402,12 @@ class WireSession:
         return token
 
     def query_alive(self, key_expression: str, *, timeout_s: float = 5.0) -> list[str]:
-        """Return the keys of everybody who is there now."""
+        """Return the keys of everybody who is there now.
+
+        Args:
+            key_expression: Of the liveliness tokens asked for.
+            timeout_s: How long to wait for answers [s].
+        """
         try:
             replies = self._inner.liveliness().get(key_expression, timeout=timeout_s)
             return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

@@ -38,7 +38,7 @@ from evaluator.statistics.bootstrap import (
     remeasure_paired,
     student_interval,
 )
-from evaluator.statistics.coverage.stored import Choice, choose_method, vouch
+from evaluator.statistics.coverage import Choice, choose_method, vouch
 
 SEED = 0
 """Resampling is seeded: the same groups give the same interval."""

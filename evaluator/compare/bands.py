@@ -40,7 +40,7 @@ OVER_TIME = range(0, 101, 10)
 """Places on the curves that the table shows, in percent of the motion."""
 
 
-def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[Cell, ...]:
+def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> dict[str, Cell]:
     """One engine's row.
 
     Args:
@@ -55,25 +55,25 @@ def band_row(task: str, engine: str, by_id: Mapping[str, Measurement]) -> tuple[
 
     recorded, simulated = (of(REPEATABILITY["mean_m"], side) for side in ("recorded", engine))
     whole, moving = BAND_DISTANCES[""], BAND_DISTANCES["moving_"]
-    inside = of(INSIDE_BAND).value
-    return (
-        engine,
-        recorded.n,
-        simulated.n,
-        millimetres(of(whole["mean_over_pairs_m"]).value),
-        millimetres(of(moving["mean_over_pairs_m"]).value),
-        millimetres(of(moving["between_mean_curves_m"]).value),
-        millimetres(of(BAND_WITHOUT_OFFSET).value),
-        millimetres(of(BAND_ALONG_PATH).value),
-        millimetres(of(whole["end_point_over_pairs_m"]).value),
-        degrees(of(moving["turned_over_pairs_rad"]).value),
-        millimetres(recorded.value),
-        millimetres(simulated.value),
-        inside,
-    )
+    mean = "mean_over_pairs_m"
+    return {
+        "engine": engine,
+        "recorded runs": recorded.n,
+        "simulated runs": simulated.n,
+        "error over normalised time (mm)": millimetres(of(whole[mean]).value),
+        "the same, moving part (mm)": millimetres(of(moving[mean]).value),
+        "moving part, mean curves (mm)": millimetres(of(moving["between_mean_curves_m"]).value),
+        "the same without offset (mm)": millimetres(of(BAND_WITHOUT_OFFSET).value),
+        "moving part, along the path (mm)": millimetres(of(BAND_ALONG_PATH).value),
+        "end-point error (mm)": millimetres(of(whole["end_point_over_pairs_m"]).value),
+        "moving part, turned (deg)": degrees(of(moving["turned_over_pairs_rad"]).value),
+        "recorded repeatability (mm)": millimetres(recorded.value),
+        "simulated repeatability (mm)": millimetres(simulated.value),
+        "inside the recorded band": of(INSIDE_BAND).value,
+    }
 
 
-def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Table:
+def band_table(table_id: str, task: str, rows: Sequence[Mapping[str, Cell]]) -> Table:
     """One task's table.
 
     Args:
@@ -81,25 +81,10 @@ def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Ta
         task: Task of the runs; may be empty.
         rows: One for each engine, as ``band_row`` lays it out.
     """
-    return Table(
+    return Table.of(
+        rows,
         id=table_id,
         title=f"Recorded against simulated runs: {task}" if task else "Imported runs",
-        columns=(
-            "engine",
-            "recorded runs",
-            "simulated runs",
-            "error over normalised time (mm)",
-            "the same, moving part (mm)",
-            "moving part, mean curves (mm)",
-            "the same without offset (mm)",
-            "moving part, along the path (mm)",
-            "end-point error (mm)",
-            "moving part, turned (deg)",
-            "recorded repeatability (mm)",
-            "simulated repeatability (mm)",
-            "inside the recorded band",
-        ),
-        rows=tuple(rows),
         note="Unpaired runs without a common clock: uniform samples over time. The first error "
         "compares whole recordings and so counts different waiting times as error; the second cuts "
         f"waiting ({MOVING}). Errors are means over all pairs of runs unless they say mean curves. "
@@ -112,36 +97,31 @@ def band_table(table_id: str, task: str, rows: Sequence[tuple[Cell, ...]]) -> Ta
 def profile_table(curves: Sequence[BandCurve]) -> tuple[Table, ...]:
     """Distances and spreads at eleven places of the moving part."""
     rows = [
-        (
-            curve.task,
-            curve.engine,
-            place,
-            millimetres(curve.distance_m[place]),
-            millimetres(curve.recorded_spread_m[place] if curve.recorded_spread_m else None),
-            millimetres(curve.simulated_spread_m[place] if curve.simulated_spread_m else None),
-        )
+        {
+            "task": curve.task,
+            "engine": curve.engine,
+            "time (%)": place,
+            "between mean curves (mm)": millimetres(curve.distance_m[place]),
+            "recorded repeatability (mm)": _at(curve.recorded_spread_m, place),
+            "simulated repeatability (mm)": _at(curve.simulated_spread_m, place),
+        }
         for curve in curves
         if curve.part == "moving"
         for place in OVER_TIME
     ]
     if not rows:
         return ()
-    return (
-        Table(
-            id="bands_over_time",
-            title="Bands over time, moving part",
-            columns=(
-                "task",
-                "engine",
-                "time (%)",
-                "between mean curves (mm)",
-                "recorded repeatability (mm)",
-                "simulated repeatability (mm)",
-            ),
-            rows=tuple(rows),
-            note="From leaving the start to arriving at the end.",
-        ),
+    table = Table.of(
+        rows,
+        id="bands_over_time",
+        title="Bands over time, moving part",
+        note="From leaving the start to arriving at the end.",
     )
+    return (table,)
+
+
+def _at(spread_m: Sequence[float] | None, place: int) -> float | None:
+    return millimetres(spread_m[place]) if spread_m else None
 
 
 @dataclass(frozen=True, kw_only=True)

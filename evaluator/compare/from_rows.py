@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from evaluator.compare.agreement import agreement_intervals, group_agreement
+from evaluator.compare.baselines import baseline_results
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
@@ -98,6 +99,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     gains = replanning_gains(groups, method=method)
     pairs, unpaired = pair_starts(rows)
     scorecard, scorecard_tables = gate_scorecard(rows)
+    beside, beside_tables = baseline_results(rows)
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
@@ -114,6 +116,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
+        *beside,
         *scorecard,
         *kept,
         *stages,
@@ -127,7 +130,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         exclusions=(*unpaired, *other_stages),
         gains=gains,
         again_tables=again_tables,
-        gate_tables=(*scorecard_tables, *kept_tables),
+        gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
         decision_tables=decision_tables,
     )

@@ -1,21 +1,42 @@
-"""The task file an episode names, where there is one."""
+"""The task file a trial was recorded with, or the one its name stands for, where there is one."""
 
 from functools import cache
+from pathlib import Path
 
-from bridge.errors import GstError
-from bridge.task.task_file import Task, load_task
-from evaluator.measurements import slug
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.task.find import MissingTaskError, find_task_file
+from bridge.task.task_file import Task
 
 
 @cache
 def known_task(name: str) -> Task | None:
-    """Load a task by the name an episode gives; None for an unknown one.
-
-    A name from a file is never read as a path.
-    """
-    if not name or slug(name) != name:
-        return None
+    """Load a shipped task by name; None for an unknown one."""
     try:
-        return load_task(name)
-    except GstError:
+        return find_task_file(name).task()
+    except MissingTaskError:
         return None
+
+
+def recorded_task(episode: Episode) -> Task | None:
+    """Load the task an episode was recorded with; None where its file is nowhere.
+
+    Raises:
+        GstError: When the file is damaged, or no task.
+    """
+    try:
+        return streams.task_file(episode).task()
+    except MissingTaskError:
+        return None
+
+
+@cache
+def task_sha256(name: str, tasks_dir: Path) -> str:
+    """Hash the file of that name in a run's ``tasks/`` or among the shipped; "-" without one.
+
+    What an episode carries is a part of the episode, and of its hash.
+    """
+    try:
+        return find_task_file(name, tasks_dir=tasks_dir).sha256
+    except MissingTaskError:
+        return "-"

@@ -14,14 +14,14 @@ from bridge.episode.topics import TCP_POSE
 from bridge.geometry import se3
 from bridge.task.predicate import PredicateResult, Rollout, all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task
-from evaluator.compare.known_task import known_task
+from evaluator.compare.known_task import recorded_task
 from evaluator.compare.measure import Part, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import LABEL_AGREED, LABEL_AGREED_OF_TASK, LABEL_OBJECTS
 from evaluator.result import Cell, Exclusion, Measurement, Table
 
 AFTER = "end"
-DECIDED_BY_A_LOOK = ("inside", "shape")
+DECIDED_BY_A_LOOK = ("inside", "on", "moved", "shape")
 """Clauses that one localisation decides. Whether something still moves, it cannot say."""
 AWAY_M = 0.12
 """Fingers farther than this from an object's origin do not touch it."""
@@ -64,7 +64,7 @@ def perceive_outcome(
         EpisodeError: When a file turns out to be damaged.
     """
     info = recorded.info
-    task = known_task(info.task) if task is None else task
+    task = recorded_task(recorded) if task is None else task
     if localised is None or task is None:
         return None
     findings = evaluate_success(task, _rollout(recorded, localised, plan_id, task))
@@ -87,7 +87,7 @@ def perceive_outcome(
 
 def _told(findings: list[PredicateResult]) -> str:
     wrong = [f.detail for f in findings if f.value is not True]
-    return "; ".join(wrong) or "; ".join(f.detail for f in findings if f.kind == "inside")
+    return "; ".join(wrong) or "; ".join(f.detail for f in findings if f.kind in ("inside", "on"))
 
 
 def _rollout(recorded: Episode, localised: Episode, plan_id: str, task: Task) -> Rollout:
@@ -110,11 +110,15 @@ def _rollout(recorded: Episode, localised: Episode, plan_id: str, task: Task) ->
         if soft is not None and name in task.objects:
             rest = np.array(task.objects[name].size_m)
             extents[name] = np.stack([rest, np.array(soft["extents_m"])])
-    still = {name: T for name, T in before.items() if name in task.containers}
+    stays = {name for name, model in task.objects.items() if model.fixed} | set(task.containers)
+    still = {name: T for name, T in before.items() if name in stays}
+    unknown = np.full((4, 4), np.nan)
     places = still | after
     return Rollout(
         stamps_ns=np.array([seen_ns - 1, seen_ns]),
-        Ts_base_object={name: np.stack([before.get(name, T), T]) for name, T in places.items()},
+        Ts_base_object={
+            name: np.stack([before.get(name, unknown), T]) for name, T in places.items()
+        },
         finger_contact=_away(recorded, seen_ns, places),
         extents_m=extents,
     )

@@ -8,7 +8,7 @@ from typing import TypeVar
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.coverage.stored import Size, vouch
+from evaluator.statistics.coverage import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
 Item = TypeVar("Item")

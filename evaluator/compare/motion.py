@@ -268,7 +268,7 @@ NUM_WORST = 3
 
 def group_table(groups: Groups) -> Table:
     """Means of each task and condition."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for name, motions in groups.items():
         of_group: dict[tuple[str, str], list[MotionSummary]] = {}
         for motion in motions:
@@ -276,37 +276,30 @@ def group_table(groups: Groups) -> Table:
         for task, condition in sorted(of_group):
             members = of_group[task, condition]
             rows.append(
-                (
-                    task,
-                    condition.replace("_", " "),
-                    name,
-                    len(members),
-                    millimetres(average(members, lambda m: m.position_mean_m)),
-                    millimetres(average(members, lambda m: m.end_point_m)),
-                    degrees(average(members, lambda m: m.rotation_mean_rad)),
-                    milliseconds(average(members, lambda m: m.lag_s)),
-                    millimetres(average(members, lambda m: m.without_lag_mean_m)),
-                    millimetres(average(members, lambda m: m.without_offset_mean_m)),
-                    degrees(average(members, lambda m: m.joint_rms_rad)),
-                )
+                {
+                    "task": task,
+                    "condition": condition.replace("_", " "),
+                    "against": name,
+                    "trials": len(members),
+                    "mean distance (mm)": millimetres(
+                        average(members, lambda m: m.position_mean_m)
+                    ),
+                    "end point (mm)": millimetres(average(members, lambda m: m.end_point_m)),
+                    "mean angle (deg)": degrees(average(members, lambda m: m.rotation_mean_rad)),
+                    "delay (ms)": milliseconds(average(members, lambda m: m.lag_s)),
+                    "without delay (mm)": millimetres(
+                        average(members, lambda m: m.without_lag_mean_m)
+                    ),
+                    "without offset (mm)": millimetres(
+                        average(members, lambda m: m.without_offset_mean_m)
+                    ),
+                    "joints, RMS (deg)": degrees(average(members, lambda m: m.joint_rms_rad)),
+                }
             )
-    return Table(
+    return Table.of(
+        rows,
         id="motion",
         title="Recorded, planned and executed motions",
-        columns=(
-            "task",
-            "condition",
-            "against",
-            "trials",
-            "mean distance (mm)",
-            "end point (mm)",
-            "mean angle (deg)",
-            "delay (ms)",
-            "without delay (mm)",
-            "without offset (mm)",
-            "joints, RMS (deg)",
-        ),
-        rows=tuple(rows),
         note="Tool centre point, means over trials. Planned, executed: recorded against that "
         "replay. Twin: executed against planned replay. Without delay: the recorded motion shifted "
         "in time; without offset: laid over by a rigid motion too.",
@@ -315,7 +308,7 @@ def group_table(groups: Groups) -> Table:
 
 def over_time_table(groups: Groups) -> Table:
     """Errors at eleven places of the execution."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for name, motions in groups.items():
         if not motions:
             continue
@@ -323,21 +316,20 @@ def over_time_table(groups: Groups) -> Table:
         joints = _stacked([m.joint_curve_rad for m in motions if m.joint_curve_rad])
         for place in OVER_TIME:
             arm = degrees(float(joints[:, place].mean())) if len(joints) else None
-            mean = millimetres(float(tool[:, place].mean()))
-            largest = millimetres(float(tool[:, place].max()))
-            rows.append((name, place, len(tool), mean, largest, arm))
-    return Table(
+            rows.append(
+                {
+                    "against": name,
+                    "time (% of the execution)": place,
+                    "trials": len(tool),
+                    "mean distance (mm)": millimetres(float(tool[:, place].mean())),
+                    "largest (mm)": millimetres(float(tool[:, place].max())),
+                    "joints, mean of RMS (deg)": arm,
+                }
+            )
+    return Table.of(
+        rows,
         id="motion_over_time",
         title="Motion errors over time",
-        columns=(
-            "against",
-            "time (% of the execution)",
-            "trials",
-            "mean distance (mm)",
-            "largest (mm)",
-            "joints, mean of RMS (deg)",
-        ),
-        rows=tuple(rows),
         note="From the first to the last instant that both sides of a trial know.",
     )
 
@@ -350,34 +342,25 @@ def _stacked(curves: Sequence[Packed]) -> Float[np.ndarray, "num_curves num_plac
 
 def worst_table(groups: Groups) -> Table:
     """The trials with the largest distances."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for name, motions in groups.items():
         far = sorted(motions, key=lambda motion: -motion.position_max_m)[:NUM_WORST]
         rows += [
-            (
-                name,
-                motion.episode,
-                motion.aligned_by,
-                millimetres(motion.position_max_m),
-                millimetres(motion.position_mean_m),
-                motion.joint_worst,
-                degrees(motion.joint_max_rad),
-            )
+            {
+                "against": name,
+                "episode": motion.episode,
+                "aligned by": motion.aligned_by,
+                "largest distance (mm)": millimetres(motion.position_max_m),
+                "mean distance (mm)": millimetres(motion.position_mean_m),
+                "worst joint": motion.joint_worst,
+                "its error (deg)": degrees(motion.joint_max_rad),
+            }
             for motion in far
         ]
-    return Table(
+    return Table.of(
+        rows,
         id="motion_worst",
         title="The largest motion errors",
-        columns=(
-            "against",
-            "episode",
-            "aligned by",
-            "largest distance (mm)",
-            "mean distance (mm)",
-            "worst joint",
-            "its error (deg)",
-        ),
-        rows=tuple(rows),
         note="The three trials with the largest distance.",
     )
 

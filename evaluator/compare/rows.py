@@ -86,6 +86,8 @@ class TrialRow:
     """What each clause of the planned replay's verdict said, predicates included."""
     gate_clauses: tuple[tuple[str, bool], ...] = ()
     """The same of the verdict before motion."""
+    baselines: tuple[tuple[str, bool], ...] = ()
+    """What forecasts without a twin say of the plan sent, by name; unknown ones are left out."""
     count: int = 1
     """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     began_ns: int = 0

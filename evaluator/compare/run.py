@@ -11,6 +11,7 @@ from bridge.exchange.trials_csv import trials_path
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.bands import BandReport, compare_bands
+from evaluator.compare.baselines import with_rule
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
@@ -68,7 +69,7 @@ def compare_run(
         summaries = sum_up(trials, cache, output, pool)
     recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
     imported, doubled = imported_rows(run, recorded_ids)
-    rows = [*(trial.row for trial in trials), *imported]
+    rows = [*with_rule((trial.row for trial in trials), summaries.rules), *imported]
     nets = open_nets(images.backbones)
     views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)

@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from evaluator.compare.known_task import known_task
+from bridge.episode.reader import Episode
+from evaluator.compare.known_task import known_task, recorded_task
 from evaluator.compare.measure import RATE_COLUMNS, proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
@@ -66,7 +67,7 @@ def stage_results(
         funnel_rows += [
             (task, words, s.name, s.reached, s.passed, s.unknown or None) for s in found
         ]
-        curves = (("trials so far", _survival(found)), *_objects(task, names, ended))
+        curves = (("trials so far", _survival(found)), *_objects(alike[0][0], names, ended))
         curve_rows += [
             (task, words, counted, p.step, *_band(p)) for counted, points in curves for p in points
         ]
@@ -97,7 +98,7 @@ def _survival(stages: Sequence[StageCount]) -> list[CurvePoint]:
 
 
 def _objects(
-    task: str, names: Sequence[str], ended: Sequence[Sequence[bool | None]]
+    row: TrialRow, names: Sequence[str], ended: Sequence[Sequence[bool | None]]
 ) -> tuple[tuple[str, list[CurvePoint]], ...]:
     """Objects that were released where they belong, by control step, for tasks with several.
 
@@ -105,7 +106,7 @@ def _objects(
     object whose stage came and has no known ending is neither; one whose stage was not reached,
     because an earlier one failed, is not where it belongs.
     """
-    known = known_task(task)
+    known = known_task(row.task) if row.path is None else recorded_task(Episode.open(row.path))
     releasing = (
         {str(stage["id"]) for stage in known.stages if stage.get("release")} if known else ()
     )

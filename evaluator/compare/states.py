@@ -9,7 +9,7 @@ import numpy as np
 
 from bridge.episode.reader import Episode
 from bridge.task.task_file import ObjectModel, Task
-from evaluator.compare.known_task import known_task
+from evaluator.compare.known_task import recorded_task
 from evaluator.compare.measure import (
     Part,
     degrees,
@@ -99,7 +99,7 @@ def summarise_states(
     if sent is None:
         return ()
     info = recorded.info
-    task = known_task(info.task) if task is None else task
+    task = recorded_task(recorded) if task is None else task
     last = sent.last_stages()
     seen = recorded_states(sent, localised)
     missing = ObjectState(reason=NOT_LOCALISED)
@@ -191,37 +191,27 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
         position = by_id[_defined(key, "position", "median").id]
         rotation = _number(by_id, key, "rotation")
         extents = _number(by_id, key, "extents")
+        low, high = (millimetres(end) for end in ends(position.interval))
+        mean = by_id[_defined(key, "position", "mean").id]
         rows.append(
-            (
-                key[2],
-                key[3].replace("_", " "),
-                key[0],
-                key[1],
-                position.n,
-                millimetres(position.value),
-                *(millimetres(end) for end in ends(position.interval)),
-                millimetres(by_id[_defined(key, "position", "mean").id].value),
-                None if rotation is None else degrees(rotation.value),
-                None if extents is None else millimetres(extents.value),
-            )
+            {
+                "task": key[2],
+                "condition": key[3].replace("_", " "),
+                "predicted by": key[0],
+                "against": key[1],
+                "objects": position.n,
+                "median distance (mm)": millimetres(position.value),
+                "low (mm)": low,
+                "high (mm)": high,
+                "mean distance (mm)": millimetres(mean.value),
+                "median rotation (deg)": None if rotation is None else degrees(rotation.value),
+                "median extents (mm)": None if extents is None else millimetres(extents.value),
+            }
         )
-    return Table(
+    return Table.of(
+        rows,
         id="final_states",
         title="Predicted against final object states",
-        columns=(
-            "task",
-            "condition",
-            "predicted by",
-            "against",
-            "objects",
-            "median distance (mm)",
-            "low (mm)",
-            "high (mm)",
-            "mean distance (mm)",
-            "median rotation (deg)",
-            "median extents (mm)",
-        ),
-        rows=tuple(rows),
         note="After each object's last stage, when all has settled. plan: the poses the planner "
         "wrote into it; planned, executed: the dynamic replays; recorded: localised after the "
         "execution. Medians over episodes with 95 % intervals from order statistics; rotation is "
@@ -235,38 +225,27 @@ def stage_table(states: Sequence[StateSummary]) -> Table:
     for state in states:
         key = (state.task, state.condition, state.stage, state.predicted_by, state.against)
         groups.setdefault(key, []).append(state)
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for (task, condition, stage, predicted_by, against), members in groups.items():
         positions = [s.position_m for s in members if s.position_m is not None]
         turns = [s.rotation_rad for s in members if s.rotation_rad is not None]
         rows.append(
-            (
-                task,
-                condition.replace("_", " "),
-                stage,
-                predicted_by,
-                against,
-                len(positions),
-                millimetres(median(positions) if positions else None),
-                millimetres(max(positions, default=None)),
-                degrees(median(turns) if turns else None),
-            )
+            {
+                "task": task,
+                "condition": condition.replace("_", " "),
+                "stage": stage,
+                "predicted by": predicted_by,
+                "against": against,
+                "objects": len(positions),
+                "median distance (mm)": millimetres(median(positions) if positions else None),
+                "largest (mm)": millimetres(max(positions, default=None)),
+                "median rotation (deg)": degrees(median(turns) if turns else None),
+            }
         )
-    return Table(
+    return Table.of(
+        rows,
         id="stage_states",
         title="Object states after each stage",
-        columns=(
-            "task",
-            "condition",
-            "stage",
-            "predicted by",
-            "against",
-            "objects",
-            "median distance (mm)",
-            "largest (mm)",
-            "median rotation (deg)",
-        ),
-        rows=tuple(rows),
         note="Objects are localised only while nothing moves, so the recording is asked about the "
         "last stage of each object alone.",
     )

@@ -4,7 +4,6 @@ What is kept follows from the trial's files, the plan sent and the task file, al
 content in the key. Only summaries stay in memory, no series.
 """
 
-import functools
 import gc
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,13 +12,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bridge.data_files import dataset_file
-from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
 from bridge.process_pool import SERIAL, ProcessPool, Serial, cores
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
-from evaluator.compare.known_task import known_task
+from evaluator.compare.baselines import RuleSummary, apply_rule
+from evaluator.compare.known_task import task_sha256
 from evaluator.compare.labels import PerceivedOutcome, perceive_outcome
 from evaluator.compare.motion import MotionSummary, summarise_motions
 from evaluator.compare.states import StateSummary, summarise_states
@@ -40,6 +39,7 @@ class Summaries:
     motions: tuple[MotionSummary, ...] = ()
     states: tuple[StateSummary, ...] = ()
     perceived: tuple[PerceivedOutcome, ...] = ()
+    rules: tuple[RuleSummary, ...] = ()
     left_out: tuple[Exclusion, ...] = ()
     """Trials of which something could not be read."""
 
@@ -144,6 +144,7 @@ def sum_up(
         motions=_in_order(found[MotionSummary], trials),
         states=_in_order(found[StateSummary], trials),
         perceived=_in_order(found[PerceivedOutcome], trials),
+        rules=_in_order(found[RuleSummary], trials),
         left_out=tuple(left_out),
     )
 
@@ -183,6 +184,11 @@ def _perceived(files: _Files) -> tuple[PerceivedOutcome, ...]:
     return () if found is None else (found,)
 
 
+def _rules(files: _Files) -> tuple[RuleSummary, ...]:
+    found = apply_rule(files.recorded, files.localised, plan_id=files.plan_id)
+    return () if found is None else (found,)
+
+
 def _replays_key(trial: Trial) -> str:
     hashes = [trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES]
     return " ".join([trial.file.sha256, *hashes, str(trial.row.plan_id)])
@@ -190,20 +196,17 @@ def _replays_key(trial: Trial) -> str:
 
 def _localised_key(trial: Trial) -> str:
     localised = "-" if trial.localised is None else trial.localised.sha256
-    return f"{trial.file.sha256} {localised} {trial.row.plan_id} {_task_sha256(trial.row.task)}"
+    task = task_sha256(trial.row.task, RunFolder(trial.file.path.parent.parent).tasks_dir)
+    return f"{trial.file.sha256} {localised} {trial.row.plan_id} {task}"
 
 
 def _states_key(trial: Trial) -> str:
     return f"{_replays_key(trial)} {_localised_key(trial)}"
 
 
-@functools.cache
-def _task_sha256(name: str) -> str:
-    return "-" if known_task(name) is None else hash_file(dataset_file("tasks", name))
-
-
 PARTS = (
     _Part(kind=MotionSummary, scope="motion", make=_motions, key=_replays_key),
     _Part(kind=StateSummary, scope="final states", make=_states, key=_states_key),
     _Part(kind=PerceivedOutcome, scope="label", make=_perceived, key=_localised_key),
+    _Part(kind=RuleSummary, scope="baselines", make=_rules, key=_localised_key),
 )

@@ -234,7 +234,7 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
         rows: Trials, each as often as its ``count`` says.
         word: What the recorded side is called: stand-in, real or recorded.
     """
-    lines = []
+    lines: list[dict[str, Cell]] = []
     for name, answer_of in (
         ("sim planned", lambda row: row.sim_planned),
         ("verdict before motion", lambda row: row.verdict),
@@ -244,27 +244,19 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     ):
         counts = confusion_of(rows, answer_of)
         lines.append(
-            (
-                name,
-                counts.true_positive,
-                counts.false_positive,
-                counts.false_negative,
-                counts.true_negative,
-                counts.n,
-            )
+            {
+                "twin": name,
+                f"predicted success, {word} success": counts.true_positive,
+                f"predicted success, {word} failure": counts.false_positive,
+                f"predicted failure, {word} success": counts.false_negative,
+                f"predicted failure, {word} failure": counts.true_negative,
+                "trials": counts.n,
+            }
         )
-    return Table(
+    return Table.of(
+        lines,
         id="confusion",
         title="Prediction of the twin against the outcome",
-        columns=(
-            "twin",
-            f"predicted success, {word} success",
-            f"predicted success, {word} failure",
-            f"predicted failure, {word} success",
-            f"predicted failure, {word} failure",
-            "trials",
-        ),
-        rows=tuple(lines),
         note="Trials with a known outcome in which a plan was executed. A verdict before motion "
         "that predicted failure refused the plan; it was executed anyway, because the answer was "
         "only recorded. With replanning refused plans are not executed, so the gate's misses there "

@@ -4,7 +4,6 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
 from jaxtyping import UInt8
@@ -26,43 +25,36 @@ class ViewPair:
     rendered_u8: UInt8[np.ndarray, "height width 3"]
 
 
-def pairs_html(pairs: Sequence[ViewPair], number: int) -> str:
-    """Write the worst views, worst first; nothing without pictures.
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One side of a pair, as the page holds it."""
 
-    Args:
-        pairs: Views, worst first; as many as fit are shown.
-        number: Number of the figure in the page.
-    """
+    side: str
+    width: int
+    height: int
+    png: str
+    """In base64."""
+
+
+def pictures_of(pairs: Sequence[ViewPair]) -> list[tuple[ViewPair, tuple[Picture, Picture]]]:
+    """Return the first views with their pictures, as many as the page may hold."""
     shown, spent = [], 0
     for pair in pairs[:MAX_PAIRS]:
-        pictures = (_png(pair.recorded_u8), _png(pair.rendered_u8))
-        spent += sum(len(picture) for picture in pictures)
+        recorded, rendered = _png(pair.recorded_u8), _png(pair.rendered_u8)
+        spent += len(recorded) + len(rendered)
         if spent > MAX_BYTES:
             break
+        pictures = (
+            _picture("recorded", pair.recorded_u8, recorded),
+            _picture("rendered", pair.rendered_u8, rendered),
+        )
         shown.append((pair, pictures))
-    if not shown:
-        return ""
-    rows = "".join(
-        f'<div class="pair"><p>{escape(pair.name)} <span class="soft">{escape(pair.score)}</span>'
-        f"</p><div>{_image(pair, 'recorded', recorded)}{_image(pair, 'rendered', rendered)}</div>"
-        "</div>"
-        for pair, (recorded, rendered) in shown
-    )
-    return (
-        f'<figure id="figure-worst" class="whole"><div class="pairs">{rows}</div><figcaption>'
-        f"<b>Figure {number}.</b> <strong>The worst views.</strong> Left as recorded, right as "
-        "rendered from the same camera; worst first, scaled down where they were larger."
-        "</figcaption></figure>"
-    )
+    return shown
 
 
-def _image(pair: ViewPair, side: str, png: bytes) -> str:
-    height, width = (pair.recorded_u8 if side == "recorded" else pair.rendered_u8).shape[:2]
-    data = base64.b64encode(png).decode()
-    return (
-        f'<img alt="{escape(pair.name)}, {side}" width="{width}" height="{height}" '
-        f'src="data:image/png;base64,{data}">'
-    )
+def _picture(side: str, image_u8: UInt8[np.ndarray, "height width 3"], png: bytes) -> Picture:
+    height, width = image_u8.shape[:2]
+    return Picture(side=side, width=width, height=height, png=base64.b64encode(png).decode())
 
 
 def _png(image_u8: UInt8[np.ndarray, "height width 3"]) -> bytes:

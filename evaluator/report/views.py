@@ -207,6 +207,29 @@ def _clauses(frame: "pd.DataFrame") -> "pd.DataFrame":
     return shown
 
 
+def _baselines(frame: "pd.DataFrame") -> "pd.DataFrame":
+    def share(k: str, n: str) -> list[Shown]:
+        def write(row: Record) -> Shown:
+            if not row[n]:
+                return None
+            return Figures(f"{100 * row[k] / row[n]:.0f} %", count=f"{row[k]}/{row[n]}")
+
+        return _each(frame, write)
+
+    def difference(row: Record) -> Shown:
+        if not _known(row["twin more right (pp)"]):
+            return None
+        ends = f"{row['low']:+.1f}, {row['high']:+.1f}" if _known(row["low"]) else ""
+        return Figures(f"{row['twin more right (pp)']:+.1f} pp", ends)
+
+    shown = frame[["asked of", "task", "forecast by"]].copy()
+    shown["right"] = share("right", "trials")
+    shown["PPV"] = share("yes and succeeded", "said yes")
+    shown["NPV"] = share("no and failed", "said no")
+    shown["twin more right"] = _each(frame, difference)
+    return shown
+
+
 def _stopping(frame: "pd.DataFrame") -> "pd.DataFrame":
     def interval(row: Record) -> Shown:
         if not _known(row["low"]):
@@ -272,6 +295,7 @@ _VIEWS: dict[str, Callable[["pd.DataFrame"], "pd.DataFrame"]] = {
     "layout": _layout,
     "success_curve": _curve,
     "sim_varied": _varied,
+    "gate_baselines": _baselines,
     "gate_clauses": _clauses,
     "stopping": _stopping,
     "bands": _bands,

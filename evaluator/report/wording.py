@@ -11,6 +11,9 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.phi", "phi"),
     ("agreement.sim_planned.ppv", "Success when sim says success (PPV)"),
     ("agreement.sim_planned.npv", "Failure when sim says failure (NPV)"),
+    ("baseline.sim_planned.base_rate", "Success whatever sim says (base rate)"),
+    ("baseline.sim_planned.geometric_rule.rate", "Geometric rule and outcome agree"),
+    ("baseline.sim_planned.geometric_rule.twin_gain_pp", "Sim more often right than that rule"),
     ("agreement.verdict.ppv", "Success when the gate accepted (PPV)"),
     ("agreement.pearson_r", "Pearson r over groups"),
     ("agreement.pearson_r.without_replanning", "Pearson r without replanning"),
@@ -99,13 +102,15 @@ def count_text(measurement: Measurement) -> str:
     """Write what the value rests on: ``5/6 trials`` or ``6 groups``."""
     if measurement.n is None:
         return ""
-    counted = measurement.counted or ""
-    if counted and measurement.n != 1:
-        counted = PLURALS.get(counted, f"{counted}s")
-    named = f" {counted}" if counted else ""
+    named = f" {noun(measurement.counted, measurement.n)}" if measurement.counted else ""
     if measurement.k is not None and measurement.value is not None:
         return f"{measurement.k}/{measurement.n}{named}"
     return f"{measurement.n}{named}"
+
+
+def noun(name: str, count: int) -> str:
+    """Write what was counted, in the plural but for one."""
+    return name if count == 1 else PLURALS.get(name, f"{name}s")
 
 
 def ends_text(measurement: Measurement) -> str:

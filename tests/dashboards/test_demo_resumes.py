@@ -212,7 +212,7 @@ def test_a_trial_without_outcome_stands_in_the_end_with_its_cause(
 ) -> None:
     record_all(run)
     monkeypatch.setattr(demo, "_step", lambda *_, **__: None)
-    monkeypatch.setattr(demo, "_record", lambda *_: None)
+    monkeypatch.setattr(demo, "_record", lambda run, config, _: look(run, config))
     monkeypatch.setattr(demo, "_refuse_nothing", lambda *_: None)
     (run.episodes_dir / "trial_0002.mcap").unlink()
     void = Outcome(result="unknown", detail="nothing executed, no verdict (cube not found)")
@@ -248,7 +248,7 @@ def test_no_advice_names_a_folder_that_the_user_did_not_name(
 ) -> None:
     monkeypatch.setattr("bridge.terminal.shutil.which", lambda _: found)
     monkeypatch.chdir(run.path)
-    demo._close(run, QUICK, Output(), 1.0)
+    demo._close(run, QUICK, Output(), 1.0, {})
     printed = capsys.readouterr().out.replace(str(run.path), "RUN")
     assert ".." not in printed
     assert "/" not in printed.replace("RUN/results/report.html", "").replace("RUN", "")

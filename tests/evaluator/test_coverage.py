@@ -1,6 +1,8 @@
 """Intervals hold what they promise, the shipped map says so, and what does not is refused."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,17 +11,9 @@ from scipy.stats import binom
 from evaluator.compare.measure import measured, proportion
 from evaluator.measurements import Defined
 from evaluator.result import Interval
+from evaluator.statistics import coverage as stored
 from evaluator.statistics.bootstrap import METHODS
-from evaluator.statistics.coverage import exact, simulate, stored
-from evaluator.statistics.coverage.exact import newcombe_coverage
-from evaluator.statistics.coverage.simulate import (
-    POPULATIONS,
-    Population,
-    of_agreement,
-    of_remeasurements,
-    truth,
-)
-from evaluator.statistics.coverage.stored import choose_method, holds_from
+from evaluator.statistics.coverage import choose_method, holds_from, newcombe_coverage
 from evaluator.statistics.differences import (
     guaranteed_difference,
     newcombe_difference,
@@ -28,6 +22,17 @@ from evaluator.statistics.differences import (
 from evaluator.statistics.intervals import clopper_pearson, jeffreys, wilson
 from evaluator.statistics.sequential import betting_interval
 from evaluator.statistics.weighted import STATISTICS
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import coverage_drawn as simulate
+import coverage_exact as exact
+from coverage_drawn import (
+    POPULATIONS,
+    Population,
+    of_agreement,
+    of_remeasurements,
+    truth,
+)
 
 REQUIRED = range(5, 101)
 
@@ -261,8 +266,8 @@ def test_coverage_of_unequal_groups_is_counted_out_with_the_interval_itself(
         assert (found.worst, found.mean) == pytest.approx((of_map.worst, of_map.mean), abs=1e-6)
         return
     shares = []
-    for p_first in exact.PAIR_RATES:
-        for p_second in exact.PAIR_RATES:
+    for p_first in stored.PAIR_RATES:
+        for p_second in stored.PAIR_RATES:
             held = 0.0
             for first in range(n_first + 1):
                 for second in range(n_second + 1):

@@ -17,7 +17,8 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 def command_lines() -> list[str]:
     """Lines of the documents' code blocks that call ``robot-gst``."""
     texts = [path.read_text().replace("\\\n", " ") for path in DOCUMENTS]
-    blocks = [block for text in texts for block in re.findall(r"```\n(.*?)```", text, re.DOTALL)]
+    fences = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+    blocks = [block for text in texts for block in fences.findall(text)]
     lines = [line for block in blocks for line in block.splitlines()]
     return sorted(
         {line for line in lines if line.startswith("robot-gst ") and "COMMAND" not in line}

@@ -99,6 +99,12 @@ def find_fixed_camera(
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
 
+    Args:
+        episodes: Whose joints and depth images are used.
+        camera_id: The camera, by its name in the topics.
+        max_postures: At most so many postures at rest are looked at, those farthest apart.
+        seed: Of the alignment's random draws.
+
     Raises:
         RobotNotAlignedError: The images do not determine it, or none shows a robot that stands
             still.
@@ -199,6 +205,11 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     A camera is found from pose pairs of a target where there are some, otherwise, when it stands
     still, from the robot in its depth images.
 
+    Args:
+        run: Whose episodes are read, and in whose scene folder the calibration goes.
+        config: Which camera (empty: all), which pose pairs and mounting.
+        output: Told why a camera was not found.
+
     Raises:
         NothingToCalibrateError: No camera could be found for want of data; says what is missing.
         UndeterminedCameraError: The one camera that was asked for is not determined.
@@ -276,7 +287,13 @@ def _from_target(pairs: PosePairs, config: CalibrateConfig) -> dict[str, Any]:
 
 
 def target_record(found: TargetCamera, pairs: PosePairs, link: str) -> dict[str, Any]:
-    """Say what pose pairs gave."""
+    """Say what pose pairs gave.
+
+    Args:
+        found: The solution, and how the camera is mounted.
+        pairs: What it was found from; its source is recorded.
+        link: Robot link that carries the camera, or the target of a fixed camera.
+    """
     solution = found.solution
     in_hand = found.mount == "hand"
     return {

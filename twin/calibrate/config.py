@@ -38,8 +38,9 @@ class CalibrateConfig:
     are held out."""
     evaluations: int = 50
     """With --physics: points the search tries; the intervals take about 60 more."""
-    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 900.0
-    """With --physics: wall time after which the search ends: 900s, 10min or plain seconds."""
+    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 3600.0
+    """With --physics: a last resort, named where it strikes: wall time after which the search ends
+    before its last point: 1h, 10min or plain seconds."""
     workers: int | None = None
     """With --physics: processes that simulate side by side: one for each core, at most 8, when no
     number is given."""

@@ -29,6 +29,10 @@ def motions(
     """Motions P and Q between pairs of poses, for which P X = X Q.
 
     From A_i X = Z B_i for two poses: P = A_j^-1 A_i and Q = B_j^-1 B_i.
+
+    Args:
+        Ts_a: Poses A of the pairs; see the module.
+        Ts_b: Poses B of the same pairs.
     """
     first, second = np.triu_indices(len(Ts_a), 1)
     if len(first) > MAX_MOTIONS:
@@ -48,6 +52,10 @@ def solve_hand_eye(
     the rotation that lays the rotation vectors of Q over those of P, then linear least squares
     for the translation. The rotation is found by singular values, which unlike their square root
     of a matrix also refuses mirror images.
+
+    Args:
+        Ts_a: Poses A of the pairs, from the robot; see the module.
+        Ts_b: Poses B of the same pairs, from the camera.
     """
     P, Q = motions(Ts_a, Ts_b)
     alpha, beta = se3.vector_from_rotation(P[:, :3, :3]), se3.vector_from_rotation(Q[:, :3, :3])
@@ -70,6 +78,10 @@ def solve_robot_world(
     Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product"
     (2013): with vec(A X B^T) = (B kron A) vec(X), the first singular vectors of the sum of
     R_B kron R_A are the stacked columns of R_X and R_Z; translations follow by least squares.
+
+    Args:
+        Ts_a: Poses A of the pairs, from the robot; see the module.
+        Ts_b: Poses B of the same pairs, from the camera.
     """
     R_a, R_b = Ts_a[:, :3, :3], Ts_b[:, :3, :3]
     total = np.einsum("nij,nkl->ikjl", R_b, R_a).reshape(9, 9)
@@ -221,7 +233,14 @@ def misfits(
     X: Float[np.ndarray, "4 4"],
     Z: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "num_pairs 6"]:
-    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair."""
+    """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair.
+
+    Args:
+        Ts_a: Poses A of the pairs, from the robot; see the module.
+        Ts_b: Poses B of the same pairs, from the camera.
+        X: The transform behind A, such as ``T_hand_camera``.
+        Z: The transform before B, such as ``T_base_target``.
+    """
     E = se3.invert(Z @ Ts_b) @ Ts_a @ X
     return np.concatenate([E[:, :3, 3], se3.vector_from_rotation(E[:, :3, :3])], axis=1)
 
@@ -358,6 +377,12 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
 
     With the camera in the hand X is ``T_effector_camera`` and Z is ``T_base_target``; with a fixed
     camera X is ``T_effector_target`` and Z is ``T_base_camera``.
+
+    Args:
+        pairs: Poses of hand and target at the same instants.
+        mount: Where the camera is said to be: ``hand``, ``fixed``, or ``auto`` to take what fits
+            clearly better.
+        seed: Of the resampling that gives the intervals.
 
     Raises:
         UndeterminedCameraError: Too few pairs, rotations about one axis only, pairs that fit

@@ -116,6 +116,11 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
 
     Poses that are no numbers, as some detectors send when they see nothing, are left out.
 
+    Args:
+        episodes: Those without poses of a target from this camera are passed over.
+        camera_id: The camera, by its name in the topics.
+        link: Robot link whose pose in the base is the other half of a pair.
+
     Raises:
         EpisodeError: An episode with targets has no joint states.
         RobotDescriptionError: No usable robot description, or it lacks the link.

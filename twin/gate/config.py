@@ -24,7 +24,8 @@ class GateConfig:
     cell: str = "standin"
     """Whose plans are judged: topics and the service are below this name."""
     task: str = "cube_into_box"
-    """The task whose objects and success predicate count."""
+    """The task whose objects and success predicate count: a name of the run's tasks/ or of
+    datasets/tasks, or a file."""
     max_steps: int = 100_000
     """Simulated steps behind one verdict, the varied replays' among them: the deadline that gives
     the same verdict on every machine. A plan that alone needs more gets no verdict."""

@@ -64,7 +64,13 @@ def who_moved(
 def turn_between(
     T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> float:
-    """Turn about the vertical from one pose to another, among those that look the same [rad]."""
+    """Turn about the vertical from one pose to another, among those that look the same [rad].
+
+    Args:
+        T_first: Pose of the object in the base frame.
+        T_second: A later pose of it, same frame.
+        model: Its symmetry says which turns look the same; a soft object has none.
+    """
     period = 2 * np.pi if model.soft is not None else yaw_period_rad(model)
     yaws = [np.arctan2(T[1, 0], T[0, 0]) for T in (T_first, T_second)]
     return float(abs(np.mod(yaws[1] - yaws[0] + period / 2, period) - period / 2))
@@ -118,7 +124,12 @@ class Perception(Protocol):
         """When the last message arrived."""
 
     def frames(self, *, max_age_ns: int, max_per_camera: int) -> Any:
-        """The latest frames at rest."""
+        """The latest frames at rest.
+
+        Args:
+            max_age_ns: A camera gives nothing when its last image is older.
+            max_per_camera: At most so many frames of one camera, the newest.
+        """
 
 
 Localise = Callable[[Any, Task, float], Mapping[str, Any]]
@@ -330,7 +341,12 @@ def _newest(frames: Any) -> int:
 
 
 def no_verdict(plan: Plan, reason: str) -> Verdict:
-    """The answer when nothing can be decided: accepted null, with the reason."""
+    """The answer when nothing can be decided: accepted null, with the reason.
+
+    Args:
+        plan: The plan that was asked about; only its id is used.
+        reason: Why nothing can be decided, as the operator reads it.
+    """
     undecided = Factor(value=None)
     return Verdict(
         plan_id=plan.id,

@@ -21,7 +21,8 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import UsageError
-from bridge.task.task_file import load_task
+from bridge.task.find import chosen_task_file
+from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
@@ -38,11 +39,23 @@ class GateError(TwinError):
 
 
 def make_gate(
-    config: GateConfig, perception: Perception, now_ns: Callable[[], int], twin: TwinProcess
+    task: Task,
+    config: GateConfig,
+    perception: Perception,
+    now_ns: Callable[[], int],
+    twin: TwinProcess,
 ) -> Gate:
-    """Put the real localisation and replay behind the gate."""
+    """Put the real localisation and replay behind the gate.
+
+    Args:
+        task: What plans are judged by.
+        config: Limits and deadline.
+        perception: What the cell shows now.
+        now_ns: The clock on which messages arrive; says how long the cell has been silent.
+        twin: The process that localises and replays.
+    """
     return Gate(
-        task=load_task(config.task),
+        task=task,
         config=config,
         perception=perception,
         localise=twin.localise,
@@ -58,6 +71,13 @@ def serve_gate(
 
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
     that it lies before the execution it allows.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        gate: Judges one plan.
+        perception: Says what time it is in the cell.
+        config: Cell, and how many plans may wait.
+        output: Told each verdict in a line.
     """
     publisher = session.publisher(cell_topic(config.cell, VERDICT), schema.VERDICT)
     publishing = threading.Lock()
@@ -87,7 +107,15 @@ def watch_cell(
     *,
     joints: bool = False,
 ) -> None:
-    """Hand the cell's images, transforms, description and events to ``take``; joints if asked."""
+    """Hand the cell's images, transforms, description and events to ``take``; joints if asked.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        cell: Its name, the first part of its topics.
+        take: Called with topic, payload, time of arrival [ns] and type name, from the session's
+            threads.
+        joints: Joint states too.
+    """
 
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)
@@ -104,6 +132,10 @@ def claim_gate(session: Any, cell: str) -> None:
     Whoever asks takes the first answer that comes, and of two gates one may know another task or
     an older scene.
 
+    Args:
+        session: An open ``bridge.wire.session``; the claim lasts as long as it.
+        cell: Name of the cell.
+
     Raises:
         GateError: When there is one already.
     """
@@ -117,7 +149,13 @@ def claim_gate(session: Any, cell: str) -> None:
 
 
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
-    """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
+    """Judge plans until SIGINT or SIGTERM; both end with exit code 0.
+
+    Args:
+        path: The run whose scene and calibration are used.
+        config: Cell, task, connection and limits.
+        output: Told when the gate is ready, and each verdict.
+    """
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
     from twin.scene.localise.live import LiveView  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
@@ -125,7 +163,8 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     if not CELL_NAME.match(config.cell):
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
         raise UsageError(message)
-    run, task = RunFolder.open(path), load_task(config.task)
+    run = RunFolder.open(path)
+    task = chosen_task_file(config.task, tasks_dir=run.tasks_dir).task()
     perception = LiveView(config.cell, read_calibration(run))
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
@@ -135,10 +174,10 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     ):
         claim_gate(session, config.cell)
         watch_cell(session, config.cell, perception.take, joints=perception.needs_joints)
-        gate = make_gate(config, perception, session.now_ns, twin)
+        gate = make_gate(task, config, perception, session.now_ns, twin)
         serve_gate(session, gate, perception, config, output)
         output.say(
-            f"gate ready: {config.task} of cell {config.cell}, service {config.cell}{GATE}, "
+            f"gate ready: {task.name} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{perception.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):

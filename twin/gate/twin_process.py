@@ -154,6 +154,11 @@ class TwinProcess:
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
         """Find a task's objects.
 
+        Args:
+            frames: What the cameras saw at rest, as ``LiveView.frames`` gives them.
+            task: Whose objects are looked for.
+            ends_s: When to be done, on the monotonic clock.
+
         Raises:
             UndecidedError: When there is no answer in time, or none at all.
         """
@@ -163,6 +168,12 @@ class TwinProcess:
 
     def replay(self, plan: Plan, found: Mapping[str, Any], urdf: str, ends_s: float) -> Verdict:
         """Replay a plan from where its objects were found.
+
+        Args:
+            plan: What is to be judged.
+            found: The task's objects as localised, by name.
+            urdf: Description of the robot.
+            ends_s: When to be done, on the monotonic clock.
 
         Raises:
             UndecidedError: When there is no answer in time, or none at all.

@@ -212,7 +212,12 @@ class Arm:
         )
 
     def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
+        """Put the robot into a posture at rest, without simulating.
+
+        Args:
+            joints_rad: Of the arm, from base to hand.
+            width_m: Distance between the finger pads.
+        """
         for index, value in zip(self._arm, joints_rad, strict=True):
             pybullet.resetJointState(
                 self.id, index, float(value), 0.0, physicsClientId=self._client
@@ -226,6 +231,12 @@ class Arm:
         """Set the position targets that the motors follow from the next step on.
 
         Motors keep their orders: one that is already followed is not given again.
+
+        Args:
+            joints_rad: Where the arm is to be, from base to hand.
+            velocity_rad_s: How fast its joints are to move there.
+            width_m: Distance between the finger pads; beyond what the gripper can, the nearest it
+                can.
         """
         order = (_numbers(joints_rad), _numbers(velocity_rad_s))
         if order != self._arm_order:

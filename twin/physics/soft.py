@@ -26,6 +26,11 @@ def rigid_fit(
     """Rigid motion that brings the nodes at rest nearest to where they are.
 
     Squared distances are weighted by mass. Nodes that are no numbers give a pose that is none.
+
+    Args:
+        rest_m: Where the nodes are at rest, in the body's own frame.
+        nodes_m: Where they are now, in the frame the pose is wanted in.
+        mass_fraction: What each node weighs.
     """
     if not np.isfinite(nodes_m).all():
         T = np.eye(4)
@@ -70,7 +75,13 @@ def bind_points(
     nodes_m: Float[np.ndarray, "num_nodes 3"],
     tets: Int32[np.ndarray, "num_tets 4"],
 ) -> Skin:
-    """Barycentric coordinates in the tetrahedron that holds a point, or leaves it out the least."""
+    """Barycentric coordinates in the tetrahedron that holds a point, or leaves it out the least.
+
+    Args:
+        points_m: Points at rest, in the frame of the nodes.
+        nodes_m: The lattice at rest.
+        tets: Node indices of each tetrahedron.
+    """
     corner = nodes_m[tets[:, 0]]
     to_weights = np.linalg.inv(np.swapaxes(nodes_m[tets[:, 1:]] - corner[:, None], 1, 2))
     best = np.full(len(points_m), -np.inf)
@@ -375,7 +386,12 @@ class SoftHealth:
 
 
 def health_of(model: SoftModel, nodes_m: Float[np.ndarray, "num_nodes 3"]) -> SoftHealth:
-    """Compare a body's nodes with its rest state."""
+    """Compare a body's nodes with its rest state.
+
+    Args:
+        model: The body at rest.
+        nodes_m: Where its nodes are now, in any frame.
+    """
     if not np.isfinite(nodes_m).all():
         return SoftHealth(num_inverted=0, max_stretch=np.inf, is_finite=False)
     edges, rest_m = model.rest_edges

@@ -162,7 +162,12 @@ class SoftWorld:
     def add_static(
         self, size_m: Float[np.ndarray, "3"], T_base_box: Float[np.ndarray, "4 4"]
     ) -> None:
-        """Add a box that never moves."""
+        """Add a box that never moves.
+
+        Args:
+            size_m: Whole lengths of the edges.
+            T_base_box: Pose of the box's centre.
+        """
         self._add(
             _Placed(
                 piece=box_piece(size_m, np.eye(4)),
@@ -178,7 +183,14 @@ class SoftWorld:
         mass_kg: float,
         T_base_box: Float[np.ndarray, "4 4"],
     ) -> None:
-        """Add a box that PyBullet moves."""
+        """Add a box that PyBullet moves.
+
+        Args:
+            body: PyBullet's number of it.
+            size_m: Whole lengths of the edges.
+            mass_kg: Spread evenly over the box.
+            T_base_box: Pose of the box's centre.
+        """
         x, y, z = (np.asarray(size_m) ** 2).tolist()
         self._free[body] = self._add(
             _Placed(
@@ -254,7 +266,13 @@ class SoftWorld:
     def add(
         self, object_id: str, model: SoftModel, T_base_object: Float[np.ndarray, "4 4"]
     ) -> None:
-        """Add a soft body at rest."""
+        """Add a soft body at rest.
+
+        Args:
+            object_id: What the task calls it.
+            model: Lattice, skin and material.
+            T_base_object: Where its own frame begins; the lattice is laid there undeformed.
+        """
         rest = model.nodes_m.astype(np.float64)
         friction = self._config.object_friction if model.friction is None else model.friction
         index, _ = add_body(

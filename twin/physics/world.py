@@ -121,7 +121,12 @@ class World:
         self.soft = SoftWorld(self._client, self.robot, urdf, mesh_hulls_m, config)
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
-        """Add solid boxes that never move, one body each; returns the body ids."""
+        """Add solid boxes that never move, one body each; returns the body ids.
+
+        Args:
+            boxes: Centre and whole edge lengths of each [m], in the owner's frame.
+            T_base_owner: Where the owner is.
+        """
         ids = []
         for centre, extents in boxes:
             T_owner_box = np.eye(4)
@@ -133,7 +138,13 @@ class World:
         return ids
 
     def add_table(self, height_m: float, size_m: float = 4.0, thickness_m: float = 0.4) -> int:
-        """Add the table: a slab whose top is at the height."""
+        """Add the table: a slab whose top is at the height.
+
+        Args:
+            height_m: Of the top, over the robot's base.
+            size_m: Length of the slab's sides; the robot stands at their middle.
+            thickness_m: How far the slab reaches down.
+        """
         centre = np.array([0.0, 0.0, height_m - thickness_m / 2])
         extents = np.array([size_m, size_m, thickness_m])
         body = self.add_static([(centre, extents)], np.eye(4))[0]
@@ -155,7 +166,14 @@ class World:
         mass_kg: float,
         T_base_object: Float[np.ndarray, "4 4"],
     ) -> None:
-        """Add a solid box that moves."""
+        """Add a solid box that moves.
+
+        Args:
+            object_id: What the task calls it.
+            size_m: Whole lengths of the edges.
+            mass_kg: Spread evenly over the box.
+            T_base_object: Pose of the box's centre.
+        """
         body = self._box(size_m, mass_kg, T_base_object)
         self._set_friction(body, self.config.object_friction)
         self._anchors.add(body)
@@ -190,7 +208,12 @@ class World:
         )
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating."""
+        """Put the robot into a posture at rest, without simulating.
+
+        Args:
+            joints_rad: Of the arm, from base to hand.
+            width_m: Distance between the finger pads.
+        """
         self.robot.reset(joints_rad, width_m)
         self.soft.place_links()
 

@@ -38,7 +38,12 @@ LAG_STEP_NS = 66_666_668
 
 
 def lag_s(first: Trace, second: Trace) -> float:
-    """By how much the second tool comes later than the first: least mean distance [s]."""
+    """By how much the second tool comes later than the first: least mean distance [s].
+
+    Args:
+        first: The trace that is taken for punctual.
+        second: The one that may come later; negative answers mean that it comes earlier.
+    """
     end = min(first.end_ns, second.end_ns)
     times = np.arange(0, max(end, 1), LAG_STEP_NS)
     here = _positions(first, times)
@@ -57,7 +62,12 @@ def _positions(
 
 
 def without_lag(trace: Trace, lag: float) -> Trace:
-    """The same trace with a lag [s] taken out."""
+    """The same trace with a lag [s] taken out.
+
+    Args:
+        trace: The one that comes late.
+        lag: By how much [s]; negative where it comes early.
+    """
     shift = round(lag * 1e9)
     return replace(
         trace,

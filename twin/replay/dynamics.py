@@ -68,7 +68,12 @@ def spawn(world: World, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> No
 
 
 def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "num_points 3"]:
-    """Points whose convex hull holds the object, in its own frame [m]."""
+    """Points whose convex hull holds the object, in its own frame [m].
+
+    Args:
+        model: The object of the task.
+        soft: Its lattice; None: it is rigid, and its box is taken.
+    """
     if soft is not None:
         return np.asarray(soft.nodes_m, dtype=np.float64)
     return box_corners(np.array(model.size_m))
@@ -79,7 +84,13 @@ def lifted(
     points_m: Float[np.ndarray, "num_points 3"],
     table_height_m: float,
 ) -> Float[np.ndarray, "4 4"]:
-    """Raise an object whose localised pose reaches into the table until it stands just above."""
+    """Raise an object whose localised pose reaches into the table until it stands just above.
+
+    Args:
+        T_base_object: The localised pose; it is not changed.
+        points_m: Outline of the object, in its own frame.
+        table_height_m: Of the table's top, over the robot's base.
+    """
     lowest = float(se3.apply(T_base_object, points_m)[:, 2].min())
     T = T_base_object.copy()
     T[2, 3] += max(0.0, table_height_m + LIFT_M - lowest)
@@ -115,7 +126,12 @@ class States:
 
 
 def num_steps(end_ns: int, config: ReplayConfig) -> int:
-    """Physics steps of a replay whose trajectory ends then, settling before and after included."""
+    """Physics steps of a replay whose trajectory ends then, settling before and after included.
+
+    Args:
+        end_ns: Last time of the trajectory, from its start.
+        config: Rate of the physics and times to settle.
+    """
     return round(config.settle_before_s * config.physics.rate_hz) + _steps_kept(end_ns, config)
 
 
@@ -134,6 +150,12 @@ def simulate(
 
     Every run of the same inputs gives the same bits: one fresh client, fixed steps. A soft body
     that bursts ends it: what comes after would be noise.
+
+    Args:
+        path: Joints and gripper widths over time.
+        scene: Where the objects are at the start.
+        hulls: The robot's convex pieces, which stand for its meshes.
+        config: Physics, grasp, rates and times to settle.
     """
     rate = config.physics.rate_hz
     stride = rate // config.sample_rate_hz

@@ -21,6 +21,10 @@ LARGEST_GAP_NS = 500_000_000
 def check_length(length_ns: int, plan: Plan) -> None:
     """Refuse an execution that took longer than any trajectory that is replayed.
 
+    Args:
+        length_ns: Of the execution.
+        plan: What was executed; named in the message.
+
     Raises:
         UnusablePlanError: Saying how long.
     """
@@ -77,6 +81,10 @@ def check_track(track: JointTrack, what: str, plan: Plan) -> None:
 def gripper_widths(widths: JointTrack, plan: Plan) -> JointTrack:
     """The recorded distances between the finger pads [m] alone, if that is what they are.
 
+    Args:
+        widths: The gripper's joints as they were recorded.
+        plan: What was executed; named in messages.
+
     Raises:
         UnusablePlanError: For several joints of which none has the name, for what ``check_track``
             refuses, and for numbers that no distance between these pads can be: radians,
@@ -132,6 +140,12 @@ def path_of_execution(
     is ``squeeze_m`` narrower and the force limit holds the object. A kinematic replay shows the
     recorded width.
 
+    Args:
+        track: Recorded joints; the first sample is time 0 of the path.
+        widths: Recorded widths of the gripper, on the same clock.
+        plan: What was executed: says when the gripper was to be closed.
+        config: Mode and ``squeeze_m``.
+
     Raises:
         UnusablePlanError: When a track is empty, has gaps, names other joints, or holds what is no
             posture or no width.
@@ -172,6 +186,11 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
     """The samples of an interval, with the track's value at its very start put first.
 
     A sample at the end is not made up: where the recording stops early, so does the track.
+
+    Args:
+        track: A recording of joints.
+        start_ns: First instant, on the track's clock; the track's value there is interpolated.
+        end_ns: Last instant, same clock.
     """
     inside = (track.stamps_ns > start_ns) & (track.stamps_ns <= end_ns)
     return JointTrack(
@@ -211,7 +230,13 @@ def closed_mask(
     width_m: Float[np.ndarray, " num_samples"],
     plan: Plan,
 ) -> Bool[np.ndarray, " num_samples"]:
-    """Say when the fingers were closed on something, from the plan's wish and their own motion."""
+    """Say when the fingers were closed on something, from the plan's wish and their own motion.
+
+    Args:
+        times_ns: When the widths were recorded, ascending, from the start of the execution.
+        width_m: Distance between the finger pads.
+        plan: Says when the gripper was to be closed.
+    """
     closed = np.zeros(len(times_ns), dtype=bool)
     for start_ns, end_ns in _closed_intervals(plan):
         window = np.flatnonzero((times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS))

@@ -30,7 +30,12 @@ class Failure:
 
 
 def factor_from(failures: Sequence[Failure], *, undecided: str | None = None) -> Factor:
-    """Report the earliest failure; without one True, or None when something is undecided."""
+    """Report the earliest failure; without one True, or None when something is undecided.
+
+    Args:
+        failures: All that were found, in any order.
+        undecided: What could not be decided; None: everything could.
+    """
     if failures:
         first = min(failures, key=lambda failure: failure.t_ns)
         return Factor(

@@ -20,7 +20,7 @@ from bridge.errors import EpisodeError, GstError
 from bridge.task.plan import Plan
 from bridge.task.predicate import evaluate_success
 from bridge.task.record import parse_record
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from twin.physics.engine import ENGINE
 from twin.replay.config import ReplayConfig
@@ -73,7 +73,7 @@ class ReplayJob:
     start_ns: int
     end_ns: int | None
     """Of the recorded execution, None for a plan that was never executed."""
-    task: str
+    task: Task
     start: StartState
     scene_hash: str | None
     config: ReplayConfig
@@ -110,7 +110,7 @@ class ReplayJob:
         """How long it takes, compared with others."""
         if self.config.mode == "kinematic":
             return 0.1 * self.duration_s
-        bodies = 1 + len(load_task(self.task).soft_objects)
+        bodies = 1 + len(self.task.soft_objects)
         return (1 + self.config.samples) * bodies * self.duration_s
 
     def needed_paths(self) -> tuple[Path, ...]:
@@ -144,12 +144,12 @@ class ReplayJob:
         """What the settings hash covers: settings, inputs, engine and code version."""
         return {
             "replay_version": REPLAY_VERSION,
-            "engine": engine_of(load_task(self.task), self.config),
+            "engine": engine_of(self.task, self.config),
             "episode_sha256": self.episode_sha256,
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,
             "scene_hash": self.scene_hash,
-            "task": asdict(load_task(self.task)),
+            "task": asdict(self.task),
             "Ts_base_object": {name: T.tolist() for name, T in self.start.Ts_base_object.items()},
             "config": asdict(self.config),
             "shapes": dict(self.shapes),
@@ -196,7 +196,12 @@ def divergence_of(episode: Episode) -> dict[str, Any] | None:
 
 
 def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
-    """Return the row of a trajectory that was not evaluated, with the reason."""
+    """Return the row of a trajectory that was not evaluated, with the reason.
+
+    Args:
+        job: The replay that was asked for.
+        message: Why it was not made.
+    """
     why = message.removeprefix(NOT_EVALUATED)
     return {**_row(job), "error": f"{NOT_EVALUATED}{why}", "reason": f"{NOT_EVALUATED}{why}"}
 
@@ -205,7 +210,7 @@ def _row(job: ReplayJob) -> dict[str, Any]:
     return {
         "episode": job.episode_path.stem,
         "plan": job.plan_id,
-        "task": job.task,
+        "task": job.task.name,
         "trajectory": job.trajectory,
         "mode": job.config.mode,
         "executed": job.was_executed,
@@ -229,7 +234,14 @@ def judged(
     *,
     skipped: bool = False,
 ) -> dict[str, Any]:
-    """Return the row of a trajectory with its verdict, and where it diverges from the others."""
+    """Return the row of a trajectory with its verdict, and where it diverges from the others.
+
+    Args:
+        job: The replay that was asked for.
+        verdict: What came out.
+        divergence: Where planned, executed and recorded part; None: they were not compared.
+        skipped: The verdict was there from an earlier run.
+    """
     return {
         **_row(job),
         "skipped": skipped,
@@ -264,7 +276,12 @@ Findings = dict[tuple[str, str], bool | None]
 
 
 def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
-    """What the success predicates, and the one on contacts, say of the recording itself."""
+    """What the success predicates, and the one on contacts, say of the recording itself.
+
+    Args:
+        recording: What was measured during one execution.
+        config: Limits that contacts are inferred with.
+    """
     robot = load_robot(recording.scene.urdf)
     rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
     task = recording.scene.task
@@ -284,7 +301,7 @@ def compare(job: ReplayJob, result: ReplayResult, recording: Recording, end_ns: 
     executed = trace_of_result(result, "executed", end_ns)
     recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)
     traces = [executed, recorded]
-    task = load_task(job.task)
+    task = job.task
     findings = {
         "executed": _findings(findings_of(task, result.rollout(), "replayed")),
         "recorded": {
@@ -387,7 +404,7 @@ def _open(job: ReplayJob) -> _Source:
             hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
     plan = streams.plans(episode)[job.plan_index][1]
-    task = load_task(job.task)
+    task = job.task
     rebuilt = (
         RebuiltScene()
         if job.run_path is None

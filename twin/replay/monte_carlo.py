@@ -69,7 +69,13 @@ class Variation:
 
 
 def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
-    """The generator of one sample: the same for the same seed, start and index, anywhere."""
+    """The generator of one sample: the same for the same seed, start and index, anywhere.
+
+    Args:
+        seed: Of the whole evaluation.
+        identity: Of the start; the same one draws the same variations.
+        index: Number of the sample.
+    """
     digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
 
@@ -80,6 +86,11 @@ def draw_variation(rng: np.random.Generator, scene: ReplayScene, config: ReplayC
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
     given those. Turns that look the same are the same.
+
+    Args:
+        rng: Of this sample; see ``sample_rng``.
+        scene: Nominal poses, their covariances and the task's objects.
+        config: Nominal physics, and how far to vary around it.
     """
     settings = config.variation
     factors = {
@@ -258,6 +269,10 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     """Add the share of accepted samples with its Wilson interval; without samples nothing.
 
     A sample that could not be decided counts among those that were not accepted.
+
+    Args:
+        verdict: Of the nominal replay.
+        samples: What came out of the varied ones.
     """
     if not samples:
         return verdict

@@ -32,7 +32,12 @@ _SPEED_SLACK = 1.02
 def outside_limits(
     robot: RobotModel, joints_rad: Float[np.ndarray, "num_steps num_joints"]
 ) -> Bool[np.ndarray, "num_steps num_joints"]:
-    """Say which joints are beyond their limits by more than rounding."""
+    """Say which joints are beyond their limits by more than rounding.
+
+    Args:
+        robot: Its ``lower_rad`` and ``upper_rad`` count.
+        joints_rad: Postures, joints from base to hand.
+    """
     return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
         joints_rad > robot.upper_rad + _LIMIT_SLACK_RAD
     )
@@ -41,7 +46,14 @@ def outside_limits(
 def limit_failure(
     robot: RobotModel, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], joint: int
 ) -> Failure:
-    """Name a joint that is beyond its limits."""
+    """Name a joint that is beyond its limits.
+
+    Args:
+        robot: Whose limits.
+        t_ns: When, from the start of the trajectory.
+        joints_rad: The posture then.
+        joint: Position of the joint in ``ARM_JOINTS``.
+    """
     return Failure(
         t_ns=t_ns,
         cause="joint_limit",
@@ -57,7 +69,14 @@ def jumps(
     robot: RobotModel,
     config: ReplayConfig,
 ) -> list[Failure]:
-    """Find the first jump and the first excess of speed between neighbouring postures."""
+    """Find the first jump and the first excess of speed between neighbouring postures.
+
+    Args:
+        times_ns: Of the postures, ascending.
+        joints_rad: Postures, joints from base to hand.
+        robot: Gives the limits of speed.
+        config: Gives the largest step, ``max_joint_step_rad``.
+    """
     if len(times_ns) < 2:
         return []
     steps = np.abs(np.diff(joints_rad, axis=0))
@@ -104,6 +123,10 @@ class UnusablePlanError(TwinError):
 
 def check_usable(plan: Plan, robot: RobotModel) -> None:
     """Refuse what no robot, or not this one, could follow.
+
+    Args:
+        plan: As it was sent.
+        robot: Who would follow it.
 
     Raises:
         UnusablePlanError: Naming the first thing that is wrong.
@@ -413,7 +436,14 @@ def _check_given(
 def check_path(
     path: JointPath, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
 ) -> list[Failure]:
-    """Find joint limits, jumps, excess speed and self-collision along an interpolated path."""
+    """Find joint limits, jumps, excess speed and self-collision along an interpolated path.
+
+    Args:
+        path: Joints and gripper widths over time.
+        robot: Gives limits of angle and speed.
+        hulls: The same robot's convex pieces; they are moved along the path.
+        config: Step along the path [s], and the largest joint step.
+    """
     failures = []
     outside = outside_limits(robot, path.joints_rad)
     if np.any(outside):

@@ -62,7 +62,12 @@ class Correction:
     def nodes_as_seen(
         self, nodes_m: Float[np.ndarray, "num_nodes 3"], T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "num_nodes 3"]:
-        """The same for the nodes of a soft object: moved as its pose is."""
+        """The same for the nodes of a soft object: moved as its pose is.
+
+        Args:
+            nodes_m: Where they are for the robot, base frame.
+            T_base_object: Pose of the object there; its bias is about this pose's vertical.
+        """
         if not any(self.bias):
             return nodes_m
         T_seen_base = self.as_seen(T_base_object) @ se3.invert(T_base_object)
@@ -121,6 +126,10 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     """Use calibrated physics, but for the fields that the user set to something of their own.
 
     Samples then vary what was identified by as much as the calibration leaves open.
+
+    Args:
+        config: As the user set it.
+        calibration: Of the run; None: there is none, and nothing changes.
     """
     if calibration is None:
         return config
@@ -148,6 +157,10 @@ def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
     """Press as hard as the task says the gripper is set, unless user or calibration said otherwise.
 
     A force that holds a wooden cube crushes a toy.
+
+    Args:
+        config: With calibrated physics, where there is a calibration.
+        task: May say how hard the gripper presses.
     """
     if task.grip_force_N is None or config.physics.grip_force_N != PhysicsConfig().grip_force_N:
         return config
@@ -260,6 +273,10 @@ class RebuiltScene:
 
 def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
     """Read what the scene folder of a run knows about a task's objects.
+
+    Args:
+        run: Whose scene folder is read; without ``scene.json`` only the calibration is.
+        task: Says which objects are looked up.
 
     Raises:
         UnreadableSceneError: When ``scene.json`` cannot be understood.

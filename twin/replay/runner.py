@@ -14,7 +14,7 @@ from bridge.episode.streams import execution_ns
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.process_pool import Failed, Runner
 from bridge.task.plan import Plan
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
@@ -101,7 +101,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
     task_name = replayed_task(episode, plans)
     if task_name is None:
         return []
-    task = load_task(task_name)
+    task = streams.task_file(episode, task_name).task()
     starts = localised_starts(
         run, episode, task, scene_hash=item.scene_hash, force=config.relocalise
     )
@@ -121,7 +121,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
             trajectory="planned",
             start_ns=start_ns,
             end_ns=None if interval is None else interval[1],
-            task=task_name,
+            task=task,
             start=starts.at(start_ns),
             scene_hash=item.scene_hash,
             config=replace(replay, mode="dynamic", samples=config.samples),
@@ -142,7 +142,13 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
 
 
 def replayed_task(episode: Episode, plans: list[tuple[int, Plan]]) -> str | None:
-    """Name the task an episode's plans are judged by; None when it is not one to replay."""
+    """Name the task an episode's plans are judged by; None when it is not one to replay.
+
+    Args:
+        episode: Only trials are replayed.
+        plans: The episode's plans with their times [ns]; the first names the task where the episode
+            does not.
+    """
     if episode.info.kind != "trial" or not plans:
         return None
     return episode.info.task or plans[0][1].task
@@ -223,8 +229,7 @@ def replay_trajectories(
     jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
     _say_what_is_missing(run, jobs, output)
     if config.render:
-        tasks = sorted({job.task for job in jobs})
-        for note in describe_undrawn(read_record(run) or {}, tasks):
+        for note in describe_undrawn(read_record(run) or {}, _tasks(jobs)):
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
@@ -304,13 +309,19 @@ def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str 
 
 def _say_what_is_missing(run: RunFolder, jobs: list[ReplayJob], output: Output) -> None:
     """Tell what the task file stands in for, once for all replays of a task."""
-    for task in sorted({job.task for job in jobs}):
+    for task in _tasks(jobs):
         try:
-            notes = read_rebuilt_scene(run, load_task(task)).notes
+            notes = read_rebuilt_scene(run, task).notes
         except GstError:  # which each of its replays will say
             continue
         for note in notes:
-            output.say(f"{task}: {note}")
+            output.say(f"{task.name}: {note}")
+
+
+def _tasks(jobs: Iterable[ReplayJob]) -> list[Task]:
+    """The tasks that are replayed, each once: two versions of a file are two tasks."""
+    found = sorted((job.task for job in jobs), key=lambda task: task.name)
+    return [task for index, task in enumerate(found) if task not in found[:index]]
 
 
 def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
@@ -339,7 +350,7 @@ def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator
                 yield answer
 
 
-def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[str]) -> list[str]:
+def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[Task]) -> list[str]:
     """Name what the rebuilt scene has no Gaussians of.
 
     Args:
@@ -347,8 +358,8 @@ def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[str]) -> list[st
         tasks: Tasks whose objects the replays move.
     """
     found = []
-    for name in tasks:
-        missing = [key for key in load_task(name).objects if key not in record.get("objects", {})]
+    for task in tasks:
+        missing = [key for key in task.objects if key not in record.get("objects", {})]
         if missing:
             because = record.get("objects_remark")
             reason = f" ({because})" if because else ""

@@ -123,6 +123,13 @@ def localised_starts(
     """Localise an episode's objects once, keep the answer as a derived episode, and read it.
 
     An episode that cannot be localised gives states without poses, with the reason.
+
+    Args:
+        run: Where the derived episode is kept.
+        episode: What was recorded.
+        task: Whose objects are looked for.
+        scene_hash: Of the scene the poses are meant for; None: there is none.
+        force: Localise again even where an answer is kept.
     """
     phases = quiet_phases(episode)
     try:

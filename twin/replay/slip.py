@@ -81,7 +81,12 @@ def _grasped(plan: Plan, t_ns: int) -> str | None:
 
 
 def slips(holds: Sequence[GraspedObject], limit_m: float) -> list[Failure]:
-    """The holds in which an object moves farther than a limit, from when it does."""
+    """The holds in which an object moves farther than a limit, from when it does.
+
+    Args:
+        holds: Objects that were carried.
+        limit_m: How far one may move in the hand.
+    """
     failures = []
     for hold in holds:
         beyond = hold.moved_m > limit_m
@@ -103,5 +108,10 @@ def slips(holds: Sequence[GraspedObject], limit_m: float) -> list[Failure]:
 
 
 def unless_slipped(factor: Factor, failures: Sequence[Failure]) -> Factor:
-    """The terminal factor, false where it is not yet and an object slipped."""
+    """The terminal factor, false where it is not yet and an object slipped.
+
+    Args:
+        factor: What the success predicates say.
+        failures: The slips that were found.
+    """
     return factor if factor.value is False or not failures else factor_from(failures)

@@ -41,7 +41,12 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
 
 
 def recorded_labels(run: RunFolder, episode_ids: Sequence[str]) -> dict[str, str]:
-    """What the operator said of each episode: success, failure or unknown."""
+    """What the operator said of each episode: success, failure or unknown.
+
+    Args:
+        run: Whose episodes they are.
+        episode_ids: Which are asked for; one that cannot be read counts as unknown.
+    """
     labels = {}
     for episode_id in episode_ids:
         try:
@@ -62,7 +67,12 @@ def _label(run: RunFolder, episode_id: str) -> str:
 
 
 def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """One entry per executed plan: what each side says, and where they diverge first."""
+    """One entry per executed plan: what each side says, and where they diverge first.
+
+    Args:
+        rows: One for each replayed trajectory and mode.
+        labels: What the operator said, by episode.
+    """
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if not row["executed"]:

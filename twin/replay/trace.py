@@ -51,7 +51,14 @@ class Trace:
 
 
 def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
-    """The trace of a replay in memory."""
+    """The trace of a replay in memory.
+
+    Args:
+        result: The replay.
+        side: What it is called beside the others: planned or executed.
+        end_ns: When the trajectory ends, from its start; what settles after it is not part of the
+            trace.
+    """
     return Trace(
         side=side,
         tool=poses_over(result.stamps_ns, result.Ts_base_tcp),
@@ -111,7 +118,12 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
 def poses_over(
     stamps_ns: Int[np.ndarray, " num_poses"], Ts: Float[np.ndarray, "num_poses 4 4"]
 ) -> PoseTrajectory:
-    """Transforms over time as a trajectory."""
+    """Transforms over time as a trajectory.
+
+    Args:
+        stamps_ns: When, ascending.
+        Ts: Poses at these instants, in any one frame.
+    """
     q, p = se3.split(Ts)
     return PoseTrajectory(stamps_ns, p, q)
 
@@ -186,7 +198,13 @@ class Recording:
 
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:
-    """The recorded trace; objects only at the instants at which they were localised."""
+    """The recorded trace; objects only at the instants at which they were localised.
+
+    Args:
+        recording: What was measured during one execution.
+        robot: Gives the tool's pose from the joints.
+        rate_hz: How often the tool is sampled.
+    """
     times = _times(recording.path, rate_hz)
     movable = recording.scene.movable()
     seen = np.array([0, max(recording.end_seen_ns, recording.path.end_ns() + 1)])
@@ -208,7 +226,14 @@ def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) ->
 def rollout_of_recording(
     recording: Recording, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
 ) -> Rollout:
-    """The recorded states with the contacts that follow from joints and carried objects."""
+    """The recorded states with the contacts that follow from joints and carried objects.
+
+    Args:
+        recording: What was measured during one execution.
+        robot: The robot that was recorded.
+        hulls: Its convex pieces.
+        config: Limits that contacts are inferred with.
+    """
     monitor = _watched(recording, robot, hulls, config)
     states = states_of_recording(recording, robot)
     return replace(states, contacts=monitor.contacts(), contacts_inferred=True)
@@ -218,6 +243,10 @@ def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
     """The recorded states that success predicates read: localised before and after.
 
     One look afterwards does not say whether anything still moves: ``settled`` stays undecided.
+
+    Args:
+        recording: What was measured during one execution.
+        robot: Says where the tool was at the end.
     """
     scene, end = recording.scene, recording.end
     fixed = scene.containers()

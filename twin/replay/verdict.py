@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
+from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
     ALLOWED_CONTACTS,
@@ -51,6 +52,13 @@ def terminal_factor(
 
     A soft body that burst, or is turned inside out, makes it false whatever the task asks: the
     middle of a burst body may well lie in the basket.
+
+    Args:
+        result: States, contacts and shapes over time.
+        scene: Its task has the success predicates.
+        config: Only its mode counts.
+        unreachable_ns: From when on waypoints cannot be reached; None: all can.
+        burst: The soft body that burst first; None: none did.
     """
     if config.mode == "kinematic":
         return Factor(value=None, detail="a kinematic replay does not move objects")
@@ -78,7 +86,7 @@ def terminal_factor(
         value=False,
         first_t_ns=end_ns,
         cause=findings[index].kind,
-        bodies=tuple(spec[key] for key in ("object", "container") if key in spec),
+        bodies=tuple(spec[key] for key in REFERENCES if key in spec),
         detail=_once(finding.detail for finding in findings if finding.value is False),
     )
 
@@ -96,7 +104,7 @@ def _why_open(findings: list[PredicateResult], scene: ReplayScene) -> str:
     lost = scene.missing()
     told = []
     for spec, finding in zip(scene.task.success, findings, strict=True):
-        if spec.get("object") in lost or spec.get("container") in lost:
+        if any(spec.get(key) in lost for key in REFERENCES):
             told.append(scene.describe_missing())
         elif finding.value is None:
             told.append(finding.detail)
@@ -134,7 +142,12 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
 
 
 def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
-    """What does not change the verdict but should be known."""
+    """What does not change the verdict but should be known.
+
+    Args:
+        scene: Its task has the success predicates.
+        result: What was replayed.
+    """
     warnings = []
     if already_true_at_start(scene.task, result.rollout()):
         warnings.append(HELD_BEFORE)
@@ -164,6 +177,11 @@ SOFT_ENGINE = "xpbd"
 
 def replay_plan(plan: Plan, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
     """Replay what a plan commands: waypoints, inverse kinematics, motors, objects.
+
+    Args:
+        plan: Waypoints and stages.
+        scene: Where objects are at the start, and what stands still.
+        config: Mode, physics and limits.
 
     Raises:
         UnusablePlanError: When the plan has no usable waypoints.
@@ -272,7 +290,13 @@ def _clearance_m(
 
 
 def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
-    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move.
+
+    Args:
+        path: Joints and gripper widths over time.
+        scene: Its containers stand where they are.
+        config: Gives the rate of the samples.
+    """
     count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
     stamps: Int[np.ndarray, " num_steps"] = (
         np.linspace(0, path.end_ns(), count).round().astype(np.int64)
@@ -314,7 +338,12 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
-    """Name what moved things: a grasp that is no friction grasp is part of the name."""
+    """Name what moved things: a grasp that is no friction grasp is part of the name.
+
+    Args:
+        task: Whether it has soft objects.
+        config: Mode and kind of grasp.
+    """
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""

@@ -87,7 +87,12 @@ class Batches(Generic[Item]):
         return batch
 
     def learn(self, batch: Sequence[Item], seconds: float) -> None:
-        """Remember how long a task took where it was done."""
+        """Remember how long a task took where it was done.
+
+        Args:
+            batch: The items that were done together.
+            seconds: Time that took on the worker.
+        """
         self._spent_s += seconds
         self._done_cost += sum(self._cost(item) for item in batch)
 
@@ -176,6 +181,11 @@ class RayRunner:
         """See ``Runner``. What shared a task with work that lost its node is done again alone.
 
         Alone it is tried once more by Ray itself.
+
+        Args:
+            function: Done with each item, on whichever node is free.
+            items: What is to be done; they and the answers travel between nodes.
+            cost: How long an item takes, in any unit: the longest are begun first.
         """
         ray = self._ray
         processors = self._processors()
@@ -385,6 +395,11 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     """Replay all trial episodes of a run on what the settings ask for.
 
     See ``twin.replay.runner.replay_trajectories``, and what ``runner_for`` raises.
+
+    Args:
+        run: Whose trials are replayed.
+        config: Which trajectories and modes, how many samples, and where they are computed.
+        output: Shows progress.
 
     Raises:
         UsageError: When the folder holds no episode.

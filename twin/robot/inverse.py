@@ -42,7 +42,13 @@ def pose_error(
     joints_rad: Float[np.ndarray, " num_joints"],
     T_base_tcp: Float[np.ndarray, "4 4"],
 ) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between where joints put the tool and a wanted pose."""
+    """Distance [m] and angle [rad] between where joints put the tool and a wanted pose.
+
+    Args:
+        robot: Gives the tool's pose.
+        joints_rad: Of the arm, from base to hand.
+        T_base_tcp: Where the tool is wanted.
+    """
     error = pin.SE3(robot.T_base_tcp(joints_rad)).actInv(pin.SE3(T_base_tcp))
     return float(np.linalg.norm(error.translation)), float(np.linalg.norm(pin.log3(error.rotation)))
 
@@ -55,6 +61,12 @@ def solve_ik(
     warm_start_rad: Float[np.ndarray, " num_joints"] | None = None,
 ) -> IkSolution:
     """Find joints within their limits that reach a pose, near the warm start where there is one.
+
+    Args:
+        robot: Gives poses and limits.
+        T_base_tcp: Where the tool is wanted.
+        config: Tolerances, steps, restarts and their seed.
+        warm_start_rad: Joints to start from; None: ``HOME_RAD``.
 
     Returns:
         The best solution found; ``reached`` says whether it is one.

@@ -83,6 +83,10 @@ def _mimic(name: str, element: ET.Element, leaders: set[str]) -> Mimic:
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
     """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted.
 
+    Args:
+        urdf: Text of the description.
+        keep_visuals: Leave what is drawn in; collision elements always stay.
+
     Raises:
         RobotDescriptionError: When the text is not a URDF.
         UsageError: When a mesh is not there, or is in an unknown package.
@@ -267,7 +271,12 @@ class RobotModel:
     def configuration(
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, " num_values"]:
-        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order."""
+        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order.
+
+        Args:
+            joints_rad: Of the arm, from base to hand.
+            width_m: Distance between the finger pads.
+        """
         q = self._neutral.copy()
         q[self.arm_ids] = joints_rad
         for index, finger in self._fingers:
@@ -292,6 +301,11 @@ class RobotModel:
         self, link: str, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:
         """Pose of any link or frame.
+
+        Args:
+            link: Name in the description.
+            joints_rad: Of the arm, from base to hand.
+            width_m: Distance between the finger pads.
 
         Raises:
             RobotDescriptionError: Listing the frames that exist.

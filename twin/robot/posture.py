@@ -119,7 +119,12 @@ class PostureTrack:
 def distinct_postures(
     joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int
 ) -> list[int]:
-    """Choose at most so many postures far from each other, farthest first, until none is new."""
+    """Choose at most so many postures far from each other, farthest first, until none is new.
+
+    Args:
+        joints_rad: Postures to choose from; the first is always chosen.
+        count: At most so many.
+    """
     chosen = [0]
     far = np.abs(joints_rad - joints_rad[0]).max(axis=1)
     while len(chosen) < count and far.max() > APART_RAD:
@@ -152,6 +157,10 @@ def posture_track(episode: Episode) -> PostureTrack:
 
 def check_joints(arm: JointTrack, source: str) -> None:
     """See that joint states are of the robots that are known here.
+
+    Args:
+        arm: Joint states as they came.
+        source: Who sent them, as the message names it.
 
     Raises:
         RobotDescriptionError: A joint of the arm is missing in what a source sent.

@@ -46,7 +46,12 @@ class Nearest:
 
 
 def link_poses(robot: RobotModel, posture: Posture) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Pose ``T_base_link`` of every frame of the description."""
+    """Pose ``T_base_link`` of every frame of the description.
+
+    Args:
+        robot: The description.
+        posture: Joints and gripper width.
+    """
     q = robot.configuration(posture.joints_rad, posture.width_m)
     pin.framesForwardKinematics(robot.model, robot.data, q)
     return {
@@ -112,7 +117,12 @@ class PosedSurface:
     def near_box(
         self, p_base: Float[np.ndarray, "num_points 3"], margin_m: float
     ) -> Int64[np.ndarray, " num_near"]:
-        """Which points lie in the bounding box of a shape grown by a margin; others are far."""
+        """Which points lie in the bounding box of a shape grown by a margin; others are far.
+
+        Args:
+            p_base: Points in the base frame [m].
+            margin_m: How far the boxes are grown to each side.
+        """
         lows, highs = (np.array(ends) for ends in zip(*self._boxes, strict=True))
         around = (p_base > lows.min(axis=0) - margin_m) & (p_base < highs.max(axis=0) + margin_m)
         candidates = np.flatnonzero(around.all(axis=1))
@@ -143,7 +153,12 @@ class PosedSurface:
         rays_camera: Float[np.ndarray, "*shape 3"],
         T_base_camera: Float[np.ndarray, "4 4"],
     ) -> Float32[np.ndarray, "*shape"]:
-        """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss."""
+        """Depth at which rays with z = 1 in the camera meet the robot; infinite where they miss.
+
+        Args:
+            rays_camera: Directions in the camera's frame, such as ``Camera.rays`` gives.
+            T_base_camera: Where the camera is.
+        """
         turned = rays_camera @ T_base_camera[:3, :3].T
         origin = np.broadcast_to(T_base_camera[:3, 3], turned.shape)
         rays = np.concatenate([origin, turned], axis=-1).astype(np.float32)
@@ -153,7 +168,14 @@ class PosedSurface:
 def sample_surface(
     robot: RobotModel, posture: Posture, count: int, seed: int
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points of the posed robot, evenly over its area, in the base frame [m]."""
+    """Points of the posed robot, evenly over its area, in the base frame [m].
+
+    Args:
+        robot: The description.
+        posture: Joints and gripper width.
+        count: How many points.
+        seed: Of the draw.
+    """
     poses = link_poses(robot, posture)
     corners = np.concatenate(
         [

@@ -105,7 +105,12 @@ def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
 
 
 def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> GaussianCloud:
-    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off."""
+    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off.
+
+    Args:
+        cloud: The Gaussians before.
+        num_harmonics: How many each Gaussian has afterwards, for each colour.
+    """
     kept = min(num_harmonics, cloud.num_harmonics)
     harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
     harmonics[:, :kept] = cloud.harmonics[:, :kept]
@@ -123,24 +128,6 @@ def harmonic_basis(
     return np.asarray(np.stack([-y, z, -x], axis=-1) * directions.dtype.type(SH_FIRST))
 
 
-def effective_colors(
-    cloud: GaussianCloud, camera_centre_m: Float[np.ndarray, "3"]
-) -> Float32[np.ndarray, "num_splats 3"]:
-    """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped."""
-    if cloud.num_harmonics == 0:
-        return cloud.colors
-    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m))
-    return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
-
-
-def view_directions(
-    means_m: Float32[np.ndarray, "num_splats 3"], camera_centre_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "num_splats 3"]:
-    """Unit vectors from the camera centre to each mean."""
-    ray = means_m.astype(np.float64) - camera_centre_m
-    return np.asarray(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
-
-
 def turned_harmonics(
     harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
     R_new_old: Float[np.ndarray, "*splats 3 3"],
@@ -149,6 +136,10 @@ def turned_harmonics(
 
     One rotation for all of them, or one for each. Degree 1 is a vector for each colour,
     sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and turns like one.
+
+    Args:
+        harmonics: Of degree 1, or none.
+        R_new_old: The turn.
     """
     if harmonics.shape[1] == 0:
         return harmonics
@@ -180,7 +171,12 @@ def _spread_bits(values: np.ndarray) -> np.ndarray:
 
 
 def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> GaussianCloud:
-    """The same Gaussians after a rigid motion; what their colour owes to direction turns along."""
+    """The same Gaussians after a rigid motion; what their colour owes to direction turns along.
+
+    Args:
+        cloud: The Gaussians before.
+        T_new_old: The motion, or the pose of their frame in another.
+    """
     q, _ = se3.split(T_new_old)
     w, x, y, z = q
     w2, x2, y2, z2 = cloud.quats_wxyz.astype(np.float64).T
@@ -227,6 +223,10 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
     spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them.
     Metres, in the frame that ``scene.json`` names.
+
+    Args:
+        path: Of the PLY file; one that is there is replaced.
+        cloud: What is written, with rotations of any length.
     """
     quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
     table = np.concatenate(

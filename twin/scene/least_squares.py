@@ -7,7 +7,12 @@ from jaxtyping import Float
 def tukey_weights(
     residuals: Float[np.ndarray, " num_residuals"], bound: float
 ) -> Float[np.ndarray, " num_residuals"]:
-    """Biweights (Beaton and Tukey 1974): 1 at zero, 0 from the bound on."""
+    """Biweights (Beaton and Tukey 1974): 1 at zero, 0 from the bound on.
+
+    Args:
+        residuals: In any unit.
+        bound: From here on a residual counts nothing, same unit.
+    """
     return np.asarray(np.maximum(1.0 - np.square(residuals / bound), 0.0) ** 2)
 
 
@@ -16,6 +21,12 @@ def normal_equations(
     residuals: Float[np.ndarray, " num_residuals"],
     weights: Float[np.ndarray, " num_residuals"],
 ) -> tuple[Float[np.ndarray, "num_unknowns num_unknowns"], Float[np.ndarray, " num_unknowns"]]:
-    """Return J^T W J and the gradient J^T W r; a step solves H x = -gradient."""
+    """Return J^T W J and the gradient J^T W r; a step solves H x = -gradient.
+
+    Args:
+        J: Derivative of each residual by each unknown.
+        residuals: What is to become zero.
+        weights: Of each squared residual.
+    """
     weighted = (J * weights[:, None]).T
     return weighted @ J, weighted @ residuals

@@ -211,6 +211,10 @@ UP = np.array([0.0, 0.0, 1.0])
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """Write one PNG of the scene and return what was drawn.
 
+    Args:
+        run: Whose scene is drawn.
+        config: Camera, time, joints, places of objects, and where the files go.
+
     Raises:
         UsageError: When the episode, the camera or an object is unknown (lists those that exist),
             joints are given for a robot that the scene does not have, or nothing says where the

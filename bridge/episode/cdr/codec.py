@@ -374,7 +374,12 @@ class MalformedMessageError(BridgeError):
 
 
 def encode(type_name: str, message: Mapping[str, Any]) -> bytes:
-    """Serialise a message; fields left out take their ROS default (0, empty)."""
+    """Serialise a message; fields left out take their ROS default (0, empty).
+
+    Args:
+        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
+        message: Values by field; a nested message is a mapping itself.
+    """
     out = bytearray()
     _write(out, type_name, message)
     return ENCAPSULATION_LE + bytes(out)
@@ -438,6 +443,10 @@ def decode(type_name: str, data: Buffer) -> Message:
     Numeric arrays look into ``data``, in its byte order; nothing but ``uint8[]`` is copied. What
     is made is never larger than a fixed multiple of ``data``, whatever lengths it claims.
 
+    Args:
+        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
+        data: The whole message, its four bytes of encapsulation first.
+
     Raises:
         MalformedMessageError: When the bytes do not fit the type.
         KeyError: When the type is none of ``ros2_definitions``.
@@ -455,6 +464,10 @@ def decode(type_name: str, data: Buffer) -> Message:
 
 def validate(type_name: str, data: Buffer) -> None:
     """Walk over a message without copying its arrays; accepts exactly what ``decode`` reads.
+
+    Args:
+        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
+        data: The whole message, its four bytes of encapsulation first.
 
     Raises:
         MalformedMessageError: When the bytes do not fit the type.

@@ -78,7 +78,13 @@ def _stamp(data: bytes) -> int:
 
 
 def video_message(stamp_ns: int, frame_id: str, data: bytes) -> bytes:
-    """Serialise one H.264 frame (Annex B) as foxglove.CompressedVideo."""
+    """Serialise one H.264 frame (Annex B) as foxglove.CompressedVideo.
+
+    Args:
+        stamp_ns: Source time of the frame [ns since 1970].
+        frame_id: Of the camera.
+        data: The bytes of the frame, start codes included.
+    """
     seconds, nanos = split_ns(stamp_ns)
     timestamp = protobuf.number_field(1, seconds) + protobuf.number_field(2, nanos)
     return b"".join(
@@ -212,6 +218,10 @@ def _no_color(encoding: str) -> codec.MalformedMessageError:
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
     """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
 
+    Args:
+        type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
+        data: The serialised message (CDR).
+
     Raises:
         MalformedMessageError: The bytes are no such message.
     """
@@ -220,6 +230,10 @@ def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColo
 
 def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
     """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw.
+
+    Args:
+        type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
+        data: The serialised message (CDR).
 
     Raises:
         MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
@@ -272,6 +286,10 @@ class DepthImage:
     @staticmethod
     def from_message(type_name: str, data: bytes) -> "DepthImage":
         """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG.
+
+        Args:
+            type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
+            data: The serialised message (CDR).
 
         Raises:
             MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
@@ -443,7 +461,14 @@ def joint_trajectory_to_cdr(
     times_ns: list[int],
     positions_rad: Float[np.ndarray, "num_points num_joints"],
 ) -> bytes:
-    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
+    """Serialise as trajectory_msgs/JointTrajectory, for viewers.
+
+    Args:
+        stamp_ns: Of the header [ns since 1970].
+        names: Joints, in the order of the columns of ``positions_rad``.
+        times_ns: Of each point, counted from the start of the motion.
+        positions_rad: Joint angles of each point.
+    """
     points = []
     for t_ns, row in zip(times_ns, positions_rad, strict=True):
         sec, nanosec = split_ns(t_ns)

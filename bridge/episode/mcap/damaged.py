@@ -1,4 +1,4 @@
-"""Read MCAP records and chunks whose bytes may be anything: lengths are checked before use."""
+"""Read pieces of an MCAP file that may be cut or damaged, and keep what is whole of them."""
 
 import os
 import struct
@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import zstandard
+from mcap.records import McapRecord, Schema
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.format import (
@@ -14,12 +15,12 @@ from bridge.episode.mcap.format import (
     CHUNK,
     CHUNK_FIELDS,
     MESSAGE,
-    MESSAGE_FIELDS,
     RECORD_HEAD,
     SCHEMA,
     Buffer,
     crc32,
 )
+from bridge.episode.mcap.walk import BrokenRecordError, parse, records_in
 from bridge.errors import MissingDependencyError
 
 BLOCK_BYTES = 1 << 20
@@ -45,7 +46,12 @@ class RecordFile:
         return data
 
     def read_into(self, offset: int, room: memoryview) -> int:
-        """Fill ``room`` and return how many bytes there were, fewer only at the end."""
+        """Fill ``room`` and return how many bytes there were, fewer only at the end.
+
+        Args:
+            offset: Where to begin [bytes from the start of the file].
+            room: Memory to fill; its length says how many bytes are wanted.
+        """
         done = 0
         while done < len(room):
             count = os.preadv(self.descriptor, [room[done:]], offset + done)
@@ -133,14 +139,29 @@ class Scratch:
         self._unpacked = bytearray()
 
     def read(self, file: RecordFile, offset: int, size: int) -> memoryview:
-        """Read up to ``size`` bytes, fewer only at the end of the file."""
+        """Read up to ``size`` bytes, fewer only at the end of the file.
+
+        The memory returned is used again by the next call.
+
+        Args:
+            file: The file to read from.
+            offset: Where to begin [bytes from the start of the file].
+            size: How many bytes are wanted.
+        """
         if len(self._record) < size:
             self._record = bytearray(size)
         room = memoryview(self._record)[:size]
         return room[: file.read_into(offset, room)]
 
     def unpack(self, frame: memoryview, size: int) -> memoryview | None:
-        """Unpack a zstd frame of exactly ``size`` bytes; None when it is something else."""
+        """Unpack a zstd frame of exactly ``size`` bytes; None when it is something else.
+
+        The memory returned is used again by the next call.
+
+        Args:
+            frame: The packed bytes.
+            size: What they must unpack to [bytes].
+        """
         if len(self._unpacked) < size:
             self._unpacked = bytearray(size)
         room = memoryview(self._unpacked)[:size]
@@ -160,90 +181,20 @@ MAX_CHUNK_BYTES = 1 << 29
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
 """Channel and log time of a message, after its record head."""
 _CHUNK_HEAD_BYTES = RECORD_HEAD.size + CHUNK_FIELDS.size + 4
-_COMPRESSIONS = ("", "lz4", "zstd")
+_COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
-class DamagedRecordError(Exception):
-    """Bytes are not what they claim to be. Never leaves recovery."""
+def read_plain(record: bytes) -> McapRecord | None:
+    """Return a whole header, schema, channel or metadata record, checked to its end.
 
-
-class Cursor:
-    """Takes fields off the front of a record's bytes."""
-
-    def __init__(self, data: bytes, position: int = 0) -> None:
-        """Begin at a position."""
-        self._data = data
-        self.position = position
-
-    def number(self, size: int) -> int:
-        """Take an unsigned number of ``size`` bytes."""
-        return int.from_bytes(self.data(size), "little")
-
-    def data(self, size: int) -> bytes:
-        """Take ``size`` bytes.
-
-        Raises:
-            DamagedRecordError: When there are fewer.
-        """
-        end = self.position + size
-        if end > len(self._data):
-            message = f"a field of {size} bytes reaches beyond its record"
-            raise DamagedRecordError(message)
-        found = self._data[self.position : end]
-        self.position = end
-        return found
-
-    def text(self) -> str:
-        """Take a text with its length."""
-        try:
-            return self.data(self.number(4)).decode()
-        except UnicodeDecodeError as error:
-            message = "a text is not UTF-8"
-            raise DamagedRecordError(message) from error
-
-    def text_map(self) -> dict[str, str]:
-        """Take a map of texts with its length."""
-        size = self.number(4)
-        end = self.position + size
-        found = {}
-        while self.position < end:
-            name = self.text()
-            found[name] = self.text()
-        if self.position != end:
-            message = "a map of texts does not fill its length"
-            raise DamagedRecordError(message)
-        return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChannelFields:
-    """What is needed of a channel record."""
-
-    id: int
-    schema_id: int
-    topic: str
-
-
-def parse_schema_id(record: bytes) -> int:
-    """Return the id of a whole schema record, checked to its end."""
-    cursor = Cursor(record, RECORD_HEAD.size)
-    schema_id = cursor.number(2)
-    cursor.text()
-    cursor.text()
-    cursor.data(cursor.number(4))
-    if schema_id == 0:
+    Raises:
+        BrokenRecordError: When its fields run past its end, or a schema has id 0.
+    """
+    found = parse(record[0], record[RECORD_HEAD.size :])
+    if isinstance(found, Schema) and found.id == 0:
         message = "a schema has id 0"
-        raise DamagedRecordError(message)
-    return schema_id
-
-
-def parse_channel(record: bytes) -> ChannelFields:
-    """Return the fields of a whole channel record, checked to its end."""
-    cursor = Cursor(record, RECORD_HEAD.size)
-    channel_id, schema_id, topic = cursor.number(2), cursor.number(2), cursor.text()
-    cursor.text()
-    cursor.text_map()
-    return ChannelFields(id=channel_id, schema_id=schema_id, topic=topic)
+        raise BrokenRecordError(message)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,27 +223,27 @@ def parse_chunk_head(front: bytes) -> ChunkHead:
     """Read a chunk's head from the first bytes of its record.
 
     Raises:
-        DamagedRecordError: When they are too few or name an unknown compression.
+        BrokenRecordError: When they are too few or name an unknown compression.
     """
     if len(front) < _CHUNK_HEAD_BYTES or front[0] != CHUNK:
         message = "no chunk head"
-        raise DamagedRecordError(message)
-    cursor = Cursor(front, 1)
-    length = cursor.number(8)
-    _, _, size, crc = CHUNK_FIELDS.unpack(cursor.data(CHUNK_FIELDS.size))
-    name_bytes = int.from_bytes(front[cursor.position : cursor.position + 4], "little")
-    compression = cursor.text() if name_bytes <= len("zstd") else "?"
-    if compression not in _COMPRESSIONS:
-        message = f"its compression {compression!r} is not known"
-        raise DamagedRecordError(message)
-    data_bytes = cursor.number(8)
+        raise BrokenRecordError(message)
+    _, length = RECORD_HEAD.unpack_from(front)
+    _, _, size, crc = CHUNK_FIELDS.unpack_from(front, RECORD_HEAD.size)
+    at = _CHUNK_HEAD_BYTES
+    name_bytes = int.from_bytes(front[at - 4 : at], "little")
+    name = front[at : at + name_bytes] if name_bytes <= len("zstd") else b"?"
+    at += name_bytes
+    if name not in _COMPRESSIONS or len(front) < at + 8:
+        message = f"its compression {name!r} is not known"
+        raise BrokenRecordError(message)
     return ChunkHead(
-        head_bytes=cursor.position,
+        head_bytes=at + 8,
         record_bytes=RECORD_HEAD.size + length,
-        data_bytes=data_bytes,
+        data_bytes=int.from_bytes(front[at : at + 8], "little"),
         uncompressed_size=size,
         crc=crc,
-        compression=compression,
+        compression=name.decode(),
     )
 
 
@@ -321,37 +272,36 @@ class Contents:
 def walk_records(data: Buffer) -> Contents:
     """Find the records at the front of a chunk's data, up to the first that is cut or wrong."""
     found = Contents()
-    position, size, index = 0, len(data), found.index
-    while position + RECORD_HEAD.size <= size:
-        opcode, length = RECORD_HEAD.unpack_from(data, position)
-        end = position + RECORD_HEAD.size + length
-        if end > size or opcode == 0:
-            break
-        if opcode == MESSAGE:
-            if length < MESSAGE_FIELDS:
-                break
-            channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, position + RECORD_HEAD.size)
-            entries = index.get(channel_id)
-            if entries is None:
-                entries = index[channel_id] = []
-            entries += (log_time_ns, position)
-        elif opcode in (SCHEMA, CHANNEL):
-            record = bytes(data[position:end])
-            try:
-                _ = parse_schema_id(record) if opcode == SCHEMA else parse_channel(record)
-            except DamagedRecordError:
-                break
-            found.definitions.append(record)
-        position = end
-    found.size = position
+    index = found.index
+    try:
+        for opcode, at, length in records_in(data):
+            end = at + RECORD_HEAD.size + length
+            if opcode == MESSAGE:
+                channel_id, log_time_ns = _INDEX_FIELDS.unpack_from(data, at + RECORD_HEAD.size)
+                entries = index.get(channel_id)
+                if entries is None:
+                    entries = index[channel_id] = []
+                entries += (log_time_ns, at)
+            elif opcode in (SCHEMA, CHANNEL):
+                record = bytes(data[at:end])
+                read_plain(record)
+                found.definitions.append(record)
+            found.size = end
+    except BrokenRecordError:
+        pass  # what came before is whole
     return found
 
 
 def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
     """Return a whole chunk's records.
 
+    Args:
+        head: What the chunk's record claims of itself.
+        data: Its data, still packed, and whole.
+        scratch: Memory that is used again for each chunk; the records may lie in it.
+
     Raises:
-        DamagedRecordError: When size or CRC are not as claimed.
+        BrokenRecordError: When size or CRC are not as claimed.
         MissingDependencyError: When it is packed with lz4 and that is not installed.
     """
     records = _unpack_at_once(head, data, scratch)
@@ -359,10 +309,10 @@ def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
         records = unpack_front(head, bytes(data))
     if len(records) != head.uncompressed_size:
         message = f"its data unpacks to {len(records)} bytes instead of {head.uncompressed_size}"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     if head.crc and crc32(records, 0) != head.crc:
         message = "its CRC is wrong"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     return records
 
 
@@ -382,7 +332,12 @@ def _unpack_at_once(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buff
 
 
 def unpack_front(head: ChunkHead, data: bytes) -> bytes:
-    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
+    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified.
+
+    Args:
+        head: What the chunk's record claims of itself; the size claimed bounds what is unpacked.
+        data: Its data, still packed, from the front; the end may be missing.
+    """
     if head.compression == "":
         return data
     limit = min(head.uncompressed_size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)

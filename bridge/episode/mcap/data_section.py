@@ -34,13 +34,24 @@ class Summary:
         self._metadata: list[bytes] = []
 
     def add_chunk(self, place: ChunkPlace, counts: dict[int, int]) -> None:
-        """Book a chunk that is in the file, with its number of messages by channel."""
+        """Book a chunk that is in the file, with its number of messages by channel.
+
+        Args:
+            place: Where the chunk lies and what it spans.
+            counts: Messages in it by channel id; empty when it holds definitions only.
+        """
         self._chunks.append(mcap_format.chunk_index(place))
         if counts:
             self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
 
     def add_messages(self, counts: dict[int, int], *, start_ns: int, end_ns: int) -> None:
-        """Book messages by channel, the first and the last log time among them."""
+        """Book messages by channel, the first and the last log time among them.
+
+        Args:
+            counts: Messages by channel id, added to those booked before.
+            start_ns: Earliest log time among them [ns since 1970].
+            end_ns: Latest log time among them.
+        """
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
         self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
@@ -57,7 +68,17 @@ class Summary:
         offset: int,
         length: int,
     ) -> None:
-        """Book an attachment record that is in the file."""
+        """Book an attachment record that is in the file.
+
+        Args:
+            name: Of the attachment, such as ``robot.urdf``.
+            media_type: Such as ``application/xml``.
+            log_time_ns: When it was recorded [ns since 1970].
+            create_time_ns: When it was made; 0 for unknown.
+            data_size: Of the attachment alone [bytes].
+            offset: Where its record begins [bytes from the start of the file].
+            length: Of the whole record [bytes].
+        """
         self._attachments.append(
             mcap_format.attachment_index(
                 name,
@@ -188,6 +209,14 @@ class OpenChunk:
     ) -> None:
         """Append one message whose payload has ``length`` bytes.
 
+        Args:
+            channel_id: Of a channel whose definition is in the file or in this chunk.
+            sequence: The publisher's number of the message, 0 to 2^32 - 1.
+            log_time_ns: When it was received [ns since 1970].
+            publish_time_ns: When it was sent [ns since 1970].
+            data: The payload; without ``gather`` it must not change before the chunk is written.
+            length: Of the payload, all its pieces together [bytes].
+
         Raises:
             struct.error: When a number does not fit its field; nothing is appended then.
         """
@@ -298,7 +327,12 @@ class DataSection:
             self.book(*place)
 
     def add_indexes(self, chunk: EncodedChunk, start: int) -> None:
-        """Write the message indexes of a chunk that lies at ``start``, at the end of the file."""
+        """Write the message indexes of a chunk that lies at ``start``, at the end of the file.
+
+        Args:
+            chunk: What is at ``start`` already.
+            start: Where the chunk begins [bytes from the start of the file].
+        """
         indexes, offsets = index_records(chunk.index, self.file.offset)
         self.file.append([indexes])
         self.book(chunk, start, offsets, len(indexes))
@@ -306,7 +340,14 @@ class DataSection:
     def book(
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:
-        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
+        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``.
+
+        Args:
+            chunk: What was written.
+            start: Where the chunk begins [bytes from the start of the file].
+            offsets: Where the message index of each channel begins, by channel id.
+            index_length: Of all its message indexes together [bytes].
+        """
         place = ChunkPlace(
             start_ns=chunk.start_ns,
             end_ns=chunk.end_ns,
@@ -324,7 +365,15 @@ class DataSection:
     def add_attachment(
         self, name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
     ) -> None:
-        """Write an attachment."""
+        """Write an attachment.
+
+        Args:
+            name: Of the attachment, such as ``robot.urdf``.
+            data: Its contents.
+            media_type: Such as ``application/xml``.
+            log_time_ns: When it was recorded [ns since 1970].
+            create_time_ns: When it was made; 0 for unknown.
+        """
         buffers = mcap_format.attachment(
             name,
             data,
@@ -358,7 +407,12 @@ class DataSection:
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:
-    """Return a chunk's message index records and where each lies, the first at ``start``."""
+    """Return a chunk's message index records and where each lies, the first at ``start``.
+
+    Args:
+        index: By channel id: log time and offset of each message, one after the other.
+        start: Where the first record will begin [bytes from the start of the file].
+    """
     records = [mcap_format.message_index(*item) for item in index.items()]
     offsets = {}
     for channel_id, encoded in zip(index, records, strict=True):

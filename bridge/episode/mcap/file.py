@@ -41,6 +41,10 @@ from bridge.errors import EpisodeError
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked.
 
+    Args:
+        stream: The file.
+        data_end: Where its data section ends [bytes from the start of the file].
+
     Raises:
         BrokenRecordError: When a record or chunk is damaged.
     """
@@ -51,7 +55,12 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
 
 
 def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
-    """Make the index entry of a chunk; its message indexes are yet to be added."""
+    """Make the index entry of a chunk; its message indexes are yet to be added.
+
+    Args:
+        place: Where the chunk's record lies.
+        chunk: What the record says of its contents.
+    """
     return records.ChunkIndex(
         chunk_length=place.end - place.offset,
         chunk_start_offset=place.offset,
@@ -75,7 +84,13 @@ def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.Metad
 def attachment_entry(
     place: RecordSpan, record: records.Attachment, data_size: int
 ) -> records.AttachmentIndex:
-    """Make the index entry of an attachment."""
+    """Make the index entry of an attachment.
+
+    Args:
+        place: Where the attachment's record lies.
+        record: Its name, type and times; its data may have been left out.
+        data_size: Of the data [bytes].
+    """
     return records.AttachmentIndex(
         offset=place.offset,
         length=place.end - place.offset,
@@ -186,7 +201,12 @@ class LooseMessages:
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
-    """Make one message of what reading a file's bytes raised."""
+    """Make one message of what reading a file's bytes raised.
+
+    Args:
+        path: The file that was read.
+        error: What went wrong; of its text 120 characters are kept.
+    """
     return EpisodeError(
         path=path,
         found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
@@ -319,6 +339,11 @@ def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
 
 def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
     """Read the summary section with its CRC checked, None where there is none.
+
+    Args:
+        stream: The file; its position is changed.
+        footer: The last record, with the summary's place and CRC (0: not checked).
+        footer_at: Where the footer begins [bytes from the start of the file].
 
     Raises:
         BrokenRecordError: When it is damaged.

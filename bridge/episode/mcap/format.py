@@ -81,13 +81,28 @@ def header(profile: str, library: str) -> bytes:
 
 
 def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
-    """Encode a schema; ids start at 1."""
+    """Encode a schema; ids start at 1.
+
+    Args:
+        schema_id: 1 to 65535, once in a file.
+        name: Of the type, such as ``sensor_msgs/msg/JointState``.
+        encoding: How ``data`` is written, such as ``ros2msg`` or ``jsonschema``; "" for no schema
+            text.
+        data: The text of the schema.
+    """
     size = struct.pack("<I", len(data))
     return record(SCHEMA, struct.pack("<H", schema_id), text(name), text(encoding), size, data)
 
 
 def channel(channel_id: int, schema_id: int, topic: str, message_encoding: str) -> bytes:
-    """Encode a channel; schema id 0 is none."""
+    """Encode a channel; schema id 0 is none.
+
+    Args:
+        channel_id: 0 to 65535, once in a file.
+        schema_id: Of a schema before it in the file, or 0.
+        topic: With its leading slash.
+        message_encoding: Such as ``cdr`` or ``json``.
+    """
     ids = struct.pack("<HH", channel_id, schema_id)
     return record(CHANNEL, ids, text(topic), text(message_encoding), text_map({}))
 
@@ -111,7 +126,12 @@ def chunk_head(
 
 
 def message_index(channel_id: int, entries: list[int]) -> bytes:
-    """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ..."""
+    """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ...
+
+    Args:
+        channel_id: Of the channel.
+        entries: Log times [ns since 1970] and offsets [bytes into the unpacked chunk] in turn.
+    """
     head = struct.pack("<HI", channel_id, 8 * len(entries))
     return record(MESSAGE_INDEX, head, struct.pack(f"<{len(entries)}Q", *entries))
 
@@ -134,7 +154,15 @@ def chunk_index(place: ChunkPlace) -> bytes:
 def attachment(
     name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
 ) -> list[Buffer]:
-    """Encode an attachment as buffers to be written one after the other."""
+    """Encode an attachment as buffers to be written one after the other.
+
+    Args:
+        name: Of the attachment, such as ``robot.urdf``.
+        data: Its contents; not copied.
+        media_type: Such as ``application/xml``.
+        log_time_ns: When it was recorded [ns since 1970].
+        create_time_ns: When it was made; 0 for unknown.
+    """
     fields = ATTACHMENT_FIELDS.pack(log_time_ns, create_time_ns) + text(name) + text(media_type)
     fields += struct.pack("<Q", len(data))
     crc = zlib.crc32(data, zlib.crc32(fields))
@@ -152,7 +180,17 @@ def attachment_index(
     offset: int,
     length: int,
 ) -> bytes:
-    """Encode where an attachment record of ``length`` bytes lies."""
+    """Encode where an attachment record of ``length`` bytes lies.
+
+    Args:
+        name: As in the attachment's record, and so are the type and the times.
+        media_type: Such as ``application/xml``.
+        log_time_ns: When it was recorded [ns since 1970].
+        create_time_ns: When it was made; 0 for unknown.
+        data_size: Of the attachment alone [bytes].
+        offset: Where its record begins [bytes from the start of the file].
+        length: Of the whole record [bytes].
+    """
     numbers = struct.pack("<QQQQQ", offset, length, log_time_ns, create_time_ns, data_size)
     return record(ATTACHMENT_INDEX, numbers, text(name), text(media_type))
 
@@ -178,7 +216,18 @@ def statistics(
     end_ns: int,
     message_counts: Mapping[int, int],
 ) -> bytes:
-    """Encode the counts of a file; ``message_counts`` is by channel."""
+    """Encode the counts of a file; ``message_counts`` is by channel.
+
+    Args:
+        schemas: Number of different schemas.
+        attachments: Number of attachment records.
+        metadata_records: Number of metadata records.
+        chunks: Number of chunk records.
+        channels: Number of channels, those without messages too.
+        start_ns: Earliest log time [ns since 1970], 0 when there is no message.
+        end_ns: Latest log time, 0 when there is no message.
+        message_counts: Messages by channel id; their sum is the file's.
+    """
     counts = b"".join(struct.pack("<HQ", *item) for item in message_counts.items())
     numbers = (sum(message_counts.values()), schemas, channels, attachments, metadata_records)
     times = (chunks, start_ns, end_ns, len(counts))
@@ -186,7 +235,13 @@ def statistics(
 
 
 def summary_offset(opcode: int, *, start: int, length: int) -> bytes:
-    """Encode where the summary's records of one kind lie."""
+    """Encode where the summary's records of one kind lie.
+
+    Args:
+        opcode: Of the kind of record.
+        start: Where the first of them begins [bytes from the start of the file].
+        length: Of all of them together [bytes].
+    """
     return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
 
 

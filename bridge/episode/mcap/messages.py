@@ -83,7 +83,12 @@ def refuse_strays(
     channel_ids: UInt16[np.ndarray, " num_messages"],
     announced: Bool[np.ndarray, " num_channel_ids"],
 ) -> None:
-    """Raise BrokenRecordError when a message is of a channel that was never announced."""
+    """Raise BrokenRecordError when a message is of a channel that was never announced.
+
+    Args:
+        channel_ids: The channel of each message.
+        announced: By channel id: whether the file announced the channel.
+    """
     is_known = announced[channel_ids]
     if not is_known.all():
         channel_id = int(channel_ids[int(np.argmin(is_known))])
@@ -241,7 +246,12 @@ class Selection(NamedTuple):
     """Excluded."""
 
     def overlaps(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a stretch of time, ends included, holds a wanted one."""
+        """Whether a stretch of time, ends included, holds a wanted one.
+
+        Args:
+            start_ns: First instant of the stretch [ns since 1970].
+            end_ns: Last instant of the stretch, part of it.
+        """
         return (self.start_ns is None or end_ns >= self.start_ns) and (
             self.end_ns is None or start_ns < self.end_ns
         )
@@ -361,6 +371,11 @@ def read_chunk(
 ) -> tuple[bytes, MessageTable]:
     """Unpack a chunk, its CRC checked, and list its messages.
 
+    Args:
+        stream: The file; its position is changed.
+        index: Where the chunk lies, as the summary says.
+        data_end: Where the data section ends [bytes from the start of the file].
+
     Raises:
         BrokenRecordError: When there is none where the index says, or it is damaged.
     """
@@ -431,6 +446,10 @@ _Entry = tuple[int, int, int, _Source]
 def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
     """Yield the wanted messages in order of log time, then of file, then of place in the file.
 
+    Args:
+        files: The parts of an episode; their order decides between equal log times.
+        select: Which topics and log times are wanted.
+
     Raises:
         EpisodeError: When a file is damaged or cannot be read.
     """
@@ -464,7 +483,12 @@ def _sources(file: _OpenFile) -> Iterable[_Source]:
 
 
 def may_hold(index: records.ChunkIndex, channel_ids: Set[int]) -> bool:
-    """Whether a chunk may hold messages of some channels; one without an index may hold any."""
+    """Whether a chunk may hold messages of some channels; one without an index may hold any.
+
+    Args:
+        index: What the summary says of the chunk.
+        channel_ids: The channels wanted.
+    """
     listed = index.message_index_offsets
     return not listed or not channel_ids.isdisjoint(listed)
 

@@ -84,7 +84,12 @@ class PartFile:
         return offset
 
     def overwrite(self, offset: int, data: bytes) -> None:
-        """Replace a few bytes inside the file; ``crc`` is the caller's to set anew."""
+        """Replace a few bytes inside the file; ``crc`` is the caller's to set anew.
+
+        Args:
+            offset: Where the first byte goes [bytes from the start of the file].
+            data: What replaces as many bytes; it must end inside the file.
+        """
         os.pwrite(self._descriptor, data, offset)
 
     def sync_data(self) -> None:
@@ -111,7 +116,12 @@ class PartFile:
         sync_folder(final_path.parent)
 
     def truncate(self, offset: int, crc: int) -> None:
-        """Drop everything from ``offset`` on; ``crc`` is that of what stays."""
+        """Drop everything from ``offset`` on; ``crc`` is that of what stays.
+
+        Args:
+            offset: The new length of the file [bytes].
+            crc: CRC-32 of the bytes before ``offset``.
+        """
         os.ftruncate(self._descriptor, offset)
         self.offset, self.crc = offset, crc
 

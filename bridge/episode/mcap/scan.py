@@ -9,23 +9,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from mcap.records import McapRecord
+
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
     BLOCK_BYTES,
     MAX_CHUNK_BYTES,
     ChunkHead,
     Contents,
-    Cursor,
-    DamagedRecordError,
     RecordFile,
     Scratch,
-    parse_channel,
     parse_chunk_head,
-    parse_schema_id,
+    read_plain,
     unpack_chunk,
     unpack_front,
     walk_records,
 )
+from bridge.episode.mcap.walk import BrokenRecordError, attachment_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +47,8 @@ class Plain(Span):
 
     opcode: int
     raw: bytes
+    record: McapRecord | None
+    """What it says; None of a private one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +163,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
     while position < file.size:
         try:
             found = _read_record(file, position, scratch)
-        except DamagedRecordError as error:
+        except BrokenRecordError as error:
             found = _read_damaged(file, position, str(error))
         if found is None:
             return
@@ -176,18 +178,18 @@ def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | Non
     front = file.read(offset, _FRONT_BYTES)
     if len(front) < mcap.RECORD_HEAD.size:
         message = "the file ends inside a record"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     opcode, size = mcap.RECORD_HEAD.unpack_from(front)
     if opcode in _SUMMARY_ONLY:
         return None
     if opcode == 0 or (opcode not in _KINDS and opcode < PRIVATE):
         message = f"there is no record of kind {opcode}"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     length = mcap.RECORD_HEAD.size + size
     kind = _KINDS.get(opcode, "private record")
     if offset + length > file.size:
         message = f"the file ends inside a {kind}"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     if opcode == mcap.CHUNK:
         return _read_chunk(file, offset, front, scratch)
     if opcode == mcap.MESSAGE:
@@ -201,73 +203,57 @@ def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | Non
         return DataEnd(offset=offset, length=length, crc=crc)
     if length > MAX_PLAIN_BYTES:
         message = f"a {kind} claims {length} bytes"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     raw = file.read(offset, length)
-    _check_plain(opcode, raw)
-    return Plain(offset=offset, length=length, opcode=opcode, raw=raw)
-
-
-def _check_plain(opcode: int, raw: bytes) -> None:
-    cursor = Cursor(raw, mcap.RECORD_HEAD.size)
-    if opcode == mcap.SCHEMA:
-        parse_schema_id(raw)
-    elif opcode == mcap.CHANNEL:
-        parse_channel(raw)
-    elif opcode == mcap.HEADER:
-        cursor.text()
-        cursor.text()
-    elif opcode == mcap.METADATA:
-        cursor.text()
-        cursor.text_map()
+    return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
 
 def _read_chunk(file: RecordFile, offset: int, front: bytes, scratch: Scratch) -> Chunk:
     head = parse_chunk_head(front)
     if not head.is_consistent:
         message = "the lengths of a chunk contradict each other or are beyond all limits"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     raw = scratch.read(file, offset, head.record_bytes)
     try:
         records = unpack_chunk(head, raw[head.head_bytes :], scratch)
-    except DamagedRecordError as error:
+    except BrokenRecordError as error:
         message = f"a chunk is damaged: {error}"
-        raise DamagedRecordError(message) from error
+        raise BrokenRecordError(message) from error
     contents = walk_records(records)
     if contents.size != len(records):
         message = "a chunk is damaged: its records are torn"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
     if not mcap.MESSAGE_HEAD.size <= length <= MAX_CHUNK_BYTES:
         message = f"a message claims {length} bytes"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     _, _, channel_id, _, log_time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(front)
     return TopMessage(offset=offset, length=length, channel_id=channel_id, log_time_ns=log_time_ns)
 
 
 def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
-    cursor = Cursor(file.read(offset, min(length, BLOCK_BYTES)), mcap.RECORD_HEAD.size)
-    log_time_ns, create_time_ns = cursor.number(8), cursor.number(8)
-    name, media_type, data_size = cursor.text(), cursor.text(), cursor.number(8)
-    end = cursor.position + data_size
+    front = file.read(offset, min(length, BLOCK_BYTES))[mcap.RECORD_HEAD.size :]
+    fields = attachment_fields(front, offset)
+    body = mcap.RECORD_HEAD.size
+    end = body + fields.data_at + fields.data_size
     if end + 4 > length:  # later versions of the format may add fields behind the CRC
         message = "the lengths of an attachment contradict each other"
-        raise DamagedRecordError(message)
+        raise BrokenRecordError(message)
     (crc,) = struct.unpack("<I", file.read(offset + end, 4))
-    body = mcap.RECORD_HEAD.size
     if crc and crc != file.crc(offset + body, end - body):
-        message = f"the CRC of the attachment {name!r} is wrong"
-        raise DamagedRecordError(message)
+        message = f"the CRC of the attachment {fields.name!r} is wrong"
+        raise BrokenRecordError(message)
     return AttachmentSpan(
         offset=offset,
         length=length,
-        name=name,
-        media_type=media_type,
-        log_time_ns=log_time_ns,
-        create_time_ns=create_time_ns,
-        data_size=data_size,
+        name=fields.name,
+        media_type=fields.media_type,
+        log_time_ns=fields.log_time_ns,
+        create_time_ns=fields.create_time_ns,
+        data_size=fields.data_size,
     )
 
 
@@ -305,7 +291,7 @@ def _trusted_length(file: RecordFile, offset: int) -> int:
 def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | None:
     try:
         head = parse_chunk_head(front)
-    except DamagedRecordError:
+    except BrokenRecordError:
         return None
     if offset + head.record_bytes <= file.size or head.uncompressed_size > MAX_CHUNK_BYTES:
         return None
@@ -355,6 +341,6 @@ def _next_chunk(file: RecordFile, offset: int) -> int | None:
 def _is_chunk(file: RecordFile, offset: int, window: bytes, at: int) -> bool:
     try:
         head = parse_chunk_head(window[at : at + _FRONT_BYTES])
-    except DamagedRecordError:
+    except BrokenRecordError:
         return False
     return head.is_consistent and offset + head.record_bytes <= file.size

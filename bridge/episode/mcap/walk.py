@@ -23,6 +23,7 @@ from bridge.episode.mcap.format import (
     MESSAGE_FIELDS,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    Buffer,
     crc32,
 )
 
@@ -79,6 +80,11 @@ class RecordSpan(NamedTuple):
 def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
+    Args:
+        stream: The file, or a data section in memory.
+        start: Where the first record begins [bytes from the start of the stream].
+        end: Where the last one must end.
+
     Raises:
         BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
@@ -123,7 +129,12 @@ def _place(head: bytes, at: int, end: int) -> RecordSpan:
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
-    """Return a record's bytes without opcode and length."""
+    """Return a record's bytes without opcode and length.
+
+    Args:
+        stream: The file; its position is changed.
+        place: Where the record lies, as ``walk`` gives it.
+    """
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
     if len(body) < place.length:
@@ -184,6 +195,10 @@ _U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
     """Read a record other than messages, chunks and attachments; None for unknown opcodes.
 
+    Args:
+        opcode: Kind of the record.
+        body: Its bytes without opcode and length.
+
     Raises:
         BrokenRecordError: When its fields run past its end.
     """
@@ -208,20 +223,17 @@ class FoundAttachment(NamedTuple):
 def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
+    Args:
+        stream: The file; its position is changed.
+        place: Where the attachment's record lies.
+        keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
+
     Raises:
         BrokenRecordError: When its fields run past its end, or its CRC is wrong.
     """
-    head_bytes = min(place.length, PIECE_BYTES)
     stream.seek(place.offset + RECORD_HEAD.size)
-    front = _Fields(stream.read(head_bytes))
-    try:
-        log_ns, create_ns = front.read8(), front.read8()
-        name, media_type = front.read_prefixed_string(), front.read_prefixed_string()
-        size = front.read8()
-    except (McapError, struct.error, ValueError) as error:
-        message = f"the attachment at byte {place.offset} cannot be read"
-        raise BrokenRecordError(message) from error
-    start = front.count
+    fields = attachment_fields(stream.read(min(place.length, PIECE_BYTES)), place.offset)
+    name, start, size = fields.name, fields.data_at, fields.data_size
     if size > place.length - start - 4:
         message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
         raise BrokenRecordError(message)
@@ -231,13 +243,41 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
         message = f"attachment {name!r} has another CRC than it declares"
         raise BrokenRecordError(message)
     record = records.Attachment(
-        create_time=create_ns,
-        log_time=log_ns,
+        create_time=fields.create_time_ns,
+        log_time=fields.log_time_ns,
         name=name,
-        media_type=media_type,
+        media_type=fields.media_type,
         data=b"".join(pieces),
     )
     return FoundAttachment(record, size)
+
+
+class AttachmentFields(NamedTuple):
+    """What stands before the data of an attachment."""
+
+    log_time_ns: int
+    create_time_ns: int
+    name: str
+    media_type: str
+    data_size: int
+    data_at: int
+    """From the start of the record's body."""
+
+
+def attachment_fields(front: bytes, offset: int) -> AttachmentFields:
+    """Read the first bytes of the body of the attachment whose record lies at ``offset``.
+
+    Raises:
+        BrokenRecordError: When its fields run past them.
+    """
+    fields = _Fields(front)
+    try:
+        times = fields.read8(), fields.read8()
+        names = fields.read_prefixed_string(), fields.read_prefixed_string()
+        return AttachmentFields(*times, *names, fields.read8(), fields.count)
+    except (McapError, struct.error, ValueError) as error:
+        message = f"the attachment at byte {offset} cannot be read"
+        raise BrokenRecordError(message) from error
 
 
 def _attachment_crc(
@@ -304,6 +344,10 @@ def parse_chunk(body: bytes) -> ChunkHead:
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC.
 
+    Args:
+        chunk: Still packed.
+        whose: What to call the chunk in an error.
+
     Raises:
         BrokenRecordError: When one of them is wrong, or it is too large to be believed.
     """
@@ -356,7 +400,13 @@ class MessageHead(NamedTuple):
 
 
 def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
+    """Read the front of the message record at ``at``; ``where`` becomes its ``at``.
+
+    Args:
+        data: A chunk's unpacked data, or the front of a message record.
+        at: Where the record begins in ``data``.
+        where: Its place as the caller counts it: in the chunk, or in the file [bytes].
+    """
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         message = f"a message record of {length} bytes"
@@ -364,7 +414,7 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
     return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
-def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+def records_in(data: Buffer) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, offset and body length of each record in a chunk's unpacked data.
 
     Raises:

@@ -74,6 +74,10 @@ def choose_fps(episode: Episode) -> int:
 def sample(episode: Episode, fps: int) -> Samples:
     """Put an episode on the grid, over the time in which joints and all cameras are there.
 
+    Args:
+        episode: Must have joints; gripper and cameras are taken where they are there.
+        fps: Rows per second.
+
     Raises:
         EpisodeError: When it has no joints, or its streams never overlap.
     """
@@ -127,7 +131,13 @@ def _at(
 def row_images(
     episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Yield the decoded image of each row; ``wanted`` never decreases."""
+    """Yield the decoded image of each row; ``wanted`` never decreases.
+
+    Args:
+        episode: Where the images are.
+        camera: Its id in the topics.
+        wanted: Number of the image that each row takes, counted from 0 in log order.
+    """
     row = 0
     for number, message in enumerate(episode.messages([_topic(episode, camera)])):
         if row == len(wanted):
@@ -241,7 +251,13 @@ _ACTIONS = {
 
 
 def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]) -> str:
-    """Return the text; every choice that changes a number is in it."""
+    """Return the text; every choice that changes a number is in it.
+
+    Args:
+        shape: What all episodes of the data set have in common.
+        kind: What the column ``action`` holds: ``plan`` or ``next_state``.
+        table: One record for each episode, as in ``robot_gst_export.json``.
+    """
     cameras = ", ".join(shape.cameras) or "none"
     stand_in = sum(bool(row["stand_in"]) for row in table)
     origin = (
@@ -292,6 +308,10 @@ class ExportReport:
 
 def select_episodes(source: Path, config: LeRobotConfig) -> tuple[list[Path], list[str]]:
     """Return the files to export and the ids left out because they are no demonstrations.
+
+    Args:
+        source: A run folder, or one episode file, which is taken whatever its kind.
+        config: Its ``episodes``, where given, are taken whatever their kind.
 
     Raises:
         UsageError: When nothing is left, or a named episode is not there.

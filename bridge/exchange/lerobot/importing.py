@@ -96,6 +96,10 @@ def parse_selection(text: str | None) -> list[range] | None:
 def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[EpisodeEntry]:
     """Read the wanted rows of ``meta/episodes``, in order.
 
+    Args:
+        info: The data set.
+        wanted: Ranges of episode indices; None for all.
+
     Raises:
         LeRobotFormatError: Naming the file and row that cannot be believed.
         UsageError: When none of the wanted episodes is there.

@@ -97,11 +97,22 @@ class DatasetInfo:
     version: str
 
     def data_file(self, chunk_index: int, file_index: int) -> Path:
-        """Return a data file by its indices."""
+        """Return a data file by its indices.
+
+        Args:
+            chunk_index: Number of the folder, from 0.
+            file_index: Number of the file in it, from 0.
+        """
         return self._inside(self.data_path, chunk_index=chunk_index, file_index=file_index)
 
     def video_file(self, video_key: str, chunk_index: int, file_index: int) -> Path:
-        """Return a video file by its camera and indices."""
+        """Return a video file by its camera and indices.
+
+        Args:
+            video_key: Feature name of the camera, such as ``observation.images.wrist``.
+            chunk_index: Number of the folder, from 0.
+            file_index: Number of the file in it, from 0.
+        """
         return self._inside(
             self.video_path or VIDEO_PATH,
             video_key=video_key,

@@ -50,7 +50,12 @@ class VideoWriter:
         self._stream.pix_fmt = self.pix_fmt
 
     def write(self, image_u8: UInt8[np.ndarray, "height width 3"], *, first: bool) -> None:
-        """Append one frame; the first of an episode can be decoded without those before it."""
+        """Append one frame; the first of an episode can be decoded without those before it.
+
+        Args:
+            image_u8: RGB.
+            first: It begins an episode, so it is written as a key frame.
+        """
         frame = self._frame_class.from_ndarray(image_u8, format="rgb24")
         if first:
             frame.pict_type = self._intra
@@ -70,6 +75,11 @@ def read_frames(
     path: Path, times_s: Sequence[float], tolerance_s: float
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield the frame nearest to each time; times ascend [s].
+
+    Args:
+        path: The video file.
+        times_s: From the start of the file [s].
+        tolerance_s: How far a frame may be from the time it stands for [s].
 
     Raises:
         LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder

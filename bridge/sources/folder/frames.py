@@ -81,6 +81,11 @@ def checked_rotation(
 ) -> Float[np.ndarray, "3 3"]:
     """Return the rotation nearest to a matrix written with few digits.
 
+    Args:
+        path: The file it stands in, for the error.
+        R: The matrix as read; each singular value within ``ROTATION_TOLERANCE`` of 1.
+        where: What it is the rotation of, for the error.
+
     Raises:
         FolderError: When the matrix is not close to any rotation.
     """
@@ -110,6 +115,11 @@ def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
 
 def require_image(path: Path, *, what: str, named_by: str) -> Path:
     """Return the path if the file is there.
+
+    Args:
+        path: Of the image.
+        what: ``color`` or ``depth``, for the error.
+        named_by: Who says that it exists, for the error: ``rgb.txt line 3 names it``.
 
     Raises:
         PathNotFoundError: Saying who names the file.
@@ -154,7 +164,12 @@ def camera_of(
 
 
 def refuse_scale_without_use(config: FolderConfig, path: Path) -> None:
-    """Refuse options that a self-describing index answers itself."""
+    """Refuse options that a self-describing index answers itself.
+
+    Args:
+        config: The options given.
+        path: The index that holds the same, for the error.
+    """
     for name in ("depth_intrinsics", "color_intrinsics", "depth_unit_m"):
         if getattr(config, name) is not None:
             raise FolderError(

@@ -91,7 +91,12 @@ INFO_PERIOD_S = 1.0
 
 
 def num_frames(index: FolderIndex, config: FolderConfig) -> int:
-    """How many frames will be sent."""
+    """How many frames will be sent.
+
+    Args:
+        index: What the folder holds.
+        config: Its ``max_frames`` bounds the number; None: all.
+    """
     return min(len(index.frames), config.max_frames or len(index.frames))
 
 
@@ -102,6 +107,11 @@ def frame_times_ns(
 
     Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
     without times gets the configured rate, from ``start_ns`` or 0.
+
+    Args:
+        index: What the folder holds.
+        config: The rate of a folder without times, and how many frames are sent.
+        start_ns: Time of the first image [ns since 1970]; None: as the folder says, else 0.
 
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
@@ -125,7 +135,12 @@ def frame_times_ns(
 
 
 def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
-    """What an episode's metadata says about the folder it came from."""
+    """What an episode's metadata says about the folder it came from.
+
+    Args:
+        index: What the folder holds.
+        config: The rate of a folder without times.
+    """
     rate_hz = config.rate_hz or DEFAULT_RATE_HZ
     nominal = f"nominal, {rate_hz:g} Hz from 0; the folder has none"
     return {

@@ -32,6 +32,10 @@ _KEYS_HINT = "docs/rgbd_folder.md lists the keys."
 def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read and check ``scene.json``; every image file it names must exist.
 
+    Args:
+        folder: Holds ``scene.json``; the paths in it start here.
+        config: Must not give what the file says itself: intrinsics and the unit of depth.
+
     Raises:
         PathNotFoundError: When an image is not there.
         FolderError: When a key is missing or makes no sense.

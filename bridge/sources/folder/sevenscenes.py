@@ -49,6 +49,10 @@ def find_frames(folder: Path) -> list[Path]:
 def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a sequence folder.
 
+    Args:
+        folder: One sequence.
+        config: Its intrinsics and unit of depth go before those of the folder and the data set.
+
     Raises:
         PathNotFoundError: When a frame lacks its depth image.
         FolderError: When a pose or an image makes no sense.

@@ -87,7 +87,12 @@ def read_associations(path: Path) -> list[tuple[StampedFile, StampedFile]]:
 def associate(
     colors: Sequence[StampedFile], depths: Sequence[StampedFile]
 ) -> list[tuple[StampedFile, StampedFile]]:
-    """Pair each colour with a depth image of its own, the closest pairs first, within 20 ms."""
+    """Pair each colour with a depth image of its own, the closest pairs first, within 20 ms.
+
+    Args:
+        colors: In the order of the result.
+        depths: Ascending in time.
+    """
     stamps = [depth.stamp_ns for depth in depths]
     candidates = []
     for number, color in enumerate(colors):
@@ -211,6 +216,10 @@ def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a folder of the benchmark.
 
     An association list is followed where there is one, else colour and depth are paired by time.
+
+    Args:
+        folder: One sequence of the benchmark.
+        config: Its intrinsics and unit of depth go before those of the folder and the benchmark.
 
     Raises:
         PathNotFoundError: When a listed image is not there.

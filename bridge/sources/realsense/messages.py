@@ -121,7 +121,13 @@ class CameraMessages:
     def facts(
         self, calibration: Calibration, mount: Mount | None, stamp_ns: int
     ) -> list[StampedMessage]:
-        """Intrinsics of both streams, and where depth and colour are."""
+        """Intrinsics of both streams, and where depth and colour are.
+
+        Args:
+            calibration: Intrinsics of both streams, and ``T_color_depth``.
+            mount: Parent frame and pose of the colour camera in it; None leaves that out.
+            stamp_ns: Of every message [ns since 1970].
+        """
         transforms = [
             FrameTransform(
                 stamp_ns=stamp_ns,

@@ -190,6 +190,11 @@ class RealSenseSource:
     ) -> dict[str, dict[str, int]]:
         """Publish every camera until stopped, by the caller or because one failed.
 
+        Args:
+            session: Where the messages go.
+            stop: Ends all cameras; also set here when one of them fails.
+            output: Says when a camera is lost and when it is back.
+
         Returns:
             Frames sent and lost by camera.
 
@@ -230,6 +235,10 @@ class RealSenseSource:
 
 def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[str, str]:
     """Map names to serial numbers of cameras that are attached.
+
+    Args:
+        config: Names and serial numbers wanted; without any, the only camera is taken.
+        list_devices: Returns the cameras attached now.
 
     Raises:
         CameraNotFoundError: When one is not, or none was named and there is not just one.

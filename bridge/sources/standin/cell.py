@@ -167,7 +167,12 @@ class StandinCell:
         times_ns: Int[np.ndarray, " num_waypoints"],
         joints_rad: Float[np.ndarray, "num_waypoints 6"],
     ) -> None:
-        """Send joint targets, interpolated between waypoints; times count from now."""
+        """Send joint targets, interpolated between waypoints; times count from now.
+
+        Args:
+            times_ns: Of each waypoint, ascending; the last says how long the motion takes.
+            joints_rad: Targets of the arm at these times.
+        """
         count = round(int(times_ns[-1]) / TICK_NS)
         ticks_ns = np.arange(1, count + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]

@@ -255,7 +255,12 @@ class HiddenParameters:
 
 
 def draw_hidden(cell: CellFile, seed: int) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one."""
+    """Draw one laboratory; the same cell file and seed give the same one.
+
+    Args:
+        cell: Ranges and standard deviations to draw from.
+        seed: Number of the laboratory.
+    """
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     uniform = {key: float(rng.uniform(*cell.uniform[key])) for key in sorted(cell.uniform)}
     errors = {}
@@ -280,7 +285,12 @@ def nominal_hidden(cell: CellFile) -> HiddenParameters:
 def small_transform(
     shift_m: Float[np.ndarray, "3"], turn_rad: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Build a transform from a translation and a rotation vector [rad]."""
+    """Build a transform from a translation and a rotation vector [rad].
+
+    Args:
+        shift_m: Translation [m].
+        turn_rad: Axis of the rotation times its angle; zeros for none.
+    """
     angle = float(np.linalg.norm(turn_rad))
     axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
     q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])

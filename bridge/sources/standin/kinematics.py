@@ -63,7 +63,12 @@ class Kinematics:
     def T_base_frame(
         self, joints_rad: Float[np.ndarray, "6"], frame: str
     ) -> Float[np.ndarray, "4 4"]:
-        """Return where a link is at these joints, gripper closed."""
+        """Return where a link is at these joints, gripper closed.
+
+        Args:
+            joints_rad: Angles of the arm.
+            frame: A frame of the URDF, such as ``tool0``.
+        """
         pinocchio.framesForwardKinematics(self._model, self._data, self._full(joints_rad))
         placement = self._data.oMf[self._model.getFrameId(frame)]
         return np.array(placement.homogeneous)
@@ -74,6 +79,10 @@ class Kinematics:
         joints_seed_rad: Float[np.ndarray, "6"],
     ) -> Float[np.ndarray, "6"]:
         """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3).
+
+        Args:
+            T_base_tcp: Where the tool is to be.
+            joints_seed_rad: Where the search begins; near the solution wanted.
 
         Raises:
             UnreachablePoseError: No convergence to 0.01 mm and 0.01 mrad within the limits.
@@ -127,7 +136,12 @@ def arm_kinematics() -> Kinematics:
 
 
 def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, "4 4"]:
-    """Pose ``T_base_tcp`` with the tool pointing down; yaw 0 closes the fingers along base y."""
+    """Pose ``T_base_tcp`` with the tool pointing down; yaw 0 closes the fingers along base y.
+
+    Args:
+        p_m: Tool centre point in the base frame [m].
+        yaw_rad: Turn about the base's z axis.
+    """
     T = np.eye(4)
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     # Columns: tool x is -x of the base at yaw 0, tool y is y, tool z is down.
@@ -161,7 +175,13 @@ def slerp_poses(
     T_end: Float[np.ndarray, "4 4"],
     fractions: Float[np.ndarray, " num_poses"],
 ) -> Float[np.ndarray, "num_poses 4 4"]:
-    """Straight line in position, constant axis in rotation."""
+    """Straight line in position, constant axis in rotation.
+
+    Args:
+        T_start: Pose at fraction 0.
+        T_end: Pose at fraction 1, in the same frame.
+        fractions: Shares of the way, 0 to 1.
+    """
     q_start, p_start = se3.split(T_start)
     q_end, p_end = se3.split(T_end)
     count = len(fractions)
@@ -211,7 +231,12 @@ class Track:
     def at_rest(
         T_base_tcp: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"]
     ) -> "Track":
-        """Start with an open gripper."""
+        """Start with an open gripper.
+
+        Args:
+            T_base_tcp: Where the tool is at these joints.
+            joints_rad: Angles of the arm.
+        """
         return Track(
             tau=(_waypoint(0, T_base_tcp, joints_rad, 0, MAX_WIDTH_M),),
             bounds={},
@@ -223,6 +248,12 @@ def follow_legs(
     before: Track, legs: Sequence[Leg], kinematics: Kinematics, max_joint_speed_rad_s: float
 ) -> Track:
     """Go on along straight lines at 20 Hz with smooth speed, slower where a joint would race.
+
+    Args:
+        before: What has been planned; the legs begin where it ends.
+        legs: Movements of the tool, one after the other.
+        kinematics: Of the arm.
+        max_joint_speed_rad_s: A leg takes longer than it asks for where a joint would be faster.
 
     Raises:
         UnreachablePoseError: When the arm cannot follow.

@@ -36,7 +36,7 @@ from bridge.sources.standin.settings import (
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
-from bridge.task.task_file import Task
+from bridge.task.task_file import Task, TaskFile
 from bridge.task.verdict import Verdict
 from bridge.terminal import Output
 
@@ -103,19 +103,22 @@ def _stage_result(
         heights = [float(T[2, 3]) for T in truth.poses[stage["grasp"]]]
         return max(heights) - heights[0] > LIFTED_M
     if stage.get("carry"):
-        return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in task.containers)
+        goal = task.goal_of(stage["carry"])
+        targets = task.containers if goal is None else (goal[1],)
+        return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in targets)
     return done[stage["release"]] if stage.get("release") else verdict
 
 
 def _above(
-    Ts_base_object: list[Float[np.ndarray, "4 4"]], truth: TruthLog, task: Task, container_id: str
+    Ts_base_object: list[Float[np.ndarray, "4 4"]], truth: TruthLog, task: Task, target_id: str
 ) -> bool:
-    """Whether an object was ever over a container's cavity, higher than its rim."""
-    container = task.objects[container_id]
-    half = np.array(container.inner_m[:2]) / 2
-    T_container_base = se3.invert(truth.poses[container_id][0])
-    p = se3.apply(T_container_base, np.array([T[:3, 3] for T in Ts_base_object]))
-    over = np.all(np.abs(p[:, :2]) < half, axis=1) & (p[:, 2] > container.size_m[2])
+    """Whether an object was ever over a container's cavity, or a support, higher than its top."""
+    target = task.objects[target_id]
+    half = np.array(target.inner_m[:2]) / 2
+    T_target_base = se3.invert(truth.poses[target_id][0])
+    p = se3.apply(T_target_base, np.array([T[:3, 3] for T in Ts_base_object]))
+    top_m = target.size_m[2] - target.rest_height_m
+    over = np.all(np.abs(p[:, :2]) < half, axis=1) & (p[:, 2] > top_m)
     return bool(over.any())
 
 
@@ -124,7 +127,12 @@ SETTLE_S = 0.8
 
 
 def execute_plan(cell: StandinCell, plan: Plan) -> None:
-    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper."""
+    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper.
+
+    Args:
+        cell: Moves, and publishes as it does.
+        plan: Its first waypoint should be where the arm is.
+    """
     streams = cell.streams
     times = plan.times_ns()
     joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
@@ -212,14 +220,24 @@ class Operator:
         session: Session,
         config: SessionConfig,
         output: Output | None = None,
+        task_file: TaskFile | None = None,
     ) -> None:
-        """Prepare; nothing is published before ``scan`` or ``trials``."""
+        """Prepare; nothing is published before ``scan`` or ``trials``.
+
+        Args:
+            cell: The laboratory.
+            session: Where recorder and gate answer.
+            config: What to do.
+            output: How to talk.
+            task_file: Sent to the recorder with every start.
+        """
         unknown = sorted(set(config.conditions) - set(CONDITIONS))
         if unknown:
             message = f"condition {unknown[0]!r} is unknown. There are: {', '.join(CONDITIONS)}."
             raise UsageError(message)
         self._cell, self._session, self._config = cell, session, config
         self._output = output or Output(quiet=True)
+        self._sent = {} if task_file is None else {"task_file": task_file.data.decode()}
         self._open = False
         self.scanned = False
         self.num_probes = 0
@@ -257,7 +275,12 @@ class Operator:
         return [(s, c) for s, c in all_ if (f"{task}/{s}", c) not in there]
 
     def start_poses(self, start_seed: int, condition: str) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """The declared start as a person puts it down: a little off, differently each time."""
+        """The declared start as a person puts it down: a little off, differently each time.
+
+        Args:
+            start_seed: Number of the start; the same one declares the same poses.
+            condition: Which trial of that start it is; the deviations differ between conditions.
+        """
         noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))
         index = CONDITIONS.index(condition) if condition in CONDITIONS else len(CONDITIONS)
@@ -493,7 +516,10 @@ class Operator:
         record["tags"] = list(info.tags)
         del record["id"]
         # A simulated cell publishes nothing before its episode begins: nothing can be missing yet.
-        self._control("start", {"id": info.id, "info": record, "anyway": True})
+        request = {"id": info.id, "info": record, "anyway": True, **self._sent}
+        answer = self._control("start", request)
+        if remark := answer.get("task_remark"):
+            self._output.detail(str(remark))
         self._open = True
         self._cell.announce()
 

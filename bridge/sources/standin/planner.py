@@ -42,6 +42,10 @@ class StageIds:
 def stage_ids(task: Task, object_id: str) -> StageIds:
     """The stages that grasp, carry and release an object; placing may cover the carrying.
 
+    Args:
+        task: Whose stages are searched.
+        object_id: One of its manipulated objects.
+
     Raises:
         UsageError: When none grasps or none releases it.
     """
@@ -59,11 +63,68 @@ def stage_ids(task: Task, object_id: str) -> StageIds:
     return StageIds(pick=pick, carry=carry or place, place=place)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Destination:
+    """What an object is put into or onto, as the planner sees it."""
+
+    id: str
+    relation: str
+    """inside or on."""
+    model: ObjectModel
+    T_base: Float[np.ndarray, "4 4"]
+
+    def resting_m(self, model: ObjectModel) -> float:
+        """Height at which the middle of an object comes to lie there."""
+        if self.relation == "inside":
+            return float(self.T_base[2, 3]) + (self.model.wall_m + model.size_m[2] / 2)
+        return self.top_m + model.size_m[2] / 2
+
+    @property
+    def top_m(self) -> float:
+        """Height that the object has to pass: the rim of the walls, or what it is put on."""
+        above_origin = self.model.size_m[2] - self.model.rest_height_m
+        return float(self.T_base[2, 3]) + above_origin
+
+    @property
+    def clearance_m(self) -> float:
+        """Between the underside of the held object and that height when it is let go."""
+        return RELEASE_CLEARANCE_M if self.relation == "inside" else ON_CLEARANCE_M
+
+    @property
+    def area_m(self) -> tuple[float, float]:
+        """Extents of what objects may lie on, in its frame."""
+        x, y, _ = self.model.inner_m if self.relation == "inside" else self.model.size_m
+        return x, y
+
+
+def destination_of(
+    task: Task, object_id: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> Destination:
+    """Find where an object belongs by the success predicates, and where that is.
+
+    Raises:
+        UsageError: When no predicate says it, and there is no container.
+    """
+    goal = task.goal_of(object_id)
+    if goal is None and task.containers:
+        goal = ("inside", task.containers[0])
+    if goal is None:
+        message = (
+            f"nothing in the success predicates of task {task.name} says what {object_id} is to be "
+            "inside or on: the scripted planner cannot plan it. See docs/tasks.md."
+        )
+        raise UsageError(message)
+    relation, target = goal
+    model = task.objects[target]
+    return Destination(id=target, relation=relation, model=model, T_base=seen[target])
+
+
 def planned_stages(
     task: Task,
     legs_of: Mapping[str, Sequence[Leg]],
     bounds: Mapping[str, tuple[int, int]],
     seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    places: Mapping[str, Destination],
 ) -> tuple[Stage, ...]:
     """What a plan says of each stage of its task: when it is, and where it leaves its object.
 
@@ -72,6 +133,7 @@ def planned_stages(
         legs_of: How each object is moved.
         bounds: When each stage begins and ends, from the start of the plan [ns].
         seen: Poses ``T_base_object`` as perceived.
+        places: Where each object belongs.
 
     Raises:
         UsageError: When a stage handles no object.
@@ -80,7 +142,8 @@ def planned_stages(
     for index, table in enumerate(task.stages):
         last = index == len(task.stages) - 1
         object_id = _object_of(task, table)
-        predicted = _predicted(task, object_id, legs_of[object_id], seen, table)
+        model, place = task.objects[object_id], places[object_id]
+        predicted = _predicted(model, place, legs_of[object_id], seen[object_id], table)
         start_ns, end_ns = bounds[table["id"]]
         stages.append(
             Stage(
@@ -111,20 +174,18 @@ def _object_of(task: Task, stage: Mapping[str, Any]) -> str:
 
 
 def _predicted(
-    task: Task,
-    object_id: str,
+    model: ObjectModel,
+    destination: Destination,
     legs: Sequence[Leg],
-    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    T_base_object: Float[np.ndarray, "4 4"],
     table: Mapping[str, Any],
 ) -> Float[np.ndarray, "4 4"]:
-    """Where a stage leaves its object: lifted, over the container, or on the container's floor."""
+    """Where a stage leaves its object: lifted, over where it belongs, or lying there."""
     place = {leg.name: leg.T_base_tcp[:3, 3] for leg in legs}
-    T = seen[object_id].copy()
+    T = T_base_object.copy()
     if table.get("release"):
-        container_id = task.containers[0]
-        floor_m = task.objects[container_id].wall_m + task.objects[object_id].size_m[2] / 2
         T[:2, 3] = place["open"][:2]
-        T[2, 3] = seen[container_id][2, 3] + floor_m
+        T[2, 3] = destination.resting_m(model)
     else:
         T[:3, 3] += place["carry" if table.get("carry") else "lift"] - place["close"]
     return T
@@ -140,6 +201,8 @@ CARRY_M = 0.24
 """Height of the tool while carrying."""
 RELEASE_CLEARANCE_M = 0.018
 """Between the underside of the held object and the top of the container's walls."""
+ON_CLEARANCE_M = 0.003
+"""Between the underside of the held object and the top of what it is put on."""
 LOWEST_TOOL_M = 0.016
 """The tips reach 10 mm below the tool frame."""
 
@@ -159,7 +222,14 @@ NO_ERROR = GraspError(along_m=0.0, across_m=0.0, yaw_rad=0.0, height_m=0.0, rele
 
 
 def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int = 0) -> GraspError:
-    """Draw how a candidate is wrong; the same start, round and object give the same error."""
+    """Draw how a candidate is wrong; the same start, round and object give the same error.
+
+    Args:
+        noise: Standard deviations.
+        start_seed: Number of the start.
+        round_: Number of the attempt, from 0: one more for each plan that was refused.
+        index: Number of the object among those manipulated, from 0.
+    """
     # The first object's stream has no index: a task with one object draws what it always drew.
     more = [index] if index else []
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, round_, *more])
@@ -176,7 +246,14 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
 def draw_errors(
     noise: PlannerNoise, count: int, *, start_seed: int, round_: int
 ) -> tuple[GraspError, ...]:
-    """Draw an error for each of several objects."""
+    """Draw an error for each of several objects.
+
+    Args:
+        noise: Standard deviations.
+        count: How many objects are manipulated.
+        start_seed: Number of the start.
+        round_: Number of the attempt, from 0: one more for each plan that was refused.
+    """
     return tuple(
         draw_error(noise, start_seed=start_seed, round_=round_, index=index)
         for index in range(count)
@@ -189,7 +266,13 @@ def perceive(
     *,
     start_seed: int,
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Return the objects' poses as this planner sees them: shifted and turned a little."""
+    """Return the objects' poses as this planner sees them: shifted and turned a little.
+
+    Args:
+        Ts_base_object: True poses by object id; left as they are.
+        noise: Standard deviations.
+        start_seed: Number of the start; the same one is always seen with the same error.
+    """
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, 10_000])
     seen = {}
     for object_id in sorted(Ts_base_object):
@@ -236,18 +319,23 @@ def plan_pick_and_place(
     """
     count = len(task.manipulated)
     errors = [error] * count if isinstance(error, GraspError) else list(error)
-    container = task.containers[0]
     T_home = kinematics.T_base_tcp(joints_start_rad)
-    slots = release_slots(count, task.objects[container])
+    places = {key: destination_of(task, key, seen) for key in task.manipulated}
+    slots = _slots(places)
     track = Track.at_rest(T_home, joints_start_rad)
     legs_of: dict[str, list[Leg]] = {}
+    then = dict(seen)
     for index, key in enumerate(task.manipulated):
-        ways = _ways(task, key, seen[key], seen[container], errors[index], slots[index])
+        places[key] = destination_of(task, key, then)  # which may have been moved before
+        ways = _ways(task, key, seen[key], places[key], errors[index], slots[key])
         # From object to object the wrist can wind up until each way goes past a joint's limit.
         unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
         track, legs_of[key] = _first_reachable(
             track, [*ways, *unwound], kinematics, max_joint_speed_rad_s
         )
+        released = {"release": key}
+        then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
+    keypoints = dict.fromkeys((*task.manipulated, *(place.id for place in places.values())))
     last = legs_of[task.manipulated[-1]][-1].stage
     home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
     track = follow_legs(track, [home], kinematics, max_joint_speed_rad_s)
@@ -265,19 +353,33 @@ def plan_pick_and_place(
         instruction=task.instruction,
         grounding_source=GROUNDING,
         entities={key: se3.pose_record(T) for key, T in seen.items()},
-        keypoints_m=tuple(_point(seen[key][:3, 3]) for key in (*task.manipulated, container)),
+        keypoints_m=tuple(_point(seen[key][:3, 3]) for key in keypoints),
         joint_names=ARM_JOINTS,
-        stages=planned_stages(task, legs_of, track.bounds, seen),
+        stages=planned_stages(task, legs_of, track.bounds, seen, places),
         tau=track.tau,
     )
 
 
-def release_slots(count: int, container: ObjectModel) -> list[Float[np.ndarray, "2"]]:
-    """Where in a container several objects go: two rows along its x axis, in its frame [m].
+def _slots(places: Mapping[str, Destination]) -> dict[str, Float[np.ndarray, "2"]]:
+    """Share each destination among the objects that belong there."""
+    slots: dict[str, Any] = {}
+    for target in dict.fromkeys(place.id for place in places.values()):
+        keys = [key for key, place in places.items() if place.id == target]
+        area = places[keys[0]].area_m
+        slots |= dict(zip(keys, release_slots(len(keys), area), strict=True))
+    return slots
+
+
+def release_slots(count: int, area_m: tuple[float, float]) -> list[Float[np.ndarray, "2"]]:
+    """Where on an area several objects go: two rows along its x axis, from its middle [m].
 
     An odd last one lies between the rows; a single one goes to the middle.
+
+    Args:
+        count: How many objects.
+        area_m: Extents of the area along its x and y axes; heights are not decided here.
     """
-    x, y, _ = container.inner_m
+    x, y = area_m
     columns = -(-count // 2)
     slots = []
     for index in range(count):
@@ -313,7 +415,7 @@ def _ways(
     task: Task,
     object_id: str,
     T_base_object: Float[np.ndarray, "4 4"],
-    T_base_container: Float[np.ndarray, "4 4"],
+    destination: Destination,
     error: GraspError,
     slot_m: Float[np.ndarray, "2"],
 ) -> list[list[Leg]]:
@@ -324,7 +426,7 @@ def _ways(
     turns = range(round(2 * np.pi / turn))
     yaws = sorted((wrap_rad(yaw + k * turn) for k in turns), key=abs)
     return [
-        _legs(task, object_id, T_base_object, T_base_container, each + error.yaw_rad, error, slot_m)
+        _legs(task, object_id, T_base_object, destination, each + error.yaw_rad, error, slot_m)
         for each in yaws
     ]
 
@@ -333,12 +435,12 @@ def _legs(
     task: Task,
     object_id: str,
     T_base_object: Float[np.ndarray, "4 4"],
-    T_base_container: Float[np.ndarray, "4 4"],
+    destination: Destination,
     yaw: float,
     error: GraspError,
     slot_m: Float[np.ndarray, "2"],
 ) -> list[Leg]:
-    model, container = task.objects[object_id], task.objects[task.containers[0]]
+    model = task.objects[object_id]
     p = T_base_object[:3, 3] + np.array([0.0, 0.0, model.grasp_m[2] + error.height_m])
     p[:2] += T_base_object[:2, :2] @ np.array(model.grasp_m[:2])
     R = tool_down(p, yaw)[:3, :3]
@@ -347,12 +449,12 @@ def _legs(
     above, carried = p.copy(), p.copy()
     above[2] = p[2] + HOVER_M
     carried[2] = CARRY_M
-    over = T_base_container[:3, 3] + np.array([*error.release_m, 0.0])
-    over[:2] += T_base_container[:2, :2] @ slot_m
+    over = destination.T_base[:3, 3] + np.array([*error.release_m, 0.0])
+    over[:2] += destination.T_base[:2, :2] @ slot_m
     over[2] = CARRY_M
     low = over.copy()
     below_tool = p[2] - (T_base_object[2, 3] - model.size_m[2] / 2)
-    low[2] = T_base_container[2, 3] + container.size_m[2] + below_tool + RELEASE_CLEARANCE_M
+    low[2] = destination.top_m + below_tool + destination.clearance_m
     ids = stage_ids(task, object_id)
     moves = (
         ("pregrasp", ids.pick, above, 1.5, 0),

@@ -77,7 +77,12 @@ class Renderer:
         self._painted = [k for k, item in enumerate(surfaces) if item.paint is not None]
 
     def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
-        """See the laboratory without the bodies in it, for ``render`` from the same place."""
+        """See the laboratory without the bodies in it, for ``render`` from the same place.
+
+        Args:
+            camera: Intrinsics and size of the picture.
+            T_base_camera: Where the camera stands, with OpenCV axes.
+        """
         posed = self._pose(T_base_camera, {}, self._unmoving, {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         return replace(seen, colors=self._smooth_edges(posed, seen, camera, T_base_camera))
@@ -90,7 +95,15 @@ class Renderer:
         backdrop: Layer | None = None,
         skins_m: Mapping[str, Float[np.ndarray, "num_vertices 3"]] | None = None,
     ) -> Picture:
-        """Take a picture of the bodies where they are, the soft ones by their skins."""
+        """Take a picture of the bodies where they are, the soft ones by their skins.
+
+        Args:
+            camera: Intrinsics and size of the picture.
+            T_base_camera: Where the camera is, with OpenCV axes.
+            Ts_base_body: Poses of the moving bodies, by name.
+            backdrop: What ``backdrop`` returned for the same place; None draws the laboratory too.
+            skins_m: Vertices of soft bodies by name, in the base frame; None when there is none.
+        """
         which = self._moving if backdrop is not None else [*self._unmoving, *self._moving]
         posed = self._pose(T_base_camera, Ts_base_body, which, skins_m or {})
         seen = self._look(posed, _rays(camera, T_base_camera))
@@ -299,7 +312,14 @@ def measure_depth(
     hidden: HiddenParameters,
     rng: np.random.Generator,
 ) -> UInt16[np.ndarray, "height width"]:
-    """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement"."""
+    """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement".
+
+    Args:
+        picture: What an ideal camera sees.
+        model: Noise and range of the sensor.
+        hidden: True scale and offset of this laboratory's sensor.
+        rng: Drawn from in a fixed order: the same state gives the same image.
+    """
     true_m = np.where(np.isfinite(picture.depth_m), picture.depth_m, 0.0)
     noise = rng.standard_normal(true_m.shape, dtype=np.float32)
     sigma_m = model.depth_noise_per_m * true_m**2
@@ -329,7 +349,14 @@ def measure_color(
     hidden: HiddenParameters,
     rng: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour with the exposure's gain and noise."""
+    """Colour with the exposure's gain and noise.
+
+    Args:
+        picture: What an ideal camera sees.
+        model: Noise of the sensor.
+        hidden: Gain of this laboratory's exposure.
+        rng: The same state gives the same image.
+    """
     noise = rng.standard_normal(picture.image.shape, dtype=np.float32)
     levels = picture.image * np.float32(255.0 * hidden.image_gain)
     return np.clip(levels + np.float32(model.image_noise) * noise + 0.5, 0, 255).astype(np.uint8)

@@ -49,6 +49,12 @@ def scan_joints(
     """Find joints for each viewpoint that can be reached safely from the one before.
 
     Viewpoints behind the reach of the arm are left out.
+
+    Args:
+        mount: The wrist camera on the arm.
+        kinematics: Of the arm.
+        joints_start_rad: Where the arm is before the first viewpoint.
+        config: Rings of viewpoints.
     """
     T_parent_tcp = se3.invert(
         kinematics.T_base_frame(joints_start_rad, mount.parent)
@@ -124,7 +130,13 @@ def joint_move(
     end_rad: Float[np.ndarray, "6"],
     max_speed_rad_s: float,
 ) -> tuple[np.ndarray, Float[np.ndarray, "num_waypoints 6"]]:
-    """A smooth move in joint space, as fast as the slowest joint allows: times [ns] and joints."""
+    """A smooth move in joint space, as fast as the slowest joint allows: times [ns] and joints.
+
+    Args:
+        start_rad: At rest at the first time, 0.
+        end_rad: At rest at the last time.
+        max_speed_rad_s: No joint is faster at any time.
+    """
     largest = float(np.max(np.abs(end_rad - start_rad)))
     # The minimum-jerk law peaks at 15/8 of its mean speed.
     duration_s = max(1.875 * largest / max_speed_rad_s, 0.1)

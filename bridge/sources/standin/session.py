@@ -15,7 +15,7 @@ from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS, Session, Streams
-from bridge.task.task_file import load_task
+from bridge.task.find import chosen_task_file
 from bridge.terminal import Output
 
 if TYPE_CHECKING:
@@ -42,7 +42,8 @@ def run_session(
     Returns:
         Per condition how many trials had which outcome, and whether the session was stopped.
     """
-    task = load_task(config.task)
+    task_file = chosen_task_file(config.task)
+    task = task_file.task()
     file = load_cell(config.cell_file or task.cell)
     cell = StandinCell(
         file,
@@ -56,7 +57,7 @@ def run_session(
         start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
         should_stop=should_stop,
     )
-    operator = Operator(cell, session, config, output)
+    operator = Operator(cell, session, config, output, task_file)
     stopped = False
     try:
         if config.scan:
@@ -70,7 +71,7 @@ def run_session(
         with contextlib.suppress(BridgeError):  # the first error is the one to show
             operator.abandon(discard=True)
         raise
-    return _summary(operator, config, stopped=stopped)
+    return _summary(operator, config, task.name, stopped=stopped)
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class StandinSource:
     @property
     def topics(self) -> tuple[str, ...]:
         """Those of a real cell, and the truth that only tests and perception metrics read."""
-        task = load_task(self.config.task)
+        task = chosen_task_file(self.config.task).task()
         cell, cameras = self.config.cell, load_cell(self.config.cell_file or task.cell).cameras
         endings = (topics.COLOR_IMAGE, topics.COLOR_INFO, topics.DEPTH_IMAGE, topics.DEPTH_INFO)
         of_cell = (
@@ -116,11 +117,19 @@ class StandinSource:
         )
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
-        """Record as the configuration says, or until stopped; see ``run_session``."""
+        """Record as the configuration says, or until stopped; see ``run_session``.
+
+        Args:
+            session: Where the cell publishes and the recorder is asked.
+            stop: Looked at every 8 ms of the cell's time; the open episode is then finished.
+            output: For progress and remarks.
+        """
         return run_session(session, self.config, output, should_stop=stop.is_set)
 
 
-def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dict[str, Any]:
+def _summary(
+    operator: Operator, config: SessionConfig, task_name: str, *, stopped: bool
+) -> dict[str, Any]:
     counts: dict[str, Counter[str]] = {}
     objects: dict[str, dict[str, int]] = {}
     for info, outcome in operator.results:
@@ -131,7 +140,7 @@ def _summary(operator: Operator, config: SessionConfig, *, stopped: bool) -> dic
     return {
         "stand_in": True,
         "cell": config.cell,
-        "task": config.task,
+        "task": task_name,
         "seed": config.seed,
         "scan": operator.scanned,
         "probes": operator.num_probes,

@@ -81,13 +81,23 @@ class SoftBody:
     def extents_m(
         self, nodes_m: Float[np.ndarray, "8 3"], T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of the deformed surface along the axes of its pose."""
+        """Outer extents of the deformed surface along the axes of its pose.
+
+        Args:
+            nodes_m: Corners of the cage, in the base frame.
+            T_base_object: Pose of the object, whose axes are measured along.
+        """
         local = (self.skin_weights @ nodes_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
         return np.asarray(np.ptp(local, axis=0))
 
 
 def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
-    """Find the nodes of a soft object in a compiled model."""
+    """Find the nodes of a soft object in a compiled model.
+
+    Args:
+        model: A soft object of the task.
+        mujoco_model: The compiled ``mjModel`` it is part of.
+    """
     if model.soft is None:
         message = f"{model.id} is not soft"
         raise ValueError(message)

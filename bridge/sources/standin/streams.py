@@ -63,10 +63,22 @@ class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 
     def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Publisher:
-        """Announce a topic."""
+        """Announce a topic.
+
+        Args:
+            topic: With its leading slash.
+            type_name: Type of all its messages.
+            qos: How its messages travel when the network is behind.
+        """
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """Ask and wait."""
+        """Ask and wait.
+
+        Args:
+            key: Whom to ask, as a zenoh key.
+            payload: The request.
+            timeout_s: How long to wait for the answer [s].
+        """
 
 
 def color_frame(camera_id: str) -> str:
@@ -103,7 +115,13 @@ class Streams:
     def camera_poses(
         self, poses: Mapping[str, Float[np.ndarray, "4 4"]], stamp_ns: int, *, static: bool
     ) -> None:
-        """Publish where the colour cameras are believed to be in ``base_link``."""
+        """Publish where the colour cameras are believed to be in ``base_link``.
+
+        Args:
+            poses: ``T_base_camera`` by camera id, believed, not true.
+            stamp_ns: The cell's time [ns].
+            static: They hold from now on (``/tf_static``); else at this instant (``/tf``).
+        """
         items = [
             FrameTransform(
                 stamp_ns=stamp_ns, parent=BASE_FRAME, child=color_frame(camera_id), T_parent_child=T
@@ -141,7 +159,14 @@ class Streams:
         depth_mm: UInt16[np.ndarray, "height width"],
         stamp_ns: int,
     ) -> None:
-        """Publish colour and depth of one instant."""
+        """Publish colour and depth of one instant.
+
+        Args:
+            camera_id: Name of the camera.
+            image_u8: RGB; sent as JPEG.
+            depth_mm: Aligned with the colour; 0 is "no measurement".
+            stamp_ns: The cell's time of both [ns].
+        """
         color = CompressedColor(
             stamp_ns=stamp_ns,
             frame_id=color_frame(camera_id),
@@ -160,7 +185,14 @@ class Streams:
         effort: Float[np.ndarray, "6"],
         stamp_ns: int,
     ) -> None:
-        """Publish what the encoders say."""
+        """Publish what the encoders say.
+
+        Args:
+            position: Measured angles [rad].
+            velocity: Measured [rad/s].
+            effort: Torques [N m].
+            stamp_ns: The cell's time [ns].
+        """
         sample = JointSample(
             stamp_ns=stamp_ns,
             names=ARM_JOINTS,
@@ -190,14 +222,26 @@ class Streams:
     def truth_object(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"], stamp_ns: int
     ) -> None:
-        """Publish a true pose, for tests and the evaluator's perception metrics only."""
+        """Publish a true pose, for tests and the evaluator's perception metrics only.
+
+        Args:
+            object_id: Id of the object in the task.
+            T_base_object: Where it really is.
+            stamp_ns: The cell's time [ns].
+        """
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
         self._put(object_topic(TRUTH, object_id, "pose"), sample.to_cdr(), stamp_ns)
 
     def truth_nodes(
         self, object_id: str, points_m: Float[np.ndarray, "num_points 3"], stamp_ns: int
     ) -> None:
-        """Publish where the points of a soft object really are, in ``base_link``."""
+        """Publish where the points of a soft object really are, in ``base_link``.
+
+        Args:
+            object_id: Id of a soft object in the task.
+            points_m: In ``base_link``.
+            stamp_ns: The cell's time [ns].
+        """
         sample = PointCloudSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, points_m=points_m)
         self._put(object_topic(TRUTH, object_id, "nodes"), sample.to_cdr(), stamp_ns)
 
@@ -217,7 +261,13 @@ class Streams:
         self._put(cell_topic(self._cell, PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns)
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
-        """Publish one event; the schema lists the kinds and the fields."""
+        """Publish one event; the schema lists the kinds and the fields.
+
+        Args:
+            kind: One of the types of the event schema.
+            stamp_ns: The cell's time [ns].
+            **fields: Further fields of the event, such as ``plan_id``; checked against the schema.
+        """
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
         check_record(record, name="event", package="bridge.episode")
         self._put(cell_topic(self._cell, EVENT), json.dumps(record).encode(), stamp_ns)

@@ -50,7 +50,13 @@ class Texture:
 
 
 def table_texture(size_m: tuple[float, float], centre_m: tuple[float, float], seed: int) -> Texture:
-    """Wooden boards along y with grain, and patches of coloured tape and checkers."""
+    """Wooden boards along y with grain, and patches of coloured tape and checkers.
+
+    Args:
+        size_m: Extents along x and y [m].
+        centre_m: Its middle in the base frame, x and y [m].
+        seed: Of the laboratory.
+    """
     rng = np.random.default_rng([7, seed])
     columns, rows = (round(extent / TABLE_RESOLUTION_M) for extent in size_m)
     wood = np.array([0.78, 0.63, 0.46])
@@ -108,7 +114,13 @@ def _add_patches(
 def lab_texture(
     size_m: tuple[float, float], base: tuple[float, float, float], seed: int
 ) -> Texture:
-    """Floor or wall: large soft blotches and tile lines, low contrast."""
+    """Floor or wall: large soft blotches and tile lines, low contrast.
+
+    Args:
+        size_m: Extents of the rectangle [m].
+        base: Mean colour, sRGB in 0..1.
+        seed: Of the laboratory, plus the number of the surface.
+    """
     rng = np.random.default_rng([8, seed])
     columns, rows = (round(extent / ROOM_RESOLUTION_M) for extent in size_m)
     coarse = rng.normal(0, 1, (rows // 12 + 2, columns // 12 + 2))
@@ -156,7 +168,14 @@ def box_surface(
     size_m: Float[np.ndarray, "3"],
     color: tuple[float, float, float],
 ) -> Surface:
-    """A box with hard edges."""
+    """A box with hard edges.
+
+    Args:
+        body: Name of the body it moves with; "" for the laboratory.
+        centre_m: Of the box, in the frame of the body [m].
+        size_m: Edges of the box [m].
+        color: sRGB in 0..1.
+    """
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -171,7 +190,14 @@ def make_surface(
     triangles: Int[np.ndarray, "num_triangles 3"],
     color: tuple[float, float, float],
 ) -> Surface:
-    """Attach normals that are smooth within a crease and broken across it."""
+    """Attach normals that are smooth within a crease and broken across it.
+
+    Args:
+        body: Name of the body it moves with; "" for the laboratory.
+        vertices_m: In the frame of the body.
+        triangles: Indices of vertices, counterclockwise seen from outside.
+        color: sRGB in 0..1.
+    """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     length = np.linalg.norm(weighted, axis=1, keepdims=True)
@@ -262,7 +288,13 @@ def _mesh_surface(body: str, mesh: ToyMesh) -> Surface:
 def smooth_normals(
     vertices_m: Float[np.ndarray, "num_vertices 3"], triangles: np.ndarray
 ) -> Float[np.ndarray, "num_triangles 3 3"]:
-    """Normals at the corners of triangles, weighted by area, without creases."""
+    """Normals at the corners of triangles, weighted by area, without creases.
+
+    Args:
+        vertices_m: In any frame; the normals are in the same.
+        triangles: Indices of vertices, counterclockwise seen from outside, one row of three for
+            each.
+    """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     total = np.stack(

@@ -172,7 +172,13 @@ def step_s_of(task: Task) -> float:
 
 
 def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter] = ()) -> Any:
-    """Compile the laboratory with its true parameters into an ``mjModel``."""
+    """Compile the laboratory with its true parameters into an ``mjModel``.
+
+    Args:
+        task: Its objects are put into the laboratory.
+        hidden: True masses, frictions and offsets.
+        clutter: What stands about and is no object of the task.
+    """
     if task.soft_objects:
         spec = mujoco.MjSpec.from_string(soft_model_xml(task, hidden))
         # The only integrator that takes the elasticity of flexes.
@@ -384,7 +390,12 @@ class World:
         joints_rad: Float[np.ndarray, "6"],
         Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
     ) -> None:
-        """Put the arm and the objects somewhere, at rest, gripper open."""
+        """Put the arm and the objects somewhere, at rest, gripper open.
+
+        Args:
+            joints_rad: Angles of the arm.
+            Ts_base_object: Pose of each object by id.
+        """
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[self._arm] = joints_rad
         self._data.qpos[self._fingers] = MAX_WIDTH_M / 2
@@ -413,7 +424,12 @@ class World:
         mujoco.mj_forward(self._model, self._data)
 
     def command(self, joints_rad: Float[np.ndarray, "6"], width_m: float) -> None:
-        """Send targets to the servos; they act after the cell's latency."""
+        """Send targets to the servos; they act after the cell's latency.
+
+        Args:
+            joints_rad: Targets of the arm.
+            width_m: Target of the gripper, the distance between the pads.
+        """
         target = np.concatenate([joints_rad, [width_m / 2]])
         self._pending.append(target)
 
@@ -479,7 +495,12 @@ class World:
     def extents_m(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of a soft object along the axes of its pose."""
+        """Outer extents of a soft object along the axes of its pose.
+
+        Args:
+            object_id: A soft object of the task.
+            T_base_object: Its pose, whose axes are measured along.
+        """
         return self._soft[object_id].extents_m(self.nodes_m(object_id), T_base_object)
 
     def finger_contact(self) -> dict[str, bool]:

@@ -7,69 +7,14 @@ URDF.
 
 import json
 import math
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from bridge.clock import split_ns
 from bridge.episode import schema
-from bridge.episode.cdr import codec
+from bridge.episode.cdr.batch import MessageTemplate, Stamp, named
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import EVENT, cell_topic
-from bridge.robots.default import ARM_JOINTS, BASE_FRAME
-
-# Messages of one layout are serialised once; then only stamp and numbers change from sample to
-# sample. At 500 samples a second and six topics a general serialiser would cost a quarter of a
-# core.
-
-_STAMP = {"sec": 0x13579BDF, "nanosec": 0x2468ACE0}
-_STAMP_BYTES = struct.pack("<iI", *_STAMP.values())
-Stamp = dict[str, int]
-
-
-class MessageTemplate:
-    """A message of which one header stamp and a run of doubles are filled in later."""
-
-    def __init__(
-        self, type_name: str, build: Callable[[Stamp, list[float]], dict[str, Any]], count: int
-    ) -> None:
-        """Serialise once and remember where the numbers went.
-
-        Args:
-            type_name: As in ``bridge.episode.schema``.
-            build: Makes the message from a stamp and ``count`` numbers.
-            count: How many doubles are filled in, in the order the message holds them.
-        """
-        marks = [2.0**-30 * (3 * number + 1) for number in range(count)]
-        self._bytes = codec.encode(type_name, build(_STAMP, marks))
-        self._stamp_at = self._place(_STAMP_BYTES)
-        runs: list[list[int]] = []
-        for mark in marks:
-            at = self._place(struct.pack("<d", mark))
-            if runs and at == runs[-1][0] + 8 * runs[-1][1]:
-                runs[-1][1] += 1
-            else:
-                runs.append([at, 1])
-        self._runs = [(at, struct.Struct(f"<{length}d")) for at, length in runs]
-
-    def _place(self, mark: bytes) -> int:
-        at = self._bytes.find(mark)
-        if at < 0 or self._bytes.find(mark, at + 1) >= 0:
-            message = f"{mark!r} is not once in the message"
-            raise ValueError(message)
-        return at
-
-    def fill(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Return the message with this stamp and these numbers."""
-        data = bytearray(self._bytes)
-        struct.pack_into("<iI", data, self._stamp_at, *split_ns(stamp_ns))
-        start = 0
-        for at, layout in self._runs:
-            count = layout.size // 8
-            layout.pack_into(data, at, *numbers[start : start + count])
-            start += count
-        return bytes(data)
-
+from bridge.robots.default import BASE_FRAME
 
 _ROBOT = {
     -1: "NO_CONTROLLER",
@@ -138,33 +83,11 @@ def tool_wrench(wrench: Sequence[float]) -> tuple[float, ...]:
     return -fx, -fy, fz, -tx, -ty, tz
 
 
-def joints_template(names: tuple[str, ...], *, velocities: bool) -> MessageTemplate:
-    """sensor_msgs/JointState: positions [rad or m], then velocities [per s] where wanted."""
-    count = len(names)
-
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
-        header = {"stamp": stamp, "frame_id": ""}
-        first, rest = numbers[:count], numbers[count:]
-        return {"header": header, "name": list(names), "position": first, "velocity": rest}
-
-    return MessageTemplate(schema.JOINT_STATE, build, count * (2 if velocities else 1))
-
-
-def pose_template() -> MessageTemplate:
-    """geometry_msgs/PoseStamped in base_link, filled with ``tool_pose``."""
-
-    def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
-        pose = {"position": _named("xyz", numbers), "orientation": _named("xyzw", numbers[3:])}
-        return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "pose": pose}
-
-    return MessageTemplate(schema.POSE_STAMPED, build, 7)
-
-
 def frame_template() -> MessageTemplate:
     """tf2_msgs/TFMessage with the tool's frame, so that a camera at the wrist has a place."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
-        transform = {"translation": _named("xyz", numbers), "rotation": _named("xyzw", numbers[3:])}
+        transform = {"translation": named("xyz", numbers), "rotation": named("xyzw", numbers[3:])}
         header = {"stamp": stamp, "frame_id": BASE_FRAME}
         item = {"header": header, "child_frame_id": CONTROLLER_TCP_FRAME, "transform": transform}
         return {"transforms": [item]}
@@ -176,25 +99,23 @@ def wrench_template() -> MessageTemplate:
     """geometry_msgs/WrenchStamped along base_link, filled with ``tool_wrench``."""
 
     def build(stamp: Stamp, numbers: list[float]) -> dict[str, Any]:
-        wrench = {"force": _named("xyz", numbers), "torque": _named("xyz", numbers[3:])}
+        wrench = {"force": named("xyz", numbers), "torque": named("xyz", numbers[3:])}
         return {"header": {"stamp": stamp, "frame_id": BASE_FRAME}, "wrench": wrench}
 
     return MessageTemplate(schema.WRENCH_STAMPED, build, 6)
 
 
-def _named(axes: str, numbers: Sequence[float]) -> dict[str, float]:
-    return dict(zip(axes, numbers, strict=False))
-
-
-def arm_template() -> MessageTemplate:
-    """Positions and velocities of the arm's joints."""
-    return joints_template(ARM_JOINTS, velocities=True)
-
-
 def mode_event(
     cell: str, robot_mode: int | None, safety_mode: int | None, stamp_ns: int
 ) -> StampedMessage:
-    """What the controller says of itself, as an event (type note)."""
+    """What the controller says of itself, as an event (type note).
+
+    Args:
+        cell: Name of the cell, without slashes.
+        robot_mode: The controller's number of it; None when it does not say.
+        safety_mode: The controller's number of it; None when it does not say.
+        stamp_ns: Source time of the sample that says so [ns since 1970].
+    """
     robot = None if robot_mode is None else robot_mode_name(robot_mode)
     safety = None if safety_mode is None else safety_mode_name(safety_mode)
     record = {

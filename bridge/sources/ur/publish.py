@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
+from bridge.episode.cdr.batch import MessageTemplate, joint_template, pose_template
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import (
@@ -23,11 +24,10 @@ from bridge.episode.topics import (
     cell_topic,
 )
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.robots.default import ARM_JOINTS, GRIPPER_WIDTH, ROBOT
+from bridge.robots.default import ARM_JOINTS, BASE_FRAME, GRIPPER_WIDTH, ROBOT
 from bridge.sources.device_samples import Announcer, HostClock, NumberedPublisher
 from bridge.sources.ur import messages
 from bridge.sources.ur.config import ControllerError, UrConfig
-from bridge.sources.ur.messages import MessageTemplate
 from bridge.sources.ur.rtde import RtdeClient, Sample, Wish
 from bridge.terminal import Output
 from bridge.wire.qos import Qos
@@ -74,13 +74,14 @@ class ArmPublisher:
         self._announcer = announcer
         self._gripper = config.make_gripper()
         state = schema.JOINT_STATE
-        targets = messages.joints_template(ARM_JOINTS, velocities=False)
-        width = messages.joints_template((GRIPPER_WIDTH,), velocities=False)
-        speed = messages.joints_template((messages.SPEED_NAME,), velocities=False)
-        self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, messages.arm_template())
+        targets = joint_template(ARM_JOINTS)
+        width = joint_template((GRIPPER_WIDTH,))
+        speed = joint_template((messages.SPEED_NAME,))
+        joints = joint_template(ARM_JOINTS, velocities=True)
+        self._joints = _Topic(cell_topic(cell, JOINT_STATES), state, joints)
         self._targets = _Topic(cell_topic(cell, JOINT_TARGETS), state, targets)
         self._pose = _Topic(
-            cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, messages.pose_template()
+            cell_topic(cell, TCP_POSE), schema.POSE_STAMPED, pose_template(BASE_FRAME)
         )
         self._wrench = _Topic(
             cell_topic(cell, TCP_WRENCH), schema.WRENCH_STAMPED, messages.wrench_template()
@@ -208,6 +209,11 @@ class UrSource:
 
     def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Publish until stopped.
+
+        Args:
+            session: Where the messages go.
+            stop: Ends it, also while it waits for the controller to come back.
+            output: Says when the controller is lost and when it is back.
 
         Returns:
             Samples sent, samples that did not reach us, and connections made.

@@ -60,7 +60,12 @@ class Package:
 
 
 def encode_package(kind: int, payload: bytes = b"") -> bytes:
-    """Put the header before a payload."""
+    """Put the header before a payload.
+
+    Args:
+        kind: Code of the kind of package, 0 to 255.
+        payload: What follows the header.
+    """
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
@@ -179,6 +184,10 @@ class RtdeLink:
 
     def ask(self, kind: Kind, payload: bytes = b"") -> bytes:
         """Send a request and return the payload of its answer.
+
+        Args:
+            kind: Of the request, and of its answer.
+            payload: What follows the header of the request.
 
         Raises:
             ControllerError: When the controller goes away or takes too long.

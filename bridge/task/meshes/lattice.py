@@ -90,7 +90,12 @@ def fill(
 def volumes_m3(
     points_m: Float[np.ndarray, "num_points 3"], tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
 ) -> Float[np.ndarray, " num_tetrahedra"]:
-    """Signed volume of each tetrahedron."""
+    """Signed volume of each tetrahedron.
+
+    Args:
+        points_m: Corners, in any frame.
+        tetrahedra: Four indices of points each; negative volume where their order is mirrored.
+    """
     a, b, c, d = (points_m[tetrahedra[:, k]] for k in range(4))
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
 
@@ -98,7 +103,12 @@ def volumes_m3(
 def cage_nodes(
     low_m: Float[np.ndarray, "3"], high_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "8 3"]:
-    """Corners of a box in the order of ``CORNERS``: z runs fastest."""
+    """Corners of a box in the order of ``CORNERS``: z runs fastest.
+
+    Args:
+        low_m: Corner of the box with the smallest coordinates.
+        high_m: Corner with the largest.
+    """
     return np.asarray(low_m + np.array(CORNERS, dtype=np.float64) * (high_m - low_m))
 
 
@@ -107,7 +117,13 @@ def cage_weights(
     low_m: Float[np.ndarray, "3"],
     high_m: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "num_points 8"]:
-    """Trilinear weights of the cage's nodes: ``weights @ nodes`` moves the points with them."""
+    """Trilinear weights of the cage's nodes: ``weights @ nodes`` moves the points with them.
+
+    Args:
+        points_m: In the frame of the box; outside it the weights extrapolate.
+        low_m: Corner of the box with the smallest coordinates.
+        high_m: Corner with the largest; larger along every axis.
+    """
     s = (points_m - low_m) / (high_m - low_m)
     columns = [
         np.prod([s[:, k] if corner[k] else 1.0 - s[:, k] for k in range(3)], axis=0)

@@ -254,6 +254,10 @@ def basket_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[Box
     """Boxes the basket collides with: floor, walls, round corners, handles.
 
     The walls' inner faces are those of the cavity, so that what the predicate calls inside is free.
+
+    Args:
+        inner_m: Extents of the cavity [m].
+        wall_m: Thickness of walls and floor [m].
     """
     x, y = inner_m[0] / 2, inner_m[1] / 2
     top = inner_m[2] + wall_m

@@ -39,13 +39,6 @@ def test_normalised_time_keeps_both_ends() -> None:
     np.testing.assert_allclose(resampled.p_m[[0, -1]], spiral().p_m[[0, -1]], atol=1e-9)
 
 
-def test_the_length_of_a_straight_line_is_its_span() -> None:
-    p = np.array([[0.0, 0, 0], [0.3, 0, 0], [1.0, 0, 0]])
-    q = np.tile([1.0, 0, 0, 0], (3, 1))
-    track = PoseTrajectory(np.array([0, 1, 2]), p, q)
-    assert track.path_length_m() == pytest.approx(1.0)
-
-
 def test_one_pose_answers_every_stamp() -> None:
     track = spiral()
     single = PoseTrajectory(track.stamps_ns[:1], track.p_m[:1], track.q_wxyz[:1])

@@ -13,6 +13,7 @@ from loopback import free_endpoint
 from PIL import Image
 
 import robot_gst
+from bridge.data_files import datasets_folder
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -146,3 +147,30 @@ def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> Non
     topics = Episode.open(joined.run.episodes_dir / "scan.mcap").topics()
     counts = {topic: item.count for topic, item in topics.items() if topic != DROPS}
     assert counts == sent["topics"]
+
+
+def test_ctl_sends_the_task_file_that_a_person_names(
+    joined: Joined, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (datasets_folder() / "tasks" / "cube_into_box.toml").read_text()
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("cube_into_box", "mine"))
+    start = ["ctl", "start", "--id", "t1", "--connect", joined.endpoint, "--task", str(path)]
+    assert robot_gst.run(start) == 0
+    assert robot_gst.run(["ctl", "stop", "--connect", joined.endpoint]) == 0
+    episode = Episode.open(joined.run.episodes_dir / "t1.mcap")
+    assert episode.attachment("task.toml") == path.read_bytes()
+    assert episode.info.task == "mine"
+    path.write_text(text.replace("[objects.cube]", "[objects.cub]"))
+    start[3] = "t2"
+    assert robot_gst.run(start) == 2
+    assert "Did you mean 'cub'?" in capsys.readouterr().err
+    assert [each.name for each in joined.run.episodes_dir.glob("t2*")] == []
+
+
+def test_a_bad_task_file_in_a_request_begins_no_episode(joined: Joined) -> None:
+    client = RecorderClient(joined.client, timeout_s=10.0)
+    with pytest.raises(RemoteError, match="objects is missing"):
+        client.ask("start", {"id": "t1", "task_file": 'schema_version = 1\nname = "x"'})
+    assert client.status()["state"] == "idle"
+    assert list(joined.run.episodes_dir.iterdir()) == []

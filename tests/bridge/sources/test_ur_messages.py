@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.episode.cdr.batch import MessageTemplate, joint_template, pose_template
 from bridge.episode.cdr.messages import FrameTransform, JointSample, PoseSample, transforms_to_cdr
 from bridge.episode.cdr.messages import transforms_from_cdr as read_transforms
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS
 from bridge.sources.ur import messages
-from bridge.sources.ur.messages import MessageTemplate
 from bridge.task.record import check_record
 
 stamps = st.integers(0, 2**31 * 10**9 - 1)
@@ -29,13 +29,13 @@ def test_joint_states_are_those_of_the_record(stamp_ns: int, values: list[float]
         velocity=np.array(values[6:]),
         effort=np.zeros(0),
     )
-    assert messages.arm_template().fill(stamp_ns, values) == expected.to_cdr()
+    assert joint_template(ARM_JOINTS, velocities=True).fill(stamp_ns, values) == expected.to_cdr()
 
 
 @given(stamps, st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6))
 def test_poses_and_frames_are_those_of_the_record(stamp_ns: int, pose: list[float]) -> None:
     turned = messages.tool_pose(pose)
-    found = PoseSample.from_cdr(messages.pose_template().fill(stamp_ns, turned))
+    found = PoseSample.from_cdr(pose_template("base_link").fill(stamp_ns, turned))
     assert (found.stamp_ns, found.frame_id) == (stamp_ns, "base_link")
     q_wxyz, p_m = np.array([turned[6], *turned[3:6]]), np.array(turned[:3])
     np.testing.assert_allclose(found.T_frame_body, se3.transform_from(q_wxyz, p_m), atol=1e-12)

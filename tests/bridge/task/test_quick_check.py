@@ -56,6 +56,9 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         return draw(st.sampled_from(schema["enum"]))
     if "oneOf" in schema:
         return draw(like(draw(st.sampled_from(schema["oneOf"])), root, odd=odd))
+    if "allOf" in schema:  # what an object may be, by its kind: a closed record for each
+        kept = [part["then"] for part in schema["allOf"] if "$ref" in part["then"]]
+        return draw(like(draw(st.sampled_from(kept)), root, odd=odd))
     kinds = schema.get("type", "null")
     kind = draw(st.sampled_from([kinds] if isinstance(kinds, str) else kinds))
     if kind == "object":
@@ -69,8 +72,9 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         pattern = schema.get("pattern")
         return draw(st.sampled_from(["ab", "c_1"]) if pattern else st.text("ab", min_size=1))
     if kind == "number":
-        below_one = st.sampled_from([0.25, 0.5])
-        return draw(below_one if "exclusiveMaximum" in schema else st.integers(1, 9) | below_one)
+        most, below = schema.get("maximum", 9), schema.get("exclusiveMaximum", 10)
+        fitting = [n for n in (0.05, 0.25, 0.5, *range(1, 10)) if n <= most and n < below]
+        return draw(st.sampled_from(fitting))
     return draw({"integer": st.integers(1, 9), "boolean": st.booleans(), "null": st.none()}[kind])
 
 

@@ -1,5 +1,6 @@
 """Parquet says what CSV and JSON say, with types; without a package the report is still written."""
 
+import importlib
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from own_process import printed
 
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import MissingDependencyError
 from bridge.exchange.trials_csv import TrialRecord, read_trials
 from evaluator.compare import compare_run
 from evaluator.report.parquet import (
@@ -118,6 +120,12 @@ def test_without_pyarrow_the_report_is_written_and_says_so(
     assert "not written: pyarrow is not installed" in text
     assert (six_trials.run.results_dir / "trials.csv").is_file()
     assert not list(six_trials.run.results_dir.glob("*.parquet"))
+
+
+def test_without_jinja2_it_is_said_which_extra_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    take_away(monkeypatch, "jinja2", "evaluator.report.page")
+    with pytest.raises(MissingDependencyError, match=r"jinja2.*robot-gst\[report\]"):
+        importlib.import_module("evaluator.report.page")
 
 
 class Missing:

@@ -10,7 +10,7 @@ import pytest
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.rows import Comparison, TrialRow
-from evaluator.report.html import SHOWN_ROWS
+from evaluator.report.page import SHOWN_ROWS
 from evaluator.report.write import write_report
 from evaluator.result import load_results
 

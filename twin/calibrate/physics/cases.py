@@ -18,7 +18,7 @@ from bridge.geometry import se3
 from bridge.geometry.signals import runs_of_true
 from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M
 from bridge.task.plan import Plan
-from bridge.task.task_file import Task, load_task
+from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.robot.model import load_robot
@@ -102,7 +102,13 @@ Series = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]
 
 
 def commands_of(episode: Episode, plan: Plan, start_ns: int) -> Series:
-    """What the gripper was told and when [s, m]: from events, else from the plan."""
+    """What the gripper was told and when [s, m]: from events, else from the plan.
+
+    Args:
+        episode: Whose gripper events are read.
+        plan: Only events of this plan count; its waypoints stand in where there are none.
+        start_ns: Time 0 of the answer, on the recording's clock.
+    """
     times, widths = [0.0], [MAX_WIDTH_M]
     for event in streams.events(episode):
         if event["type"] == "gripper" and event.get("plan_id") == plan.id:
@@ -121,6 +127,10 @@ def commands_of(episode: Episode, plan: Plan, start_ns: int) -> Series:
 def widths_of(episode: Episode, start_ns: int) -> Series:
     """Recorded opening [s, m]; empty where it was not recorded.
 
+    Args:
+        episode: Whose gripper states are read.
+        start_ns: Time 0 of the answer, on the recording's clock.
+
     Raises:
         UnusableCaseError: When a width is not a number.
     """
@@ -136,7 +146,13 @@ def widths_of(episode: Episode, start_ns: int) -> Series:
 def is_holding(
     times_s: Float[np.ndarray, " num_times"], commands: Series, widths: Series
 ) -> Bool[np.ndarray, " num_times"]:
-    """When the fingers stand still on something; never where no width was recorded."""
+    """When the fingers stand still on something; never where no width was recorded.
+
+    Args:
+        times_s: When to say it, from the start of the execution.
+        commands: Widths that the gripper was told; each holds until the next.
+        widths: Widths that were recorded; empty: none were.
+    """
     if not len(widths[0]):
         return np.zeros(len(times_s), dtype=bool)
     told = commands[1][np.searchsorted(commands[0], times_s, side="right") - 1]
@@ -146,7 +162,12 @@ def is_holding(
 
 
 def holds(commands: Series, widths: Series) -> Series:
-    """Widths at which the fingers stood still on something, just before they were opened again."""
+    """Widths at which the fingers stood still on something, just before they were opened again.
+
+    Args:
+        commands: Widths that the gripper was told; each holds until the next.
+        widths: Widths that were recorded; empty: none were.
+    """
     times_s, width_m = widths
     held_at, held = [], []
     for index in np.flatnonzero(np.diff(commands[1]) > HELD_M) + 1:
@@ -186,6 +207,10 @@ def read_cases(run: RunFolder, output: Output) -> tuple[list[Case], dict[str, st
 
     Localisations that are missing are made. An episode that cannot be used does not stop the rest.
 
+    Args:
+        run: Its episodes are read; localisations that are made are kept in it.
+        output: Shows progress, and why an episode is passed over.
+
     Returns:
         The cases, and per episode why it is none.
 
@@ -223,13 +248,17 @@ def _nothing(run: RunFolder, paths: Sequence[Path], reasons: Mapping[str, str]) 
 def read_case(run: RunFolder, episode: Episode) -> Case:
     """Read one episode.
 
+    Args:
+        run: Keeps the localisations; its scene folder says what they were made with.
+        episode: A recorded probe or trial.
+
     Raises:
         UnusableCaseError: Nothing executed, objects not found, soft objects, gaps.
         BackwardTimeError: Its clock went back meanwhile.
     """
     plan, start_ns, end_ns = _executed(episode)
     check_clock(episode, (JOINT_STATES, GRIPPER_STATE), start_ns, end_ns, plan.id)
-    task = load_task(plan.task or episode.info.task)
+    task = streams.task_file(episode, plan.task).task()
     if task.soft_objects:
         message = f"task {task.name} has soft objects, and only rigid ones are calibrated."
         raise UnusableCaseError(message)

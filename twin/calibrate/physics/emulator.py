@@ -76,7 +76,15 @@ def cloud(
     count: int,
     seed: int,
 ) -> Float[np.ndarray, "num_points num_parameters"]:
-    """Draw points around a centre, in pairs opposite to each other."""
+    """Draw points around a centre, in pairs opposite to each other.
+
+    Args:
+        centre: Where the points lie on average, in units of the prior; it is the first of them.
+        width: Standard deviation along each parameter, same units.
+        bounds: Lowest and highest value of each parameter; points beyond are moved onto them.
+        count: Points around the centre; one more when it is odd.
+        seed: Of the draw.
+    """
     rng = np.random.default_rng([707, seed])
     half = rng.standard_normal((-(-count // 2), len(centre)))
     offsets = np.concatenate([np.zeros((1, len(centre))), half, -half])
@@ -97,7 +105,16 @@ def fit_emulator(
     bounds: Float[np.ndarray, "num_parameters 2"],
     observed: Observations,
 ) -> Emulator:
-    """Lay quadratics without mixed terms through predicted numbers."""
+    """Lay quadratics without mixed terms through predicted numbers.
+
+    Args:
+        points: Where cases were simulated, in units of the prior.
+        features: What was predicted there, in the order of ``Features.flat``.
+        centre: Where the quadratics are about.
+        width: Divides what is away from the centre, for each parameter.
+        bounds: Lowest and highest value of each parameter that may be asked for.
+        observed: What was seen in reality; gives the scales of the features.
+    """
     basis = _basis((points - centre) / width)
     rows = [_clear_terms(basis, column) for column in features.T]
     variance = np.array([row[1] for row in rows]) + FLOOR
@@ -149,7 +166,15 @@ def maximise(
     fixed: dict[int, float] | None = None,
     iterations: int = 60,
 ) -> tuple[Float[np.ndarray, " num_parameters"], float]:
-    """The emulator's best point, some parameters held where they are told to be."""
+    """The emulator's best point, some parameters held where they are told to be.
+
+    Args:
+        emulator: Gives the posterior.
+        start: Where the search begins, in units of the prior; moved into what the emulator is
+            trusted with.
+        fixed: Values of parameters that are held, by their position; None: all are free.
+        iterations: At most so many steps of L-BFGS-B.
+    """
     limits = emulator.trusted()
     x = np.clip(start, limits[:, 0], limits[:, 1])
     for index, value in (fixed or {}).items():
@@ -180,7 +205,12 @@ def _cost(
 def spread(
     emulator: Emulator, x: Float[np.ndarray, " num_parameters"]
 ) -> Float[np.ndarray, "num_parameters num_parameters"]:
-    """Posterior covariance from the curvature at the best point (Laplace), at most the prior's."""
+    """Posterior covariance from the curvature at the best point (Laplace), at most the prior's.
+
+    Args:
+        emulator: Gives the posterior.
+        x: The best point, in units of the prior.
+    """
     size = len(x)
     step = np.maximum(0.2 * emulator.width, STEP)
     H = np.zeros((size, size))

@@ -42,7 +42,12 @@ class Split:
 
 
 def split_cases(cases: Sequence[Case], seed: int) -> Split:
-    """Hold out a share of each kind of episode; of a kind with one episode nothing."""
+    """Hold out a share of each kind of episode; of a kind with one episode nothing.
+
+    Args:
+        cases: All that can be used.
+        seed: Of the draw of what is held out.
+    """
     rng = np.random.default_rng([SPLIT_STREAM, seed])
     held: list[int] = []
     for kind in sorted({case.kind for case in cases}):
@@ -129,6 +134,8 @@ class Best:
     x: Float[np.ndarray, " num_parameters"]
     log_posterior: float
     num_evaluations: int
+    out_of_time: bool
+    """The number of points did not end the search, nor did its own precision."""
 
 
 def search(
@@ -147,29 +154,33 @@ def search(
         bounds: Limits of each parameter.
         evaluations: At most so many points; a generation that was begun is finished.
         seed: Of the points that are drawn.
-        has_time: Asked before each generation.
+        has_time: Asked before each generation. A last resort: what is found without time depends
+            on the machine's speed.
         advance: Told how many points were tried.
     """
     start = np.zeros(len(bounds))
-    best = Best(x=start, log_posterior=objective(start[None])[0], num_evaluations=1)
+    best, highest, out_of_time = start, objective(start[None])[0], False
     if len(bounds) < 2:  # the package asks for at least two dimensions
         bounds = np.concatenate([bounds, [[-1.0, 1.0]]])
     size = len(start)
     optimiser = CMA(mean=np.zeros(len(bounds)), sigma=SIGMA, bounds=bounds, seed=seed)
     count = 1
-    while count < evaluations and has_time():
+    while count < evaluations:
+        if not has_time():
+            out_of_time = True
+            break
         points = np.stack([optimiser.ask() for _ in range(optimiser.population_size)])
         values = objective(points[:, :size])
         optimiser.tell([(x, -value) for x, value in zip(points, values, strict=True)])
         count += len(points)
         top = int(np.argmax(values))
-        if values[top] > best.log_posterior:
-            best = Best(x=points[top, :size], log_posterior=values[top], num_evaluations=count)
-        advance(count, f"best log-posterior {best.log_posterior:.1f}")
+        if values[top] > highest:
+            best, highest = points[top, :size], values[top]
+        advance(count, f"best log-posterior {highest:.1f}")
         spread = np.std(points[:, :size], axis=0)
         if optimiser.should_stop() or float(spread.max()) < NARROW:
             break
-    return Best(x=best.x, log_posterior=best.log_posterior, num_evaluations=count)
+    return Best(x=best, log_posterior=highest, num_evaluations=count, out_of_time=out_of_time)
 
 
 IDENTIFIED = 0.5
@@ -196,7 +207,12 @@ class Predictor(Protocol):
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
     ) -> list[list[Prediction]]:
-        """Predict the chosen cases at every point."""
+        """Predict the chosen cases at every point.
+
+        Args:
+            points: Parameters, in units of the prior.
+            chosen: Positions in ``cases``.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,8 +221,9 @@ class PhysicsFitConfig:
 
     evaluations: int = 50
     """Points of the search; the intervals take about 60 more."""
-    budget_s: float = 900.0
-    """Wall time after which the search ends; the intervals are still computed."""
+    budget_s: float = 3600.0
+    """A last resort, told where it strikes: wall time after which the search ends. The intervals
+    are still computed."""
     seed: int = 0
     """Of the search, of the split and of the clouds."""
 
@@ -241,6 +258,8 @@ class Fit:
     num_evaluations: int
     promoted: bool
     why: str
+    cut_short: str
+    """After how many points the time limit struck; empty when it did not."""
 
 
 def fit(
@@ -283,6 +302,12 @@ def fit(
         advance=advance,
     )
     emulator, count = _emulate(predictor, training, split, found.x, bounds, config, advance)
+    cut_short = ""
+    if found.out_of_time:
+        cut_short = (
+            f"the time limit of {config.budget_s:g} s struck after {found.num_evaluations} of "
+            f"{config.evaluations} points"
+        )
     count += found.num_evaluations
     best, _ = maximise(emulator, found.x)
     estimates = _estimates(parameters, emulator, best)
@@ -300,6 +325,7 @@ def fit(
         num_evaluations=count + 2,
         promoted=promoted,
         why=why,
+        cut_short=cut_short,
     )
 
 

@@ -180,7 +180,12 @@ class Score:
 
 
 def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
-    """Put the observations of cases into flat arrays; objects not found again are left out."""
+    """Put the observations of cases into flat arrays; objects not found again are left out.
+
+    Args:
+        cases: What was recorded.
+        num_samples: Noisy starts from which the success of each trial is predicted.
+    """
     seen = [np.isfinite(case.settled).all(axis=1) for case in cases]
     rows = list(zip(cases, seen, strict=True))
     none = np.zeros(0)
@@ -219,7 +224,12 @@ def _way(case: Case) -> Float[np.ndarray, "num_objects 3"]:
 
 
 def features_of(cases: Sequence[Case], predictions: Sequence[Prediction]) -> Features:
-    """Put predictions into the same arrays; turns are the ones nearest to what was seen."""
+    """Put predictions into the same arrays; turns are the ones nearest to what was seen.
+
+    Args:
+        cases: What was recorded; says which poses and turns are compared.
+        predictions: What the twin gives for each of the cases, in their order.
+    """
     settled = [np.zeros((0, 3))]
     for case, prediction in zip(cases, predictions, strict=True):
         ok = np.isfinite(case.settled).all(axis=1)
@@ -242,7 +252,12 @@ def features_of(cases: Sequence[Case], predictions: Sequence[Prediction]) -> Fea
 
 
 def unflatten(row: Float[np.ndarray, " num_features"], like: Observations) -> Features:
-    """The inverse of ``Features.flat``."""
+    """The inverse of ``Features.flat``.
+
+    Args:
+        row: Settled poses, held widths and shares of success, one after another.
+        like: Says how many of each there are.
+    """
     poses, holds = 3 * len(like.settled), len(like.widths_m)
     return Features(
         settled=row[:poses].reshape(-1, 3),

@@ -101,7 +101,12 @@ def rigid_parameters(config: PhysicsConfig) -> tuple[PhysicsParameter, ...]:
 def values_of(
     parameters: Sequence[PhysicsParameter], x: Float[np.ndarray, " num_parameters"]
 ) -> dict[str, float]:
-    """Name the quantities of a point in units of the prior."""
+    """Name the quantities of a point in units of the prior.
+
+    Args:
+        parameters: What each number of the point means.
+        x: The point, 0 at the nominal value and 1 a standard deviation of the prior away.
+    """
     return {item.name: item.value(float(u)) for item, u in zip(parameters, x, strict=True)}
 
 
@@ -125,7 +130,12 @@ def apply_values(values: Mapping[str, float], config: PhysicsConfig) -> PhysicsC
 def shifted(
     T_base_object: Float[np.ndarray, "4 4"], shift: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Move a pose by a ``BIAS``: along x and y [m], turned about its own vertical axis [rad]."""
+    """Move a pose by a ``BIAS``: along x and y [m], turned about its own vertical axis [rad].
+
+    Args:
+        T_base_object: The pose before; it is not changed.
+        shift: Along base x and y [m], and the turn [rad].
+    """
     T = T_base_object.copy()
     T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, shift[2]])) @ T[:3, :3]
     T[:2, 3] += shift[:2]

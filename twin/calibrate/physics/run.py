@@ -12,7 +12,7 @@ from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.geometry.signals import lag_of_least_cost
+from bridge.geometry.signals import lag_between_steps
 from bridge.process_pool import default_size
 from bridge.robots.default import ARM_JOINTS
 from bridge.terminal import Output
@@ -79,14 +79,21 @@ def best_shift_s(
     seen_s: Float[np.ndarray, " num_samples"],
     seen_rad: Float[np.ndarray, "num_samples num_joints"],
 ) -> float | None:
-    """Delay with the least squared distance between two tracks; None when nothing moves."""
+    """Delay with the least squared distance between two tracks; None when nothing moves.
+
+    Args:
+        told_s: When the waypoints were to be reached.
+        told_rad: The joints of the waypoints.
+        seen_s: When joints were recorded, from the same zero.
+        seen_rad: The joints that were recorded.
+    """
     if len(seen_s) < 2 or float(np.ptp(seen_rad, axis=0).max()) < MOVES_RAD:
         return None
 
     asked = seen_s[None, :] - DELAYS_S[:, None]
     told = np.stack([np.interp(asked, told_s, column) for column in told_rad.T], axis=2)
     costs = np.mean((told - seen_rad) ** 2, axis=(1, 2))
-    return lag_of_least_cost(costs, DELAYS_S, between=True)
+    return lag_between_steps(costs, DELAYS_S)
 
 
 def mean_delay(delays_s: list[float]) -> Delay | None:
@@ -119,6 +126,13 @@ def physics_record(
 
     ``identified`` has the fields of ``PhysicsConfig`` that replays take over, empty when nothing
     was promoted.
+
+    Args:
+        found: What the fit gave.
+        cases: What it was fitted to, in the order its split refers to.
+        config: Nominal physics; identified frictions are shares of its ``object_friction``.
+        delay: Between commands and motion; None: it was not measured.
+        skipped: Why episodes were not used, by id.
     """
     by_name = {item.parameter.name: item for item in found.estimates}
     record = {
@@ -141,7 +155,9 @@ def physics_record(
         "skipped": dict(skipped),
         "num_evaluations": found.num_evaluations,
     }
-    # No times in here: the same inputs give the same id.
+    if found.cut_short:
+        record["cut_short"] = found.cut_short
+    # Where no limit struck, no times are in here: the same inputs give the same id.
     return {**record, "id": provenance.hash_settings(record)}
 
 
@@ -210,8 +226,18 @@ def _effective(by_name: Mapping[str, Estimate], config: PhysicsConfig) -> dict[s
 
 
 def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say in a line per parameter what was found."""
+    """Say in a line per parameter what was found.
+
+    Args:
+        record: As ``physics_record`` makes it.
+        calibration_id: Of the calibration that holds now.
+    """
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
+    if "cut_short" in record:
+        lines.append(
+            f"  cut short: {record['cut_short']}; on another machine the numbers may be others. "
+            "Give --budget more."
+        )
     for name, item in record["parameters"].items():
         word = "identified" if item["identified"] else "not identified"
         lines.append(
@@ -247,6 +273,11 @@ def calibrate_physics(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[Mapping[str, Any], str]:
     """Find out about physics from a run's probes and trials, and write ``calibration.json``.
+
+    Args:
+        run: Whose probes and trials are read, and in whose scene folder the calibration goes.
+        config: Evaluations, time budget, samples, workers and seed.
+        output: Shows progress.
 
     Returns:
         The physics record that was made now, and the id of the calibration that holds now.

@@ -215,6 +215,10 @@ class Evaluator:
     ) -> list[list[Prediction]]:
         """Predict the chosen cases, by their numbers, at every point.
 
+        Args:
+            points: Parameters, in units of the prior.
+            chosen: Positions in ``cases``.
+
         Raises:
             LostPieceError: When a case was begun again and its process died again.
         """

@@ -39,7 +39,13 @@ class Solid:
 def solid_of(
     body: str, shape: coal.CollisionGeometry, points_m: Float[np.ndarray, "num_points 3"]
 ) -> Solid:
-    """Put a box and a sphere around a piece."""
+    """Put a box and a sphere around a piece.
+
+    Args:
+        body: The link, object or obstacle that the piece belongs to.
+        shape: Its geometry, in the body's frame.
+        points_m: Points whose hull holds the shape, same frame.
+    """
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(points_m - centre, axis=1).max())
@@ -47,7 +53,12 @@ def solid_of(
 
 
 def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
-    """A box around the origin."""
+    """A box around the origin.
+
+    Args:
+        body: What the box is, as failures name it.
+        size_m: Whole lengths of the edges.
+    """
     corners = box_corners(size_m)
     return solid_of(body, convex_hull(corners), corners)
 
@@ -72,7 +83,12 @@ def placement_of(T: Float[np.ndarray, "4 4"]) -> coal.Transform3s:
 def placed_panels(
     model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
 ) -> list[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]:
-    """The boxes an object is made of: pose of each box's centre, and its extents [m]."""
+    """The boxes an object is made of: pose of each box's centre, and its extents [m].
+
+    Args:
+        model: The object; a container has a panel for each wall.
+        T_base_object: Where it is.
+    """
     placed = []
     for centre, extents in model.panels():
         T_object_panel = np.eye(4)
@@ -169,7 +185,13 @@ class Planes:
         R: Float[np.ndarray, "3 3"],
         t: Float[np.ndarray, "3"],
     ) -> float:
-        """Smallest signed distance of points to the placed piece [m], never too large outside."""
+        """Smallest signed distance of points to the placed piece [m], never too large outside.
+
+        Args:
+            points_m: Points in the base frame.
+            R: Rotation of the piece's link in the base frame.
+            t: Origin of that link in the base frame [m].
+        """
         local = (points_m - t) @ R
         return float((local @ self.normals.T + self.offsets_m).max(axis=1).min())
 
@@ -190,7 +212,14 @@ def distances_to_boxes_m(
     p_box_base: Float[np.ndarray, "num_boxes 3"],
     half_m: Float[np.ndarray, "num_boxes 3"],
 ) -> Float[np.ndarray, " num_boxes"]:
-    """Smallest signed distance of points to each box around the origin of its frame [m]."""
+    """Smallest signed distance of points to each box around the origin of its frame [m].
+
+    Args:
+        points_m: Points in the base frame.
+        R_box_base: Rotations from the base frame into that of each box.
+        p_box_base: Origin of the base in the frame of each box [m].
+        half_m: Half the edge lengths of each box.
+    """
     local = R_box_base @ points_m.T + p_box_base[:, :, None]
     q = np.abs(local) - half_m[:, :, None]
     out = np.maximum(q, 0.0)

@@ -66,6 +66,11 @@ class BoundingSpheres:
         """Signed distance of each placed piece to the grid's surface [m].
 
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
+
+        Args:
+            lookup: The grid of distances to what stands still.
+            R: Rotation of each piece's link in the grid's frame.
+            t: Origin of each piece's link in the grid's frame [m].
         """
         answers = np.empty(len(R))
         nearest(
@@ -86,7 +91,12 @@ class BoundingSpheres:
 def bounding_spheres_of(
     corners_m: Float[np.ndarray, "num_points 3"], fine_m: float = FINE_M
 ) -> BoundingSphereTree:
-    """Cover the convex hull of points so that nothing is farther from a fine one than asked."""
+    """Cover the convex hull of points so that nothing is farther from a fine one than asked.
+
+    Args:
+        corners_m: Corners of the piece, in the frame the spheres are wanted in.
+        fine_m: No part of the hull's surface lies farther than this from one of the finest points.
+    """
     hull = ConvexHull(corners_m)
     # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
     levels = [_divided(corners_m[hull.simplices], fine_m * np.sqrt(3.0))]
@@ -166,7 +176,12 @@ def _divided(
 
 @lru_cache(maxsize=4)
 def robot_bounding_spheres(hulls: RobotHulls, left_out: frozenset[str]) -> BoundingSpheres:
-    """Cover the hulls of a robot but those of some links; made once."""
+    """Cover the hulls of a robot but those of some links; made once.
+
+    Args:
+        hulls: The robot's convex pieces.
+        left_out: Links without spheres.
+    """
     return BoundingSpheres(
         [
             bounding_spheres_of(hull.points_m, FINE_M if hull.link in GRIPPER_LINKS else ARM_FINE_M)

@@ -54,6 +54,10 @@ def half_way(a: State, b: State) -> State:
     """The state in the middle, straight in joints, positions and nodes.
 
     Objects that leapt, or are known at one of the two only, are left out.
+
+    Args:
+        a: The earlier state.
+        b: The later state.
     """
     poses = {}
     for name in a.Ts_base_object.keys() & b.Ts_base_object.keys():
@@ -103,13 +107,26 @@ class Reach:
             self._fingers[row] = 0.5 if hull.link in FINGER_LINKS else 0.0
 
     def travel_m(self, a: State, b: State) -> Float[np.ndarray, " num_links"]:
-        """How far any point of each link moved at most [m], when the joints moved straight."""
+        """How far any point of each link moved at most [m], when the joints moved straight.
+
+        Args:
+            a: The state before.
+            b: The state after; only its joints and gripper width are looked at.
+        """
         turned = np.abs(b.joints_rad - a.joints_rad)
         return np.asarray(self._per_rad @ turned + self._fingers * abs(b.width_m - a.width_m))
 
 
 def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
-    """How far any point of an object moved at most [m]; infinite when it is in one state only."""
+    """How far any point of an object moved at most [m]; infinite when it is in one state only.
+
+    Args:
+        a: The state before.
+        b: The state after.
+        name: The object.
+        radius_m: How far its outermost point is from its origin; not used where its nodes are
+            known.
+    """
     if name in a.nodes_m and name in b.nodes_m:
         return float(np.linalg.norm(b.nodes_m[name] - a.nodes_m[name], axis=1).max())
     if name not in a.Ts_base_object or name not in b.Ts_base_object:
@@ -293,6 +310,11 @@ class ClearanceMonitor:
         """Look for links inside objects that still lie where they were localised.
 
         Physics would push the object aside and hide that a finger comes down on it.
+
+        Args:
+            t_ns: When, from the start of the trajectory; failures carry it.
+            joints_rad: Of the arm, from base to hand.
+            width_m: Distance between the finger pads.
         """
         self.hulls.place(joints_rad, width_m)
         R, t = self.hulls.rotations, self.hulls.translations
@@ -388,7 +410,12 @@ class ClearanceMonitor:
 
 
 def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
-    """The last stage that has begun; before the first one begins, the first."""
+    """The last stage that has begun; before the first one begins, the first.
+
+    Args:
+        stages: Of a plan, in the order in which they begin.
+        t_ns: Time from the start of the trajectory.
+    """
     begun = [stage for stage in stages if stage.t_start_ns <= t_ns]
     if begun:
         return begun[-1]
@@ -400,6 +427,10 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 
     Where a stage released an object, it may go on lying on what that stage allowed it to touch; the
     gripper's own leave ends with the stage.
+
+    Args:
+        stages: Of a plan, in the order in which they begin.
+        t_ns: Time from the start of the trajectory.
     """
     active = active_stage(stages, t_ns)
     if active is None:

@@ -199,7 +199,12 @@ def static_obstacles(
     panels: Sequence[ContainerPanel],
     table_height_m: float,
 ) -> list[StaticObstacle]:
-    """The table and the panels, each in its own frame."""
+    """The table and the panels, each in its own frame.
+
+    Args:
+        panels: Walls and floors of the containers that stand still.
+        table_height_m: Of the table's top, over the robot's base.
+    """
     T_base_table = np.eye(4)
     T_base_table[2, 3] = table_height_m
     found = [StaticObstacle(body=TABLE, piece=0, solid=half_space_solid(TABLE), T=T_base_table)]

@@ -202,7 +202,14 @@ class Surroundings:
         nodes_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
         moved_m: Mapping[str, Float[np.ndarray, "num_nodes 3"]],
     ) -> dict[Pair, float]:
-        """Measure soft bodies: the near links against all, what stands still against moved ones."""
+        """Measure soft bodies: the near links against all, what stands still against moved ones.
+
+        Args:
+            links: The robot's pieces in the order of its hulls, which are placed already.
+            nodes_m: Nodes of each soft body, base frame.
+            moved_m: Those of bodies that have left where they had come to rest; only they are
+                measured against what stands still.
+        """
         found: dict[Pair, float] = {}
         for name, nodes in nodes_m.items():
             centre = (nodes.min(axis=0) + nodes.max(axis=0)) / 2
@@ -257,6 +264,11 @@ def posture_clearance(
 
     The arm against itself and against what stands still, with ``eps_col_m`` taken off. The gripper
     is where the path says, whatever the arm does, so it is left out; so are objects.
+
+    Args:
+        scene: Table, containers and distances to the rest.
+        hulls: The robot's convex pieces; the function moves them.
+        config: Its ``eps_col_m`` is taken off.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links = own_links(hulls)

@@ -63,7 +63,13 @@ class Confidence:
 def depth_errors(
     views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose
 ) -> DepthErrors:
-    """Compare every third pixel of each view with the depth at which it should see the robot."""
+    """Compare every third pixel of each view with the depth at which it should see the robot.
+
+    Args:
+        views: Depth images and where their cameras are in the source frame.
+        surfaces: The robot as it stood at each of them.
+        pose: Where the source frame lies in the robot's base, and the depth scale.
+    """
     errors = [np.zeros(0)]
     for view, surface in zip(views, surfaces, strict=True):
         rays = view.camera.rays()[::STRIDE_PX, ::STRIDE_PX]
@@ -137,6 +143,11 @@ def search(
 
     The base frame's z = 0 is taken to lie in the plane; refinement corrects that by some
     centimetres.
+
+    Args:
+        views: Depth images with the robot at rest; at most ``MAX_VIEWS`` of them are used.
+        robot: Who is looked for.
+        planes: What the robot may stand on.
     """
     used = list(views[:: max(1, -(-len(views) // MAX_VIEWS))])
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(used)]
@@ -159,7 +170,13 @@ def _on_plane(
 def search_near(
     views: Sequence[RobotView], robot: RobotModel, T_base_source: Float[np.ndarray, "4 4"]
 ) -> Hypothesis:
-    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right."""
+    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right.
+
+    Args:
+        views: Depth images with the robot at rest.
+        robot: Who is looked for.
+        T_base_source: The pose to search around.
+    """
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)]
     nowhere = np.zeros(2)
     plane = LevelPlane(T_level_source=T_base_source, low_m=nowhere, high_m=nowhere, share=0.0)

@@ -29,7 +29,13 @@ class RobotView:
     def from_frame(
         frame: RgbdFrame, posture: Posture, T_source_camera: Float[np.ndarray, "4 4"]
     ) -> "RobotView":
-        """Take the depth image of a frame."""
+        """Take the depth image of a frame.
+
+        Args:
+            frame: Colour is not used.
+            posture: How the robot stood then.
+            T_source_camera: Pose of the depth camera in the frame that is to be aligned.
+        """
         return RobotView(
             camera=frame.depth_camera,
             depth_m=np.where(np.isfinite(frame.depth_m), frame.depth_m, 0.0),
@@ -90,7 +96,12 @@ def _interior(trusted: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "he
 
 
 def thin(views: Sequence[RobotView], count: int) -> list[ViewCloud]:
-    """Every n-th point of each view, about ``count`` of all views together."""
+    """Every n-th point of each view, about ``count`` of all views together.
+
+    Args:
+        views: Whose points are thinned, all by the same step.
+        count: Of all points together.
+    """
     total = sum(len(view.cloud.p_m) for view in views)
     step = max(1, total // max(count, 1))
     return [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
@@ -126,6 +137,10 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
 
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
     edge, which points up, and what is left over is told by where the robot fits.
+
+    Args:
+        views: Depth images and where their cameras are in the source frame.
+        seed: Of the random draws.
     """
     clouds = thin(views, NUM_POINTS)
     p = np.concatenate(

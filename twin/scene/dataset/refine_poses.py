@@ -105,7 +105,14 @@ def with_corrections(
     views: Sequence[TrainingView],
     corrections: Sequence[np.ndarray],
 ) -> list[FrameChoice]:
-    """Write the corrections of views into the choices they come from, for later readers."""
+    """Write the corrections of views into the choices they come from, for later readers.
+
+    Args:
+        choices: Whose frames were read.
+        choice_of_view: Position in ``choices`` of each view.
+        views: The frames that were corrected.
+        corrections: ``T_new_old`` of each view, in the root frame.
+    """
     found: list[dict[int, np.ndarray]] = [{} for _ in choices]
     for owner, view, T in zip(choice_of_view, views, corrections, strict=True):
         found[owner][view.stamp_ns] = T
@@ -158,7 +165,12 @@ def refine_view_pose(
 def without_drift(
     corrections: Sequence[Float[np.ndarray, "4 4"]], views: Sequence[TrainingView]
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """Take out the motion that all cameras share: the best rigid fit of new onto old poses."""
+    """Take out the motion that all cameras share: the best rigid fit of new onto old poses.
+
+    Args:
+        corrections: ``T_new_old`` of each view, in the root frame.
+        views: With their old poses.
+    """
     old = np.stack([_frame_points(view.T_base_color) for view in views]).reshape(-1, 3)
     new = np.stack(
         [_frame_points(T @ v.T_base_color) for T, v in zip(corrections, views, strict=True)]

@@ -143,7 +143,12 @@ def score_of(met: Sequence[Meeting]) -> Score:
 
 
 def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
-    """Report on poses as they were recorded; no agreement where views hardly overlap."""
+    """Report on poses as they were recorded; no agreement where views hardly overlap.
+
+    Args:
+        num_pairs: How many pairs of frames were compared.
+        recorded: How well depth fits with the poses as they are.
+    """
     return PoseReport(
         num_pairs=num_pairs,
         agreement=recorded.agreement if recorded.overlap >= MIN_OVERLAP else None,
@@ -154,7 +159,12 @@ def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
 def best_of(
     conventions: Iterable[Convention], score: Callable[[Convention], Score]
 ) -> tuple[Convention, float]:
-    """The convention under which most depth agrees, and how much; 0 without solid overlap."""
+    """The convention under which most depth agrees, and how much; 0 without solid overlap.
+
+    Args:
+        conventions: The readings that are tried.
+        score: Says how well depth fits under one of them.
+    """
     scored = []
     for convention in conventions:
         agreement, overlap = score(convention)
@@ -163,7 +173,12 @@ def best_of(
 
 
 def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
-    """Whether poses fit with this agreement, and clearly better than as they were recorded."""
+    """Whether poses fit with this agreement, and clearly better than as they were recorded.
+
+    Args:
+        agreement: Under another reading of the poses, 0..1.
+        recorded: What the poses as they were recorded give.
+    """
     return agreement >= GOOD and agreement >= (recorded.agreement or 0.0) + CLEARLY_BETTER
 
 
@@ -377,6 +392,10 @@ class ScanReport:
 
 def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:
     """Look for what makes a scan useless, or worth less than it seems.
+
+    Args:
+        cameras: What the training frames of each showed.
+        config: Depth limits, and whether wrong poses are refused.
 
     Raises:
         NoDepthError: When no camera has depth images that can be used.

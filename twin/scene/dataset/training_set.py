@@ -70,6 +70,11 @@ def read_training_set(
 ) -> TrainingSet:
     """Read every training frame, check the scan, and set aside what moved.
 
+    Args:
+        choices: Which frames of which cameras to read.
+        config: Depth limits and what is checked or refined.
+        output: Told what is remarkable about the scan.
+
     Raises:
         NoFramesError: When no frame has colour, depth and a pose together.
         NoDepthError: When no depth image holds anything usable.
@@ -159,7 +164,12 @@ def _set_ego_pixels_aside(
 def with_fitted_poses(
     training: TrainingSet, Ts_base_color: Float[np.ndarray, "num_views 4 4"]
 ) -> TrainingSet:
-    """Carry the poses the fit ended with into views and choices, for all that comes after."""
+    """Carry the poses the fit ended with into views and choices, for all that comes after.
+
+    Args:
+        training: With the poses the fit began with.
+        Ts_base_color: Poses of the colour cameras after the fit, in the order of the views.
+    """
     found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in training.choices]
     views = list(training.views)
     for index, (owner, T) in enumerate(zip(training.choice_of_view, Ts_base_color, strict=True)):

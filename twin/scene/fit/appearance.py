@@ -120,6 +120,12 @@ def solve_gains(
     Least squares over static pixels that are not saturated. The mean is the gauge: all images
     twice as bright and all colours half as bright would look the same. Images that there is no
     time for keep the gains they have.
+
+    Args:
+        cloud: The scene as it is fitted so far.
+        observations: Images with the gains they have now.
+        rasteriser: Draws the cloud.
+        allowance: Time until which images are looked at.
     """
     gains = np.array([item.gain for item in observations], dtype=np.float64)
     for index, item in enumerate(observations):
@@ -133,7 +139,12 @@ def solve_gains(
 def gain_between(
     drawn: Float32[np.ndarray, "3 height width"], target: Target
 ) -> Float[np.ndarray, "3"]:
-    """The factor per channel that brings a drawn image closest to the recorded one."""
+    """The factor per channel that brings a drawn image closest to the recorded one.
+
+    Args:
+        drawn: Colour planes, 0..1.
+        target: What was recorded, and which pixels of it count.
+    """
     wanted = target.image()
     usable = target.static_mask & (wanted < SATURATED).all(axis=0)
     recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)
@@ -153,6 +164,12 @@ def conjugate_gradients(
 
     Hestenes and Stiefel 1952 with a diagonal preconditioner. Ends early when ``apply`` gives None.
     Returns x and the steps taken.
+
+    Args:
+        apply: The symmetric matrix times a vector; None when there is no time for it.
+        right: The right-hand side.
+        diagonal: Of the matrix, above zero.
+        steps: At most so many.
     """
     x = np.zeros_like(right)
     residual = right.copy()

@@ -26,7 +26,12 @@ ALIGN_DECAY = 0.03
 def corrected_pose(
     T_base_camera: Float[np.ndarray, "4 4"], correction: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Turn [rad] and shift [m] the scene before a camera, both along the camera's axes."""
+    """Turn [rad] and shift [m] the scene before a camera, both along the camera's axes.
+
+    Args:
+        T_base_camera: The pose before.
+        correction: Rotation vector [rad], then shift [m].
+    """
     C = np.eye(4)
     C[:3, :3] = se3.rotation_from_vector(correction[:3])
     C[:3, 3] = correction[3:]
@@ -39,6 +44,10 @@ def correction_gradient(
     """Gradient on a turn and a shift at zero, from that on the matrix ``T_camera_base``.
 
     dT = [w]x T + v e4^T, so each column t with gradient g adds t x g to that of the turn w.
+
+    Args:
+        d_T_camera_base: Gradient of the loss on each number of the matrix.
+        T_base_camera: The pose it was drawn from.
     """
     T_camera_base = se3.invert(T_base_camera)[:3]
     turn = np.cross(T_camera_base.T, d_T_camera_base.T).sum(axis=0)
@@ -71,13 +80,24 @@ class CameraCorrections:
         )
 
     def pose(self, index: int, T_base_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Where a view is now thought to be."""
+        """Where a view is now thought to be.
+
+        Args:
+            index: Of the view.
+            T_base_camera: Where it was thought to be at first.
+        """
         if not self.values[index].any():
             return T_base_camera
         return corrected_pose(T_base_camera, self.values[index])
 
     def update(self, index: int, gradient: Float[np.ndarray, "6"], decay: float) -> None:
-        """Follow the gradient of one view's loss; the first view never moves."""
+        """Follow the gradient of one view's loss; the first view never moves.
+
+        Args:
+            index: Of the view.
+            gradient: On its turn [1/rad] and shift [1/m] at zero.
+            decay: Factor on Adam's step.
+        """
         if index == 0:
             return
         sizes = np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)
@@ -118,6 +138,13 @@ def align_view(
 
     Numbers made after this are not strictly held out: they tell how good the scene is where pose
     and exposure are known, and must be named as aligned.
+
+    Args:
+        cloud: The fitted scene.
+        half: The recorded image at half size, for the first steps.
+        full: The same at full size.
+        T_base_camera: Where the camera was recorded.
+        rasteriser: Draws the cloud and its gradients.
     """
     value, first, second = np.zeros((3, 6))
     total = ALIGN_COARSE_STEPS + ALIGN_FINE_STEPS

@@ -68,6 +68,12 @@ def score(
     """Draw the views, evenly chosen where there are many, and lift their errors.
 
     Views that there is no time for are left out.
+
+    Args:
+        cloud: The scene as it is fitted so far.
+        observations: Recorded images with poses and gains.
+        rasteriser: Draws the cloud.
+        allowance: Time until which views are drawn.
     """
     step = -(-len(observations) // MAX_SCORED_VIEWS)
     error, pixels, size_px, fraction = (np.zeros(len(cloud), np.float32) for _ in range(4))

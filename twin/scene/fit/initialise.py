@@ -27,6 +27,10 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
     ones do not waste Gaussians. A coarse voxel gives way where finer ones cover it. All voxels
     grow together until the budget, less what is left to the fit, holds.
 
+    Args:
+        points: What each frame measured, all in one frame.
+        config: Voxel size, budget and the shape of new Gaussians.
+
     Raises:
         NoSurfaceError: When no voxel has two points.
     """

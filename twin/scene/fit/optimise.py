@@ -121,7 +121,12 @@ class Checkpoint:
 
 
 def first_state(session: FitSession, num_views: int) -> FitState:
-    """Before the first image."""
+    """Before the first image.
+
+    Args:
+        session: Holds the cloud that is to be fitted.
+        num_views: Training images, each with a gain and a camera correction.
+    """
     return FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
@@ -132,7 +137,12 @@ def first_state(session: FitSession, num_views: int) -> FitState:
 
 
 def save_state(checkpoint: Checkpoint, state: FitState) -> None:
-    """Write the state whole; plain arrays, nothing that runs when read."""
+    """Write the state whole; plain arrays, nothing that runs when read.
+
+    Args:
+        checkpoint: Where to, and the name of the inputs and settings.
+        state: After whole steps.
+    """
     content: dict[str, np.ndarray] = {
         "key": np.array(checkpoint.key),
         "version": np.array(STATE_VERSION),
@@ -160,6 +170,10 @@ def load_state(
     """Read the state of an interrupted fit of the same inputs and settings; None if there is none.
 
     A damaged file, or one of another version, is none.
+
+    Args:
+        checkpoint: Where from, and the name of the inputs and settings.
+        make_session: Begins a session with the cloud that was kept.
     """
     try:
         whole = io.BytesIO(checkpoint.path.read_bytes())
@@ -264,7 +278,12 @@ class Events:
         return sorted(events, key=lambda event: event.at)
 
     def keep(self, state: FitState, at: Progress) -> None:
-        """Do what is due; what is already behind is not done again."""
+        """Do what is due; what is already behind is not done again.
+
+        Args:
+            state: The fit so far; what is done changes it.
+            at: How far along the fit is.
+        """
         coarse = at.fraction < self._config.coarse_fraction
         while (
             state.events_done < len(self._schedule)
@@ -315,7 +334,13 @@ class Events:
 
 
 def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
-    """The order in which one pass shows the views; the same whenever it is asked for."""
+    """The order in which one pass shows the views; the same whenever it is asked for.
+
+    Args:
+        seed: Of the fit.
+        epoch: Number of the pass, from 0.
+        num_views: Training images.
+    """
     return np.random.default_rng([seed, epoch]).permutation(num_views)
 
 

@@ -95,6 +95,10 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
 def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
     """The safetensors of a folder, all of them present.
 
+    Args:
+        folder: With the weights of one model.
+        kind: What they should be; named in messages.
+
     Raises:
         WeightsError: When there are none, or some of a set of parts are missing.
     """
@@ -124,7 +128,12 @@ def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
 
 
 def weights_hash(folder: Path, kind: WeightsKind) -> str:
-    """SHA-256 over configuration and weights, for the record of what was used."""
+    """SHA-256 over configuration and weights, for the record of what was used.
+
+    Args:
+        folder: With the weights of one model.
+        kind: What they should be; named in messages.
+    """
     return provenance.hash_files([folder / "config.json", *weight_files(folder, kind)])
 
 
@@ -190,6 +199,11 @@ def read_normalisation(
     folder: Path, kind: WeightsKind, default: tuple[tuple[float, ...], tuple[float, ...]]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Mean and standard deviation of colours 0..1, from ``preprocessor_config.json`` if present.
+
+    Args:
+        folder: With the weights of one model.
+        kind: What they should be; named in messages.
+        default: Mean and standard deviation per channel where the folder states none.
 
     Raises:
         WeightsError: When the file holds something else than three numbers each.

@@ -30,6 +30,12 @@ def sample_surface(
 ) -> tuple[Float[np.ndarray, "num_samples 3"], Float[np.ndarray, "num_samples 3"]]:
     """Points spread evenly over triangles, and the unit normals there.
 
+    Args:
+        vertices: In any unit.
+        faces: Vertex indices of each triangle.
+        num_samples: How many points.
+        seed: Of the draw.
+
     Raises:
         MetricFitError: When the triangles have no area.
     """
@@ -54,6 +60,12 @@ def visible_mask(
     """Which samples of a surface some camera sees: the nearest in their direction, within a cell.
 
     Directions are sorted into cells as wide as ``cell_m`` at the object's distance.
+
+    Args:
+        points_m: Points on the surface, in the frame of the cameras.
+        normals: Unit length, outwards.
+        camera_centres_m: Where the cameras are.
+        cell_m: Width of the cells that the directions are sorted into.
     """
     seen = np.zeros(len(points_m), dtype=bool)
     for centre in camera_centres_m:
@@ -81,7 +93,12 @@ def visible_mask(
 def surface_area(
     vertices: Float[np.ndarray, "num_vertices 3"], faces: Int[np.ndarray, "num_faces 3"]
 ) -> float:
-    """Of all triangles, in squared units of the vertices."""
+    """Of all triangles, in squared units of the vertices.
+
+    Args:
+        vertices: In any unit.
+        faces: Vertex indices of each triangle.
+    """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 

@@ -72,6 +72,11 @@ class Sam3Segmenter:
     ) -> "Sam3Segmenter":
         """Load weights from a local folder.
 
+        Args:
+            folder: With configuration, weights and tokenizer.
+            placement: Device and precision; None: the first GPU, else the CPU, in float32.
+            config: Thresholds; None: the defaults.
+
         Raises:
             WeightsError: When the folder is missing, incomplete or of another kind.
             MissingDependencyError: When the extra ``foundation`` is not installed.
@@ -177,6 +182,10 @@ class DinoFeatures:
     def load(folder: Path, placement: Placement | None = None) -> "DinoFeatures":
         """Load weights from a local folder.
 
+        Args:
+            folder: With configuration and weights.
+            placement: Device and precision; None: the first GPU, else the CPU, in float32.
+
         Raises:
             WeightsError: When the folder is missing, incomplete or of another kind.
             MissingDependencyError: When the extra ``foundation`` is not installed.
@@ -273,6 +282,10 @@ class ClipEmbedder:
     def load(folder: Path, placement: Placement | None = None) -> "ClipEmbedder":
         """Load weights from a local folder.
 
+        Args:
+            folder: With configuration, weights and tokenizer.
+            placement: Device and precision; None: the first GPU, else the CPU, in float32.
+
         Raises:
             WeightsError: When the folder is missing, incomplete or of another kind.
             MissingDependencyError: When the extra ``foundation`` is not installed.
@@ -337,6 +350,11 @@ def masked_crop(
 ) -> UInt8[np.ndarray, "side side 3"]:
     """The square around a mask with a margin; all but the mask has the ground's colour.
 
+    Args:
+        image_u8: sRGB.
+        mask: True on the thing that is cut out.
+        ground_u8: sRGB of everything around it.
+
     Raises:
         UsageError: When the sizes differ or the mask is empty.
     """
@@ -371,6 +389,11 @@ FEATURES = ("dinov3",)
 
 def split_spec(spec: str, option: str, known: tuple[str, ...]) -> tuple[str, Path]:
     """Split ``name:folder``.
+
+    Args:
+        spec: As the user wrote it; ``~`` is expanded in the folder.
+        option: The command-line option it came with, for the message.
+        known: Names that may stand before the colon.
 
     Raises:
         UsageError: When the name is none of those known, or the folder is missing.

@@ -76,7 +76,12 @@ class GeneratorInput:
 def pointmap(
     depth_m: Float32[np.ndarray, "height width"], camera: Camera
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Measured points in PyTorch3D's camera axes (x left, y up, z forward), NaN for none [m]."""
+    """Measured points in PyTorch3D's camera axes (x left, y up, z forward), NaN for none [m].
+
+    Args:
+        depth_m: Along the optical axis; 0 is "not measured".
+        camera: The depth camera; its frame has x right, y down, z forward.
+    """
     points = camera.unproject(np.where(depth_m > 0, depth_m, np.nan).astype(np.float64))
     return np.asarray(points * np.array([-1.0, -1.0, 1.0]), dtype=np.float32)
 
@@ -299,7 +304,16 @@ def lay_down(
     *,
     source: str,
 ) -> GeneratedObject:
-    """Read a generator's files and register them with points measured in the root frame."""
+    """Read a generator's files and register them with points measured in the root frame.
+
+    Args:
+        out: Folder with the generator's ``pose.json``, ``mesh.glb`` and ``splat.ply``.
+        points_m: Measured points of the object, root frame.
+        T_base_camera: Where the camera of the generator's image was.
+        support_z_m: Height of what the object stands on; None: unknown.
+        config: How the shape is laid onto the points.
+        source: Which program made it, for the record.
+    """
     pose = read_pose(out / "pose.json")
     mesh = read_glb(out / "mesh.glb")
     vertices = mesh.vertices @ Z_UP_FROM_Y_UP.T
@@ -328,7 +342,13 @@ def lay_down(
 def scaled_cloud(
     cloud: GaussianCloud, scale: float, T_new_old: Float[np.ndarray, "4 4"]
 ) -> GaussianCloud:
-    """The same Gaussians after growing by a factor and then moving rigidly."""
+    """The same Gaussians after growing by a factor and then moving rigidly.
+
+    Args:
+        cloud: The Gaussians before.
+        scale: Factor on positions and sizes, about the origin of the old frame.
+        T_new_old: The motion that follows.
+    """
     grown = replace(
         cloud,
         means_m=as_float32(cloud.means_m * scale),

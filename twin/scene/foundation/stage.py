@@ -62,6 +62,10 @@ class ModelFindings:
 def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     """Check all that the models need, before anything slow begins.
 
+    Args:
+        config: Which models were named, and on which device they run.
+        task: Its objects give the words to look for where no prompt does; None: there is no task.
+
     Returns:
         SHA-256 of each model's weights, by its option.
 
@@ -93,6 +97,10 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
 
 def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
     """What to look for: the prompts given, else the names of the task's objects.
+
+    Args:
+        config: May hold prompts.
+        task: Names objects; None: there is no task.
 
     Raises:
         UsageError: When there is neither.
@@ -224,6 +232,14 @@ def thing_vectors(
     advance: Advance = lambda done, note: None,
 ) -> tuple[Float32[np.ndarray, "num_instances num_channels"], list[int]]:
     """One unit vector for each instance, the mean over the frames that show most of it.
+
+    Args:
+        embedder: Turns cut-out images into vectors.
+        scene: The instances and which Gaussians are theirs.
+        cloud: The Gaussians that the labels of the scene refer to.
+        frames: Images in which instances are looked for.
+        rasteriser: Draws the labels into each frame.
+        advance: Told the number of instances done and the label of the last.
 
     Returns:
         Vectors in the order of the instances, zero where no frame shows one; how many frames each

@@ -33,7 +33,14 @@ def same_pose(
     distance_m: float,
     angle_rad: float,
 ) -> bool:
-    """Say whether two poses lie nearer to each other than both limits."""
+    """Say whether two poses lie nearer to each other than both limits.
+
+    Args:
+        T_base_a: One pose.
+        T_base_b: The other, in the same frame.
+        distance_m: Limit of what lies between their origins.
+        angle_rad: Limit of the angle between them.
+    """
     near = np.linalg.norm(T_base_a[:3, 3] - T_base_b[:3, 3]) < distance_m
     return bool(near and se3.rotation_angle_rad(T_base_a[:3, :3].T @ T_base_b[:3, :3]) < angle_rad)
 
@@ -67,7 +74,13 @@ def unknown_mask(
 def least_gap_s(
     tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> float | None:
-    """Least time between an instant and a published pose [s]; None without either."""
+    """Least time between an instant and a published pose [s]; None without either.
+
+    Args:
+        tree: The transforms that were published.
+        frame: Whose poses count.
+        stamps_ns: The instants, in any order.
+    """
     posed_ns = tree.stamps_ns(frame)
     if len(posed_ns) == 0 or len(stamps_ns) == 0:
         return None
@@ -253,6 +266,11 @@ def find_poses(
 def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> None:
     """See that colour and depth are posed in one frame.
 
+    Args:
+        tree: The transforms of the episode.
+        episode: Says in which frames its images are.
+        camera_id: The camera, by its name in the topics.
+
     Raises:
         FrameNotFoundError: When the tree does not know the colour frame.
         UnusableCameraError: When nothing says how the depth frame lies to it.
@@ -276,6 +294,12 @@ def calibrated_poses(
 ) -> CameraPoses:
     """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
 
+    Args:
+        episode: Gives joints for a camera in the hand, and how colour and depth lie to each other.
+        camera_id: The camera, by its name in the topics.
+        mount: Link, pose on it and depth scale.
+        stamps_ns: Of the images.
+
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
@@ -295,6 +319,12 @@ def calibrated_tree_at(
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
     """Pose a calibrated camera at its images and at some more instants, where joints are known.
+
+    Args:
+        episode: Gives joints for a camera in the hand, and the stamps of the images.
+        camera_id: The camera, by its name in the topics.
+        mount: Link and pose on it.
+        stamps_ns: The additional instants.
 
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
@@ -335,7 +365,13 @@ def _say_unposed(
 
 
 def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool:
-    """Say whether ``/tf`` holds more of a camera than how its own parts lie to each other."""
+    """Say whether ``/tf`` holds more of a camera than how its own parts lie to each other.
+
+    Args:
+        tree: The transforms of the episode.
+        episode: Says in which frames its images are.
+        camera_id: The camera, by its name in the topics.
+    """
     frame = streams.camera_info(episode, camera_id).frame_id
     if frame not in tree.frames():
         return False

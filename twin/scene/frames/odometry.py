@@ -104,7 +104,13 @@ class Aligner:
         return Look(small=small, image=image)
 
     def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
-        """Lay one frame onto another, from a guess; None when they then disagree."""
+        """Lay one frame onto another, from a guess; None when they then disagree.
+
+        Args:
+            source: The frame that is laid onto the other.
+            target: The frame it is laid onto.
+            T_guess: Pose of the source's camera in the target's, to start from.
+        """
         success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,

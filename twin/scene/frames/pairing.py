@@ -27,6 +27,10 @@ def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_
 
     Colour without depth nearby is not among them, and of two colour images beside one depth image
     only that which gets it.
+
+    Args:
+        episode: Whose images are paired; none is decoded.
+        camera_id: The camera, by its name in the topics.
     """
     found = {color[0] for color, _ in _pairs(episode, camera_id, keep=False)}
     return np.array(sorted(found), dtype=np.int64)
@@ -102,6 +106,10 @@ def name_of(episode: Episode, camera_id: str) -> str:
 
 def check_camera(episode: Episode, camera_id: str) -> None:
     """Look at the first intrinsics and the first image of colour and depth.
+
+    Args:
+        episode: Whose messages are looked at.
+        camera_id: The camera, by its name in the topics.
 
     Raises:
         UnusableCameraError: The lens distorts, intrinsics are missing or of another image size, or

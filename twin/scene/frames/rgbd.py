@@ -56,6 +56,10 @@ def trusted_depth_mask(
     """Mark measurements that exist, are near enough, and do not fly between two surfaces.
 
     0 is "no measurement" and never passes, and neither do its neighbours.
+
+    Args:
+        depth_m: Along the optical axis; 0 is "not measured".
+        limits: How far is too far, and what counts as flying.
     """
     trusted = (depth_m > NEAR_M) & (depth_m < limits.max_depth_m)
     for before, after in (
@@ -77,6 +81,10 @@ def without_seams(
     Depth warped into a larger colour image has empty rows and columns; without this no pixel of
     it would have neighbours to take a normal from. Closed gaps serve as neighbours only, they
     never become points. Depth with ordinary holes is returned as it is.
+
+    Args:
+        depth_m: Along the optical axis; 0 is "not measured".
+        flying_fraction: Measurements that differ by less than this share of the nearer one agree.
     """
     known = depth_m > 0
     whole = known[1:-1, 1:-1] & known[:-2, 1:-1] & known[2:, 1:-1]

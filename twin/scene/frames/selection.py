@@ -107,7 +107,14 @@ def path_length_m(
 def smear_px(
     tree: TransformTree, frame_id: str, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
 ) -> Float[np.ndarray, " num_frames"]:
-    """How far the image of something at a typical distance moves during one exposure [px]."""
+    """How far the image of something at a typical distance moves during one exposure [px].
+
+    Args:
+        tree: Knows the camera's poses around the instants.
+        frame_id: Of the camera.
+        stamps_ns: Of its images.
+        focal_px: Its focal length.
+    """
     with np.errstate(invalid="ignore"):  # a pose beside one that is not finite: motion unknown
         before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
         after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
@@ -123,6 +130,11 @@ def robot_smear_px(
     """The same for a robot in front of a camera that stands still, by its fastest joint.
 
     0 where no joints were recorded.
+
+    Args:
+        episode: Whose joints are read.
+        stamps_ns: Of the camera's images.
+        focal_px: Its focal length.
     """
     try:
         track = streams.joint_track(episode)
@@ -134,7 +146,13 @@ def robot_smear_px(
 
 
 def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -> dict[int, float]:
-    """Decode the colour images with these stamps and rate each."""
+    """Decode the colour images with these stamps and rate each.
+
+    Args:
+        episode: Whose images are decoded.
+        camera_id: The camera, by its name in the topics.
+        stamps_ns: Source stamps of the images that are rated.
+    """
     topic = streams.find_camera_topic(episode, camera_id, "color/image")
     wanted = set(stamps_ns)
     found: dict[int, float] = {}
@@ -292,6 +310,12 @@ def choose_frames(
 
     Which frames are held out depends on their number alone, never on what they show.
 
+    Args:
+        sources: The episodes a scene is made from.
+        config: How many frames to use, and how many to hold out.
+        output: Told which cameras are left out, and why.
+        calibration: Where cameras are mounted; None: they are where ``/tf`` or odometry says.
+
     Raises:
         NoFramesError: When nothing is left to learn from.
         UnusableCameraError: When no camera can be used: the first one's reason.
@@ -424,7 +448,12 @@ def _pick(
 
 
 def spread(values: np.ndarray, count: int) -> np.ndarray:
-    """Pick at most ``count`` values at even distances, both ends included."""
+    """Pick at most ``count`` values at even distances, both ends included.
+
+    Args:
+        values: In their order.
+        count: At most so many.
+    """
     if len(values) <= count:
         return values
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])
@@ -442,7 +471,12 @@ def _is_stationary(
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
-    """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
+    """Yield the frames of a choice that carry one of the stamps, with the poses it chose.
+
+    Args:
+        choice: Camera, episode and poses.
+        stamps_ns: Source stamps of the colour images that are wanted.
+    """
     for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
         yield _corrected(frame, choice)
 

@@ -102,7 +102,14 @@ class LiveCell:
     def poses(
         self, camera_id: str, color: str, depth: str, stamps_ns: Int[np.ndarray, " num_stamps"]
     ) -> CameraPoses:
-        """Where a camera was: where it was calibrated, else where ``/tf`` says."""
+        """Where a camera was: where it was calibrated, else where ``/tf`` says.
+
+        Args:
+            camera_id: The camera, by its name in the topics.
+            color: Frame of its colour images.
+            depth: Frame of its depth images.
+            stamps_ns: Of the images.
+        """
         mount = self.mounts.get(camera_id)
         if mount is None:
             known = set(self.tree.frames())
@@ -130,6 +137,13 @@ def frames_of(
     camera_id: str, camera: LiveCamera, cell: LiveCell, quiet_since_ns: int, max_frames: int
 ) -> PosedFrames:
     """The newest frames of one camera, taken at rest since the last execution ended.
+
+    Args:
+        camera_id: The camera, by its name in the topics.
+        camera: What it sent last.
+        cell: Where things are.
+        quiet_since_ns: When the last execution ended; images must be later, on the cell's clock.
+        max_frames: At most so many, the newest.
 
     Raises:
         CameraNotReadyError: When there are none; what is missing.

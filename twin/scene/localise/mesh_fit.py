@@ -65,7 +65,12 @@ def mesh_surface(
 
 @cache
 def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
-    """Surface of the mesh that the task file names."""
+    """Surface of the mesh that the task file names.
+
+    Args:
+        model: An object with a mesh.
+        num_samples: Points on the surface.
+    """
     mesh = object_mesh(model)
     return mesh_surface(mesh.vertices_m, mesh.triangles, num_samples)
 
@@ -73,7 +78,13 @@ def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
 def facing(
     T_object_base: Float[np.ndarray, "4 4"], view: CameraView, surface: MeshSurface
 ) -> Bool[np.ndarray, " num_samples"]:
-    """Tell which samples turn their outside to a view's camera."""
+    """Tell which samples turn their outside to a view's camera.
+
+    Args:
+        T_object_base: The base, seen from the object.
+        view: Says where the depth camera is.
+        surface: Samples and their normals, in the object's frame.
+    """
     ray = se3.apply(T_object_base, view.T_base_depth[None, :3, 3])[0] - surface.p_m
     along = np.einsum("ij,ij->i", ray, surface.normals)
     return np.asarray(along > FACING * lengths(ray))

@@ -97,7 +97,15 @@ def correct_for_table(
     points: PointConfig,
     colour: ColourConfig,
 ) -> tuple[list[CameraView], dict[str, TableFit]]:
-    """Move each view so that its table lies at z = 0; views that see too little stay."""
+    """Move each view so that its table lies at z = 0; views that see too little stay.
+
+    Args:
+        views: What each camera sees.
+        task: Its objects do not count as table.
+        config: What may be table, and how far it may correct.
+        points: From half its ``min_likeness`` on, a point is the object's and not the table's.
+        colour: What has an object's colour.
+    """
     corrected, fits = [], {}
     for view in views:
         p = _table_points(view, task, config, points, colour)
@@ -133,6 +141,12 @@ def fit_table(
 
     Unknowns: relative depth error, camera height error, rotation about base x and y; least squares
     with Tukey weights and Gaussian priors. The rotation is about the camera.
+
+    Args:
+        p_base: Points of the table, as the camera says now [m].
+        p_base_camera: Where the camera is [m].
+        camera_id: Whose correction it is, for the record.
+        config: Noise of the points, and priors of the errors.
     """
     d = p_base - p_base_camera
     # z after the correction: p_z - s d_z + h + (rotation x d)_z. On the table d_z is minus the

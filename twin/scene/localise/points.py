@@ -48,6 +48,11 @@ def likeness(
     An edge pixel that mixes object and grey lies between, which places edges between pixels.
 
     Range: 0 and up, about 1 on the object.
+
+    Args:
+        image_linear: Linear light, not sRGB.
+        color_srgb: Colour of the object, 0..255.
+        config: What is too dark, and how far the hue may be off.
     """
     total = image_linear.sum(axis=-1)
     dark = total < 3 * config.min_luminance
@@ -111,6 +116,13 @@ def fuse_stationary(
 
     Frames of a camera that moved in between make separate views, the newest are kept. Depth is
     averaged over the frames that measured a pixel, if at least half of them did.
+
+    Args:
+        frames: Of all cameras, in any order.
+        max_frames: Frames that one view is averaged over.
+        max_views: Views of one camera.
+        task: Says which part of the table is searched.
+        config: Limits of the points that are kept.
     """
     groups: list[list[RgbdFrame]] = []
     for frame in sorted(frames, key=lambda item: -item.stamp_ns):
@@ -180,7 +192,13 @@ def _sample(
 
 
 def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: float) -> CameraView:
-    """The same view with its cameras moved in the base frame and its depth scaled."""
+    """The same view with its cameras moved in the base frame and its depth scaled.
+
+    Args:
+        view: As the camera's pose was.
+        T_new_old: Correction of that pose, base frame.
+        depth_factor: True depth divided by measured depth.
+    """
     T_base_depth = T_new_old @ view.T_base_depth
     p_depth = se3.apply(se3.invert(view.T_base_depth), view.p_base) * depth_factor
     return replace(
@@ -230,7 +248,14 @@ class Cluster:
 def object_points(
     views: Sequence[CameraView], model: ObjectModel, config: PointConfig, colour: ColourConfig
 ) -> list[Cluster]:
-    """Clusters of voxel-averaged points of an object's colour, largest first."""
+    """Clusters of voxel-averaged points of an object's colour, largest first.
+
+    Args:
+        views: What each camera sees.
+        model: The object; its colour counts.
+        config: Lowest height, voxel size and gap between clusters.
+        colour: What has an object's colour.
+    """
     parts = []
     for view in views:
         p = view.p_base
@@ -247,7 +272,12 @@ def object_points(
 def voxel_mean(
     points: Float[np.ndarray, "num_points 3"], voxel_m: float
 ) -> Float[np.ndarray, "num_voxels 3"]:
-    """Replace the points of each occupied voxel by their mean."""
+    """Replace the points of each occupied voxel by their mean.
+
+    Args:
+        points: In any frame [m].
+        voxel_m: Edge length of a voxel.
+    """
     if len(points) == 0:
         return points
     keys = np.floor(points / voxel_m).astype(np.int64)
@@ -264,7 +294,13 @@ def clusters(
     view_ids: Int[np.ndarray, " num_points"],
     gap_m: float,
 ) -> list[Cluster]:
-    """Connected groups seen from above, largest first."""
+    """Connected groups seen from above, largest first.
+
+    Args:
+        points: In the base frame [m].
+        view_ids: Which view each comes from.
+        gap_m: About this much free table, seen from above, parts two groups.
+    """
     if len(points) == 0:
         return []
     cells = np.floor(points[:, :2] / (gap_m / 2)).astype(np.int64)

@@ -62,6 +62,14 @@ def find_outlines(
 
     Points at the image border and points beside something nearer are left out: there the object
     goes on.
+
+    Args:
+        views: What each camera sees.
+        model: The object; its colour and corners count.
+        T_base_object: Where it is thought to be.
+        colour: What has an object's colour.
+        window_m: How far around the predicted outline is searched.
+        sigma_px: Standard error of one edge point.
     """
     outlines = []
     for view_id, view in enumerate(views):
@@ -144,7 +152,13 @@ def _occluded(
 def outline_distances(
     outline: Outline, model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, " num_edges"]:
-    """Signed distance of each edge point to the predicted outline, positive outside [m]."""
+    """Signed distance of each edge point to the predicted outline, positive outside [m].
+
+    Args:
+        outline: Edge points of one view.
+        model: The object; its corners predict the outline.
+        T_base_object: Where it is thought to be.
+    """
     T_camera_object = se3.invert(outline.view.T_base_color) @ T_base_object
     uv, _ = outline.view.color_camera.project(se3.apply(T_camera_object, corners(model)))
     hull = ConvexHull(uv)
@@ -234,6 +248,13 @@ def fit_shape(
 
     Several starts (yaw from the smallest rectangle, centre from each visible side) are fitted to
     the points; the best one is refined with the outlines, looked for in a shrinking window.
+
+    Args:
+        cluster: Points of the object.
+        views: Those the points come from; their images have the outlines.
+        model: The object, its size known.
+        colour: What has an object's colour.
+        config: Noise, priors of the cameras and robust limits.
     """
     cluster = cluster.thinned(config.max_points)
     centre = cluster.p_base.mean(axis=0)
@@ -271,7 +292,14 @@ def refine_on_points(
     T_base_object: Float[np.ndarray, "4 4"],
     config: ShapeFitConfig,
 ) -> Float[np.ndarray, "4 4"]:
-    """Lay a shape onto points that all come from one source, starting from a pose nearby."""
+    """Lay a shape onto points that all come from one source, starting from a pose nearby.
+
+    Args:
+        points: On the surface of the object, base frame [m].
+        model: The object, its size known.
+        T_base_object: The pose to start from, upright.
+        config: Noise and robust limits.
+    """
     cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
     problem = _Problem(
         cluster=cluster.thinned(config.max_points),

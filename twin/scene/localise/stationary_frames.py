@@ -147,7 +147,14 @@ def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
 def is_stationary(
     tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
 ) -> bool:
-    """Say whether a frame's pose is the same shortly before and after an instant."""
+    """Say whether a frame's pose is the same shortly before and after an instant.
+
+    Args:
+        tree: Knows the frame's poses around the instant.
+        frame_id: Of the camera.
+        stamp_ns: The instant.
+        until_ns: Nothing later is looked at; None: no limit.
+    """
     last_ns = (
         stamp_ns + STATIONARY_WINDOW_NS
         if until_ns is None
@@ -162,6 +169,10 @@ def is_stationary(
 
 def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:
     """Where the cameras of an episode are, as far as they were calibrated.
+
+    Args:
+        episode: Whose cameras, and whose joints for those in the hand.
+        calibration: Of the run; None: no camera was calibrated.
 
     Raises:
         EpisodeError: A camera in the hand, and no joint states.

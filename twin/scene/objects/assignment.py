@@ -98,7 +98,13 @@ def hidden_table(
 def alike(
     cloud: GaussianCloud, model: ObjectModel, min_likeness: float
 ) -> Bool[np.ndarray, " num_splats"]:
-    """Tell which Gaussians have an object's colour, see ``twin.scene.localise.points.likeness``."""
+    """Tell which Gaussians have an object's colour, see ``twin.scene.localise.points.likeness``.
+
+    Args:
+        cloud: The Gaussians that are asked about.
+        model: The object; its colour counts.
+        min_likeness: From this likeness on the colour is the object's.
+    """
     color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
     linear = linear_image(color_u8[None])[0]
     return np.asarray(likeness(linear, model.color_srgb, ColourConfig()) >= min_likeness)

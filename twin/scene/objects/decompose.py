@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from bridge.episode import provenance
+from bridge.episode import provenance, streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import GstError, InvalidRecordError
 from bridge.geometry import se3
+from bridge.task.find import MissingTaskError, union_of
 from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.task_file import ObjectModel, Task, load_task
+from bridge.task.task_file import ObjectModel, Task, TaskFile
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
 from twin.scene.foundation.complete import Completed, Shapes
@@ -313,9 +314,42 @@ class Decomposition:
         return {key: item.T_base_object for key, item in objects.items()}
 
 
-def episode_of_task(sources: Sources) -> Episode | None:
-    """The episode whose task and whose objects count: the first that names a task."""
-    return next((episode for episode in sources.episodes if episode.info.task), None)
+@dataclass(frozen=True, kw_only=True)
+class ScannedTasks:
+    """The task files of a scene's episodes, each with the first episode recorded with it."""
+
+    files: Sequence[tuple[Episode, TaskFile]]
+    missing: Sequence[str]
+    """Why there is none for an episode that names a task."""
+
+    @property
+    def task(self) -> Task | None:
+        """The objects of all of them.
+
+        Raises:
+            UsageError: When two files define one object differently, or one is no task.
+        """
+        return union_of(file for _, file in self.files)
+
+
+def scanned_tasks(sources: Sources) -> ScannedTasks:
+    """Find the task files whose objects are looked for.
+
+    Raises:
+        EpisodeError: When one that an episode carries is damaged.
+    """
+    files: dict[str, tuple[Episode, TaskFile]] = {}
+    missing: dict[str, None] = {}
+    for episode in sources.episodes:
+        if not episode.info.task:
+            continue
+        try:
+            file = streams.task_file(episode)
+        except MissingTaskError as error:
+            missing[str(error)] = None
+        else:
+            files.setdefault(file.sha256, (episode, file))
+    return ScannedTasks(files=tuple(files.values()), missing=tuple(missing))
 
 
 def decompose(
@@ -326,7 +360,7 @@ def decompose(
     complete: Complete | None = None,
     output: Output | None = None,
 ) -> Decomposition:
-    """Cut the task's objects out of the scene where the first episode of a task shows them.
+    """Cut the tasks' objects out of the scene where the first episode of each task shows them.
 
     Args:
         sources: The episodes the scene was made from.
@@ -335,30 +369,27 @@ def decompose(
         views: What the scene was fitted to; objects are reconstructed from them.
         complete: Asks a shape generator about them; None: nobody is asked.
         output: How to talk; None: say nothing.
+
+    Raises:
+        UsageError: When two task files define one object differently, or one is no task.
     """
     output = Output(quiet=True) if output is None else output
-    episode = episode_of_task(sources)
-    if episode is None:
-        return Decomposition(background=cloud, remark="no episode names a task: objects not known")
+    tasks = scanned_tasks(sources)
+    task = tasks.task
+    if task is None:
+        remark = "; ".join(tasks.missing) or "no episode names a task"
+        return Decomposition(background=cloud, remark=f"objects not known: {remark}")
     if any(choice.poses.source == "odometry" for choice in choices):
         remark = (
             "objects not taken out: nothing says where the table is in a scene whose camera was "
         )
         return Decomposition(background=cloud, remark=f"{remark}followed by its images")
+    localised: dict[str, LocalisedObject] = {}
     try:
-        task = load_task(episode.info.task)
-        output.say(f"look for {', '.join(task.objects)} in {episode.info.id} and take them out")
-        held_out = {
-            choice.camera_id: choice.holdout_ns
-            for choice in choices
-            if choice.episode.path == episode.path
-        }
-        mounted = {
-            choice.camera_id: choice.poses
-            for choice in choices
-            if choice.episode.path == episode.path and choice.poses.source == "hand-eye"
-        }
-        localised = localise_episode(episode, task, held_out_ns=held_out, poses=mounted)
+        for episode, file in tasks.files:
+            for key, item in _localised(episode, file.task(), choices, output).items():
+                if key not in localised or not localised[key].found:  # where it was seen first
+                    localised[key] = item
     except GstError as error:
         return Decomposition(background=cloud, remark=f"objects not taken out: {error}")
     poses = object_poses(cloud, localised, task)
@@ -369,7 +400,8 @@ def decompose(
         asked = complete(views, task.objects, poses, shapes)
     parts = split_objects(cloud, localised, task, shapes=asked.shapes)
     missing = {key: item.reason for key, item in localised.items() if not item.found}
-    remark = "; ".join(f"{key} not found: {reason}" for key, reason in missing.items())
+    remarks = [f"{key} not found: {reason}" for key, reason in missing.items()]
+    remark = "; ".join([*tasks.missing, *remarks])
     return Decomposition(
         background=concatenate([parts.background, parts.filling]),
         remark=remark,
@@ -381,8 +413,26 @@ def decompose(
     )
 
 
+def _localised(
+    episode: Episode, task: Task, choices: Sequence[FrameChoice], output: Output
+) -> dict[str, LocalisedObject]:
+    """Look for a task's objects in the frames of one episode that are not held out."""
+    output.say(f"look for {', '.join(task.objects)} in {episode.info.id} and take them out")
+    own = [choice for choice in choices if choice.episode.path == episode.path]
+    return localise_episode(
+        episode,
+        task,
+        held_out_ns={choice.camera_id: choice.holdout_ns for choice in own},
+        poses={c.camera_id: c.poses for c in own if c.poses.source == "hand-eye"},
+    )
+
+
 def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectSplats]:
     """Load the objects that ``scene.json`` lists, each in its own frame.
+
+    Args:
+        run: Whose scene folder is read.
+        record: The content of ``scene.json``.
 
     Raises:
         PathNotFoundError: When a splat file is gone.
@@ -410,6 +460,10 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
     """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform.
 
+    Args:
+        pose: What the file holds.
+        path: The file, for the message.
+
     Raises:
         UnreadableSceneError: When they are no pose; names the file.
     """
@@ -424,7 +478,13 @@ def compose_parts(
     objects: Mapping[str, ObjectSplats],
     Ts_base_object: Mapping[str, np.ndarray] | None = None,
 ) -> GaussianCloud:
-    """Place every object in the background: where it was scanned, or where the mapping says."""
+    """Place every object in the background: where it was scanned, or where the mapping says.
+
+    Args:
+        background: In the base frame.
+        objects: By name, each in its own frame.
+        Ts_base_object: Other places for some of them; None: all stay where they were scanned.
+    """
     places = {} if Ts_base_object is None else Ts_base_object
     placed = [
         moved_cloud(item.cloud, places.get(key, item.T_base_object))

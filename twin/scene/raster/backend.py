@@ -110,7 +110,13 @@ class CudaRasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
+
+        Args:
+            cloud: The Gaussians, in the base frame.
+            camera: Size of the image and intrinsics.
+            T_base_camera: Where the camera is.
+        """
         torch = self._torch
         leaves = {
             name: torch.tensor(rows, device=self._device, requires_grad=True)
@@ -167,7 +173,13 @@ class CudaRasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees."""
+        """Draw what one camera sees.
+
+        Args:
+            cloud: The Gaussians, in the base frame.
+            camera: Size of the image and intrinsics.
+            T_base_camera: Where the camera is.
+        """
         return view_of_planes(self.draw_planes(cloud, camera, T_base_camera))
 
     def draw_features(

@@ -89,7 +89,12 @@ class CloudGradient:
 def native_camera(
     camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float32[np.ndarray, "3 4"], tuple[int, int, float, float, float, float]]:
-    """Pose and intrinsics as the extension takes them."""
+    """Pose and intrinsics as the extension takes them.
+
+    Args:
+        camera: Size of the image and intrinsics.
+        T_base_camera: Where the camera is.
+    """
     intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     return as_float32(se3.invert(T_base_camera)[:3]), intrinsics
 
@@ -292,7 +297,13 @@ class Rasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
+
+        Args:
+            cloud: The Gaussians, in the base frame.
+            camera: Size of the image and intrinsics.
+            T_base_camera: Where the camera is.
+        """
         planes: np.ndarray = self._native.draw(
             cloud.means_m,
             cloud.quats_wxyz,
@@ -311,7 +322,12 @@ class Rasteriser:
         planes: Float32[np.ndarray, "5 height width"],
         plane_gradients: Float32[np.ndarray, "5 height width"],
     ) -> CloudGradient:
-        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
+        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud.
+
+        Args:
+            planes: As the last ``draw_planes`` returned them.
+            plane_gradients: Gradient of the loss on each number of the planes.
+        """
         means, quats, scales, opacities, colors, harmonics, pose = self._native.pull(
             planes, plane_gradients
         )
@@ -367,7 +383,13 @@ class Rasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees."""
+        """Draw what one camera sees.
+
+        Args:
+            cloud: The Gaussians, in the base frame.
+            camera: Size of the image and intrinsics.
+            T_base_camera: Where the camera is.
+        """
         return view_of_planes(self.draw_planes(cloud, camera, T_base_camera))
 
 

@@ -57,7 +57,20 @@ def make_record(
     num_background: int,
     cost: Cost,
 ) -> dict[str, Any]:
-    """Put together the content of ``scene.json``."""
+    """Put together the content of ``scene.json``.
+
+    Args:
+        key: Names the inputs and settings; a rebuild with the same key is not repeated.
+        scene_hash: Of the background's file; names the scene.
+        sources: The episodes it was made from.
+        left_out: Why cameras were not used.
+        training: Frames that were learnt from, with the report on the scan.
+        config: Settings of the rebuild.
+        fitted: The cloud, and what fitting it took.
+        views: Numbers of the held-out views.
+        num_background: Gaussians that belong to no object.
+        cost: Of the whole rebuild.
+    """
     settings = asdict(config)
     settings.pop("force")
     settings["fit"]["budget_s"] = None if math.isinf(config.fit.limit_s) else config.fit.limit_s
@@ -100,7 +113,14 @@ def make_record(
 def protocol_of(
     choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig, cost: Cost
 ) -> dict[str, Any]:
-    """How the scene was made, as far as whoever rates its views must know."""
+    """How the scene was made, as far as whoever rates its views must know.
+
+    Args:
+        choices: Frames that were learnt from or held out.
+        fitted: The cloud, and what fitting it took.
+        config: Settings of the rebuild.
+        cost: Of the rebuild so far.
+    """
     frames = config.frames
     return {
         "holdout": holdout_text(frames),

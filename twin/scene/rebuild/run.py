@@ -16,8 +16,7 @@ import numpy as np
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import BridgeError, UsageError
-from bridge.task.task_file import Task, load_task
+from bridge.errors import BridgeError
 from bridge.terminal import Output
 from twin.scene.dataset.training_set import (
     TrainingSet,
@@ -38,7 +37,7 @@ from twin.scene.gaussians import (
     with_harmonics,
     write_ply,
 )
-from twin.scene.objects.decompose import Decomposition, decompose, episode_of_task
+from twin.scene.objects.decompose import Decomposition, decompose, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
@@ -84,6 +83,11 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     """Rebuild the static scene of a run and return the content of ``scene.json``.
 
     Work already done with the same inputs and settings is not repeated unless forced.
+
+    Args:
+        run: Whose scans are read, and whose scene folder is written.
+        config: Frames, fit, models, and whether to redo what is there.
+        output: Shows progress and remarks.
 
     Raises:
         NoFramesError: When the run has no RGB-D frames.
@@ -138,7 +142,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         output,
         models=config.models,
         choices=training.choices,
-        task=_task(sources),
+        task=scanned_tasks(sources).task,
     )
     clock.end("objects_and_semantics")
     record = make_record(
@@ -235,7 +239,7 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
     settings["models"].pop("device")
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
-    task = _task(sources)
+    task = scanned_tasks(sources).task  # shapes and colours decide the objects
     return provenance.hash_settings(
         {
             "method": METHOD_VERSION,
@@ -253,15 +257,6 @@ def _mounts(config: RebuildConfig, calibration: Calibration | None) -> dict[str,
     if calibration is None or not calibration.cameras or config.frames.poses != "auto":
         return None
     return {key: place.to_record() for key, place in sorted(calibration.cameras.items())}
-
-
-def _task(sources: Sources) -> Task | None:
-    """Shapes and colours decide the objects; a task that cannot be read gives none."""
-    episode = episode_of_task(sources)
-    try:
-        return None if episode is None else load_task(episode.info.task)
-    except UsageError:
-        return None
 
 
 def _already_done(run: RunFolder, key: str) -> dict[str, Any] | None:

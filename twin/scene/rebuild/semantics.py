@@ -145,7 +145,12 @@ def ask_models_about(
 
 
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
-    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
+    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time.
+
+    Args:
+        choices: Cameras and the stamps of their training frames.
+        count: Of all cameras together.
+    """
     numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
     chosen = {numbered[index] for index in spread(np.arange(len(numbered)), count)}
     frames: list[RgbdFrame] = []

@@ -88,6 +88,12 @@ class RobotFrames:
         """Return a frame's points without the robot's, and its view with the robot masked.
 
         The robot's points are kept for its links when it stood still.
+
+        Args:
+            episode: Whose joints say how the robot stood.
+            frame: Only its stamp counts.
+            points: The surface that the frame measured, root frame.
+            view: The frame as the fit sees it.
         """
         surface = self._surface(episode, frame.stamp_ns)
         if surface is None:
@@ -98,7 +104,13 @@ class RobotFrames:
         return points.take(owner < 0), view.without(shown)
 
     def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
-        """Keep the robot's points of a frame that the background does not need."""
+        """Keep the robot's points of a frame that the background does not need.
+
+        Args:
+            episode: Whose joints say how the robot stood.
+            stamp_ns: When the frame was taken.
+            points: The surface that it measured, root frame.
+        """
         surface = self._surface(episode, stamp_ns)
         if surface is not None:
             self._keep(episode, stamp_ns, surface, points)
@@ -106,7 +118,12 @@ class RobotFrames:
     def stationary_postures(
         self, episode: Episode, stamps_ns: Iterable[int]
     ) -> dict[int, Float[np.ndarray, " num_joints"]]:
-        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
+        """Joints at those of some instants at which the robot of an episode stood still [rad].
+
+        Args:
+            episode: Whose joints are read.
+            stamps_ns: The instants.
+        """
         tracked = self._tracked.get(str(episode.path))
         if tracked is None:
             return {}
@@ -187,7 +204,14 @@ def robot_mask(
     T_base_camera: Float[np.ndarray, "4 4"],
     depth_m: Float[np.ndarray, "height width"],
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels that show the posed robot, grown by two; not those with something in front of it."""
+    """Pixels that show the posed robot, grown by two; not those with something in front of it.
+
+    Args:
+        surface: The robot as it stood, base frame.
+        camera: Size of the image and intrinsics.
+        T_base_camera: Where the camera is.
+        depth_m: What the camera measured; 0 is "not measured" and hides nothing.
+    """
     expected = surface.depth_along(camera.rays(), T_base_camera)
     hidden = (depth_m > 0) & (depth_m < expected - IN_FRONT_M)
     around = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), dtype=bool)
@@ -226,6 +250,10 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
 
     Where the frames' root is the robot's base, the joints say it. In another root frame (poses
     from odometry, another world) scene and robot are aligned by what the training frames show.
+
+    Args:
+        choices: Cameras whose training frames are used; their root frame decides how to look.
+        output: Told how well scene and robot fit.
     """
     root = root_frame(choices[0])
     episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
@@ -252,6 +280,12 @@ def look_closer(
 
     A few of their frames are enough for the background. The robot shows another side in each
     posture, so up to two dozen postures far from each other are read for its links.
+
+    Args:
+        found: Receives the robot's points.
+        choices: Only cameras that stand still, and their spare frames, are read.
+        limits: Which depth is trusted.
+        stride: Pixels from one that becomes a point to the next, along rows and columns.
     """
     for choice in choices:
         postures = found.frames.stationary_postures(choice.episode, choice.spare_ns)
@@ -280,7 +314,13 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
 def write_robot(
     run: RunFolder, found: FoundRobot, links: Mapping[str, GaussianCloud]
 ) -> dict[str, Any]:
-    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot."""
+    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot.
+
+    Args:
+        run: Whose scene folder is written.
+        found: Where the robot is in the scene.
+        links: Gaussians of each link, in its own frame.
+    """
     record: dict[str, Any] = {"remark": found.remark, "links": write_links(run, links)}
     if found.alignment is not None:
         record["T_base_root"] = se3.pose_record(found.frames.T_base_root)

@@ -64,6 +64,12 @@ def surface_links(
     The table around a link that never moves is not taken for the link. Everything beside a moving
     link will be seen by itself in another posture. Beside the base it never will, so there a point
     must lie along its own normal from the link.
+
+    Args:
+        robot: Says which links never move.
+        surface: The robot as it stood, base frame.
+        p_base: Points that were measured [m].
+        normals: Unit vectors out of the surface at the points, base frame.
     """
     near = surface.near_box(p_base, BOUND_M)
     found = surface.nearest(p_base[near])
@@ -80,7 +86,12 @@ def surface_links(
 
 
 def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str, Any]:
-    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about them."""
+    """Write ``robot/<link>.ply`` and return what ``scene.json`` says about them.
+
+    Args:
+        run: Whose scene folder is written; links that are not given are deleted there.
+        links: Gaussians of each link, in its own frame.
+    """
     folder = run.scene_dir / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.glob("*.ply"):
@@ -100,6 +111,10 @@ def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str,
 
 def read_links(run: RunFolder, record: Mapping[str, Any]) -> dict[str, GaussianCloud]:
     """Load the links that ``scene.json`` lists under ``robot``, each in its own frame.
+
+    Args:
+        run: Whose scene folder is read.
+        record: The content of ``scene.json``.
 
     Raises:
         PathNotFoundError: A file is gone.

@@ -41,6 +41,11 @@ def smooth_shares(
 
     Masks bleed and shrink at random; the edge of a colour is where a thing ends. Gaussians near
     any mask take part, all others keep their share of zero.
+
+    Args:
+        share: How much of each Gaussian the masks give to each thing, 0..1.
+        cloud: Places and colours of the Gaussians.
+        config: How far and across what colours shares spread.
     """
     told = np.flatnonzero(share.max(axis=0, initial=0.0) > 0.01)
     if len(told) <= config.num_neighbours:

@@ -53,7 +53,12 @@ class Voxels:
 
 
 def make_voxels(points: SurfacePoints, voxel_m: float) -> Voxels:
-    """Average the points of each occupied voxel."""
+    """Average the points of each occupied voxel.
+
+    Args:
+        points: Coloured, oriented points of visible surfaces.
+        voxel_m: Edge length of a voxel.
+    """
     cells = np.floor(points.p_m / voxel_m).astype(np.int64)
     _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     index = index.reshape(-1)
@@ -73,7 +78,13 @@ def means_of(
     group: Int[np.ndarray, " num_rows"],
     num_groups: int,
 ) -> Float[np.ndarray, "num_groups num_columns"]:
-    """Average the rows of each group; a group without rows gives zero."""
+    """Average the rows of each group; a group without rows gives zero.
+
+    Args:
+        values: What is averaged, column by column.
+        group: Which group each row belongs to, from 0.
+        num_groups: How many there are, those without rows included.
+    """
     count = np.maximum(np.bincount(group, minlength=num_groups), 1)
     sums = [np.bincount(group, weights=column, minlength=num_groups) for column in values.T]
     return np.asarray(np.stack(sums, axis=1) / count[:, None])
@@ -82,7 +93,12 @@ def means_of(
 def neighbour_pairs(
     p_m: Float[np.ndarray, "num_voxels 3"], reach_m: float
 ) -> Int[np.ndarray, "num_pairs 2"]:
-    """Pairs of points nearer than a distance, each once."""
+    """Pairs of points nearer than a distance, each once.
+
+    Args:
+        p_m: In any frame.
+        reach_m: The distance.
+    """
     if len(p_m) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     pairs = cKDTree(p_m).query_pairs(reach_m, output_type="ndarray")
@@ -92,7 +108,12 @@ def neighbour_pairs(
 def components(
     num_nodes: int, pairs: Int[np.ndarray, "num_pairs 2"]
 ) -> Int[np.ndarray, " num_nodes"]:
-    """Number the connected groups of a graph from 0, in the order of their first node."""
+    """Number the connected groups of a graph from 0, in the order of their first node.
+
+    Args:
+        num_nodes: Of the graph; a node without an edge is a group of its own.
+        pairs: Its edges, by node numbers.
+    """
     weights = np.ones(len(pairs), dtype=np.int8)
     graph = coo_matrix((weights, (pairs[:, 0], pairs[:, 1])), shape=(num_nodes, num_nodes))
     _, labels = connected_components(graph, directed=False)
@@ -114,7 +135,12 @@ def make_patches(
     Float[np.ndarray, "num_patches 3"],
     Float[np.ndarray, "num_patches 3"],
 ]:
-    """Group voxels that are near and face the same way: patch of each, centres, normals."""
+    """Group voxels that are near and face the same way: patch of each, centres, normals.
+
+    Args:
+        voxels: Places and normals.
+        size_m: Edge length of a patch.
+    """
     cells = np.floor(voxels.p_m / size_m).astype(np.int64)
     axis = np.abs(voxels.normals).argmax(axis=1)
     forward = np.take_along_axis(voxels.normals, axis[:, None], axis=1)[:, 0] > 0
@@ -167,6 +193,13 @@ def split_by_valleys(
     Local convexity as in Stein et al. 2014 (LCCP) between small patches. A neck or an armpit is
     a valley too, so a cut counts only between pieces that each stand on the plane and whose
     outlines seen from above hardly overlap: heads, handles and the floor of a box stay.
+
+    Args:
+        voxels: Of one connected group.
+        height_m: Of each voxel over the supporting plane.
+        pairs: Voxels that are neighbours.
+        voxel_m: Edge length of a voxel.
+        config: What counts as a valley and as standing.
     """
     patch, p, normals = make_patches(voxels, config.patch_voxels * voxel_m)
     links = np.sort(patch[pairs], axis=1)
@@ -234,6 +267,13 @@ def joined_by_outline(
 
     What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
     one, a head in front of its body.
+
+    Args:
+        pieces: Voxel numbers of each piece.
+        voxels: That the numbers refer to.
+        height_m: Of each voxel over the supporting plane.
+        voxel_m: Edge length of a voxel.
+        config: Which colours are one, and how far outlines must overlap.
     """
     xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
     left = sorted(pieces, key=len)
@@ -317,6 +357,12 @@ def split_by_colour(
     k-means in Lab for k = 1.. with a Schwarz criterion whose noise has a floor; then connected
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
+
+    Args:
+        voxels: Of one connected group.
+        height_m: Of each voxel over the supporting plane.
+        pairs: Voxels that are neighbours.
+        config: Noise and least distance of colours, least size of a piece.
     """
     colour = without_shading(voxels.lab, config.lightness_weight)
     classes = _colour_classes(colour, config)

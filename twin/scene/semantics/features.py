@@ -109,6 +109,13 @@ def lift_reduced(
 
     The mean of what the maps say about each Gaussian is the start, from which the feature term of
     the paper's Eq. 3 is brought down by two steps.
+
+    Args:
+        rasteriser: Draws the cloud and carries values back.
+        cloud: The Gaussians, in the frame of the viewpoints.
+        frames: The whole feature map of each image, and where its camera stood.
+        basis: Principal components that the maps are reduced to.
+        source: Which models made the features, for the record.
     """
     reduced = [(viewpoint, basis.reduce(item)) for viewpoint, item in frames]
     mean, weight = lift_features(rasteriser, cloud, reduced)
@@ -132,7 +139,12 @@ def lift_reduced(
 
 
 def save_features(folder: Path, features: SceneFeatures) -> Path:
-    """Write ``features.npz`` whole or not at all; features as 16-bit floats."""
+    """Write ``features.npz`` whole or not at all; features as 16-bit floats.
+
+    Args:
+        folder: The scene folder.
+        features: Of Gaussians and instances.
+    """
     buffer = io.BytesIO()
     np.savez(
         buffer,

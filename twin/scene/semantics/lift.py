@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt16
+from jaxtyping import Float, Float32, Int, UInt16
 
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, as_float32
@@ -46,6 +46,12 @@ def observe(
     rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint, masks: MaskSet
 ) -> Observation:
     """Carry the masks of one frame to the Gaussians.
+
+    Args:
+        rasteriser: Draws the cloud and carries values back.
+        cloud: The Gaussians, in the frame of the viewpoint.
+        viewpoint: Of the frame that the masks belong to.
+        masks: Of one frame, at the size of its image.
 
     Raises:
         SemanticsError: When a mask has another size than the camera's image.
@@ -95,6 +101,11 @@ def lift_features(
 
     The Gaussians are drawn at the maps' own resolution: a feature cell is a pixel.
 
+    Args:
+        rasteriser: Draws the cloud and carries values back.
+        cloud: The Gaussians, in the frame of the viewpoints.
+        frames: The feature map of each image, and where its camera stood.
+
     Returns:
         Features, and how many cells' worth each Gaussian gave; both zero where never seen.
 
@@ -125,7 +136,12 @@ def lift_features(
 
 
 def camera_of_cells(camera: Camera, feature_map: FeatureMap) -> Camera:
-    """The camera whose pixels are the feature cells; the last cells may reach over the edge."""
+    """The camera whose pixels are the feature cells; the last cells may reach over the edge.
+
+    Args:
+        camera: Of the whole image.
+        feature_map: Made from that image.
+    """
     _, height, width = feature_map.values.shape
     stride = feature_map.stride
     if (
@@ -154,7 +170,14 @@ def render_labels(
     labels: UInt16[np.ndarray, " num_splats"],
     viewpoint: Viewpoint,
 ) -> UInt16[np.ndarray, "height width"]:
-    """Per pixel the label that gives it most; 0 also where empty space gives more."""
+    """Per pixel the label that gives it most; 0 also where empty space gives more.
+
+    Args:
+        rasteriser: Draws the cloud.
+        cloud: The Gaussians, in the frame of the viewpoint.
+        labels: Of each Gaussian; 0 is the background.
+        viewpoint: Camera and where it stands.
+    """
     planes = rasteriser.draw_planes(cloud, viewpoint.camera, viewpoint.T_base_camera)
     ids, weight = rasteriser.label_map(labels)
     ids[weight <= 1.0 - planes[4]] = 0
@@ -164,15 +187,13 @@ def render_labels(
 def visible_weight(
     rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint
 ) -> Float32[np.ndarray, " num_splats"]:
-    """Pixels' worth of one camera's image that each Gaussian gives."""
+    """Pixels' worth of one camera's image that each Gaussian gives.
+
+    Args:
+        rasteriser: Draws the cloud and carries values back.
+        cloud: The Gaussians, in the frame of the viewpoint.
+        viewpoint: Camera and where it stands.
+    """
     camera = viewpoint.camera
     ones = np.ones((1, camera.height, camera.width), dtype=np.float32)
     return as_float32(_transposed(rasteriser, cloud, viewpoint, ones)[:, 0])
-
-
-def mask_iou(
-    a: Bool[np.ndarray, "height width"], b: Bool[np.ndarray, "height width"]
-) -> float | None:
-    """Intersection over union; None when both are empty."""
-    union = int((a | b).sum())
-    return None if union == 0 else float((a & b).sum() / union)

@@ -213,6 +213,10 @@ def thickness_of(
 
     Otherwise a body that rests on the plane would have thin edges all around its foot. Below the
     level it is zero.
+
+    Args:
+        solid: True inside the body; z points up from the plane.
+        level: Layer along z at which the mirror lies.
     """
     above = solid[:, :, level:]
     mirrored = np.concatenate([np.flip(above, axis=2), above], axis=2)

@@ -82,6 +82,11 @@ def find_support(
     largest few planes the one with most points on it and just above it wins: a floor may be
     larger than the table, but less stands on the part of it that is seen.
 
+    Args:
+        p_m: Points of the scene, z up.
+        normals: Unit vectors at the points.
+        config: Tolerances, and how many planes are compared.
+
     Raises:
         NoSupportError: When no level plane has enough points.
     """
@@ -224,7 +229,12 @@ class ShapeDescriptors:
 
 
 def height_map(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> HeightMap:
-    """Highest point per cell; cells within the outline that show none take their neighbour's."""
+    """Highest point per cell; cells within the outline that show none take their neighbour's.
+
+    Args:
+        xyh_m: Place on the supporting plane and height over it.
+        cell_m: Edge length of a cell.
+    """
     cells = np.floor(xyh_m[:, :2] / cell_m).astype(np.int64)
     low = cells.min(axis=0) - 3
     shape = cells.max(axis=0) - low + 4

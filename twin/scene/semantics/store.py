@@ -108,6 +108,11 @@ def _object_of(item: Instance, rows: Mapping[str, int]) -> str | None:
 def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
     """Read what ``write_semantics`` wrote, for files with these numbers of Gaussians.
 
+    Args:
+        folder: The scene folder.
+        rows: How many Gaussians each file has, in the order of the labels: ``background``, object
+            ids.
+
     Raises:
         PathNotFoundError: When the scene has none.
         UnreadableSemanticsError: When the file is damaged or belongs to other splats.

@@ -36,7 +36,12 @@ class ConvexPart:
     def contains(
         self, points_m: Float[np.ndarray, "num_points 3"], margin_m: float = 0.0
     ) -> Bool[np.ndarray, " num_points"]:
-        """Say which points lie inside, or within a margin of every plane."""
+        """Say which points lie inside, or within a margin of every plane.
+
+        Args:
+            points_m: In the frame of the part.
+            margin_m: How far outside a plane still counts as inside.
+        """
         height = points_m @ self.planes[:, :3].T + self.planes[:, 3]
         return np.asarray((height <= margin_m).all(axis=1))
 

@@ -15,7 +15,7 @@ from bridge.whole_file import write_whole
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.collision import CollisionParts, collision_parts
 from twin.scene.shape.lattice import lattice
-from twin.scene.shape.mesh import Faces, Vertices, mesh_ply, read_mesh
+from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 
 
@@ -164,23 +164,6 @@ def _write_parts(folder: Path, parts: CollisionParts) -> list[str]:
     for name, part in zip(names, parts.parts, strict=True):
         write_whole(folder / name, mesh_ply(part.vertices_m, part.faces))
     return names
-
-
-def read_parts(folder: Path) -> list[tuple[Vertices, Faces]]:
-    """Read the convex collision parts of an object: vertices [m] in its frame, and faces.
-
-    An engine that takes arrays of vertices needs no file: the hull of each part is the part.
-
-    Args:
-        folder: ``objects/<id>`` of a scene.
-
-    Returns:
-        Nothing for an object that was not reconstructed.
-
-    Raises:
-        UnreadableMeshError: When a part is damaged.
-    """
-    return [read_mesh(path) for path in sorted((folder / COLLISION).glob("*.ply"))]
 
 
 def describe_shape(shape: ObjectShape) -> dict[str, Any]:

@@ -99,7 +99,12 @@ def _leaning(
 
 
 def support_z_m(model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]) -> float | None:
-    """Height of the table in the object's frame [m]; None when it does not stand on it."""
+    """Height of the table in the object's frame [m]; None when it does not stand on it.
+
+    Args:
+        model: The object; its lowest panel stands on the table or does not.
+        T_base_object: Where it is; the table is at z = 0 of the base.
+    """
     underside = float(min((centre - extents / 2)[2] for centre, extents in model.panels()))
     table = -float(T_base_object[2, 3])
     return table if abs(underside - table) <= STANDING_M else None
@@ -111,6 +116,12 @@ def masked_view(
     """One training view in an object's frame, with the pixels that show the object.
 
     A pixel belongs to the object whose surface is nearest to its point.
+
+    Args:
+        view: The training view, in the base frame.
+        key: Name of the object.
+        models: All objects of the task, by name.
+        Ts_base_object: Where those are that were found.
     """
     target = view.full
     depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
@@ -217,7 +228,13 @@ def from_outside_m(
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
-    """Signed distance of points to what an object takes up, handles and rim included [m]."""
+    """Signed distance of points to what an object takes up, handles and rim included [m].
+
+    Args:
+        points: In the base frame [m].
+        model: The object.
+        T_base_object: Where it is.
+    """
     if model.mesh is not None and model.soft is None:
         return np.asarray(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
     distance, _ = surface_distances(points, model, T_base_object)

@@ -91,7 +91,12 @@ class Lattice:
 def tet_volumes_m3(
     nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int[np.ndarray, "num_tets 4"]
 ) -> Float[np.ndarray, " num_tets"]:
-    """Signed volumes."""
+    """Signed volumes.
+
+    Args:
+        nodes_m: Where the nodes are.
+        tets: Node indices of each tetrahedron; their order decides the sign.
+    """
     a, b, c, d = (nodes_m[tets[:, k]] for k in range(4))
     return np.asarray(np.einsum("ni,ni->n", np.cross(b - a, c - a), d - a) / 6)
 

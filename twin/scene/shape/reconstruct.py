@@ -53,6 +53,11 @@ def find_cavity(
 
     Only the largest connected cavity counts. None when there is no cavity worth the name. One that
     no view looked into stays solid, and is found among the faces nobody saw.
+
+    Args:
+        solid: Voxels of the object; the third axis is up.
+        free: Voxels that some view looked through.
+        box: Where the voxels are.
     """
     in_layer = ndimage.generate_binary_structure(3, 1)
     in_layer[:, :, [0, 2]] = False
@@ -318,7 +323,12 @@ def _extent(
 def moved_views(
     views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
 ) -> list[MaskedView]:
-    """The same views in another frame."""
+    """The same views in another frame.
+
+    Args:
+        views: In the base frame.
+        T_new_base: The base, seen from the new frame.
+    """
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 

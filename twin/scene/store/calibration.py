@@ -183,6 +183,12 @@ def calibrated_tree(
     A camera in the hand follows the recorded joints. How colour and depth lie to each other comes
     from the recording's own transforms; without them they count as aligned.
 
+    Args:
+        episode: Gives joints for a camera in the hand, and the recorded transforms.
+        camera_id: The camera, by its name in the topics.
+        mount: Link and pose on it.
+        stamps_ns: The instants.
+
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
@@ -240,6 +246,11 @@ def without_joints(
 ) -> frozenset[int]:
     """Those of some instants at which nobody recorded where the hand that carries a camera was.
 
+    Args:
+        episode: Whose joints are read.
+        mount: A fixed camera needs no joints: the answer is empty.
+        stamps_ns: The instants.
+
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
@@ -250,7 +261,12 @@ def without_joints(
 def unknown_postures(
     track: PostureTrack | None, stamps_ns: Int[np.ndarray, " num_frames"]
 ) -> frozenset[int]:
-    """Those of some instants around which a track has no joints, or values that are not finite."""
+    """Those of some instants around which a track has no joints, or values that are not finite.
+
+    Args:
+        track: Where the robot was; None: it does not matter, and the answer is empty.
+        stamps_ns: The instants.
+    """
     if track is None:
         return frozenset()
     return frozenset(

@@ -21,7 +21,12 @@ class UnreadableArraysError(UnreadableFileError):
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays, whole or not at all."""
+    """Write arrays, whole or not at all.
+
+    Args:
+        path: Of the file; one that is there is replaced.
+        arrays: By name; of plain numbers, no Python objects.
+    """
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, rows in arrays.items():
@@ -34,6 +39,11 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.ndarray]:
     """Read named arrays; sizes are checked before anything is unpacked, pickles are refused.
+
+    Args:
+        path: Of the file.
+        names: The arrays that are wanted; others are passed over.
+        max_bytes: What they may take together, unpacked.
 
     Raises:
         UnreadableArraysError: When the file is none, lacks an array, or holds too much.

@@ -131,6 +131,9 @@ def test_what_was_found_is_kept_in_the_scene_as_replays_read_it_and_told_in_a_ta
     for parameter in ALL:
         assert parameter.name in text
     assert "not identified" in text
+    assert "cut short" not in text
+    text = describe_physics({**physics, "cut_short": "after 7 of 30 points"}, "id")
+    assert "cut short: after 7 of 30 points; on another machine the numbers" in text
     assert "held out, calibrated: settled poses off by" in text
     assert "of what localisation states changes from pose to pose; the twin's own: push" in text
 

@@ -105,6 +105,14 @@ def test_the_same_seed_gives_the_same_bits(fitted: Fit) -> None:
     assert [item.value for item in again.estimates] == [item.value for item in fitted.estimates]
 
 
+def test_a_search_that_ran_out_of_time_says_so(fitted: Fit) -> None:
+    assert fitted.cut_short == ""
+    some = tuple(item for item in ALL if item.name == SURFACE_FRICTION)
+    cases = synthetic.observe(("push", "slide") * 4, some, np.zeros(1), seed=1)
+    found = fit(cases, some, PhysicsFitConfig(evaluations=20, budget_s=0.0))
+    assert found.cut_short == "the time limit of 0 s struck after 1 of 20 points"
+
+
 def test_found_values_go_into_the_configuration_of_replays() -> None:
     config = apply_values(
         {SURFACE_FRICTION: 0.4, FINGER_FRICTION: 0.6, MASS_SCALE: 2.0}, PhysicsConfig()

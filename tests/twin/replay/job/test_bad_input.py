@@ -12,6 +12,7 @@ from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
+from bridge.task.task_file import load_task
 from twin.replay.config import ReplayConfig
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import NotEvaluatedError
@@ -86,8 +87,8 @@ def test_an_execution_that_took_no_time_is_refused(tmp_path: Path) -> None:
 def test_what_was_not_evaluated_says_so_once_in_its_row(tmp_path: Path) -> None:
     job = ReplayJob(
         episode_path=tmp_path / "trial.mcap", episode_sha256="", plan_id="p", plan_index=0,
-        trajectory="planned", start_ns=0, end_ns=None, task="cube_into_box", start=StartState(),
-        scene_hash=None, config=ReplayConfig(), folder=tmp_path,
+        trajectory="planned", start_ns=0, end_ns=None, task=load_task("cube_into_box"),
+        start=StartState(), scene_hash=None, config=ReplayConfig(), folder=tmp_path,
     )  # fmt: skip
     for message in ("it broke", str(NotEvaluatedError("it broke"))):
         row = row_of_failure(job, message)

@@ -136,7 +136,7 @@ def test_a_replay_puts_the_box_where_the_calibration_says(
     run.derived_dir.mkdir(exist_ok=True)
     job = ReplayJob(
         episode_path=path, episode_sha256="0" * 64, plan_id=plan.id, plan_index=0,
-        trajectory="planned", start_ns=T0, end_ns=None, task="cube_into_box",
+        trajectory="planned", start_ns=T0, end_ns=None, task=load_task("cube_into_box"),
         start=StartState(Ts_base_object=scene.Ts_base_object), scene_hash=None,
         config=ReplayConfig(mode="kinematic"), folder=run.derived_dir, run_path=run.path,
         calibration_id=known.calibration_id,

@@ -19,6 +19,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.process_pool import Failed
 from bridge.task.record import parse_record
+from bridge.task.task_file import load_task
 from twin.replay import runner, workers
 from twin.replay.config import ReplayConfig
 from twin.replay.job import ReplayJob, row_of_existing, run_job
@@ -58,7 +59,7 @@ def jobs(tmp_path: Path, script: SimpleNamespace) -> list[ReplayJob]:
             trajectory="planned",
             start_ns=T0,
             end_ns=None,
-            task="cube_into_box",
+            task=load_task("cube_into_box"),
             start=StartState(Ts_base_object=scene.Ts_base_object),
             scene_hash=None,
             config=QUICK,

@@ -8,6 +8,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import PathNotFoundError
+from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import describe_undrawn
@@ -28,7 +29,7 @@ def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() ->
         "objects_remark": "cube not found: hidden",
         "robot": {"links": {}, "remark": "no joints"},
     }
-    assert describe_undrawn(record, ["cube_into_box"]) == [
+    assert describe_undrawn(record, [load_task("cube_into_box")]) == [
         "cube: not in the scene, not in pictures (cube not found: hidden)",
         "robot: not in the scene, not in pictures (no joints)",
     ]
@@ -36,4 +37,4 @@ def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() ->
 
 def test_a_whole_scene_lacks_nothing() -> None:
     whole = {"objects": {"box": {}, "cube": {}}, "robot": {"links": {"tool0": {}}}}
-    assert describe_undrawn(whole, ["cube_into_box"]) == []
+    assert describe_undrawn(whole, [load_task("cube_into_box")]) == []

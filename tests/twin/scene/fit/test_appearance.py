@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import textured_room
 from scipy.linalg import lstsq
+from seen_colors import view_directions
 
 from twin.scene.fit.appearance import (
     RIDGE_COLOR,
@@ -20,7 +21,6 @@ from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
     harmonic_basis,
-    view_directions,
     with_harmonics,
 )
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser

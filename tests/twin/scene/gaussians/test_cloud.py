@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import sph_harm_y
+from seen_colors import effective_colors
 
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
@@ -12,7 +13,6 @@ from twin.scene.gaussians import (
     arrays,
     as_float32,
     concatenate,
-    effective_colors,
     harmonic_basis,
     moved_cloud,
     read_ply,

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from seen_colors import effective_colors
 
 from bridge.geometry import se3
-from twin.scene.gaussians import GaussianCloud, effective_colors, moved_cloud
+from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.skinning import SkinError, bind, node_rotations, pose_cloud
 
 

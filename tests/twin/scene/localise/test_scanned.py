@@ -136,7 +136,8 @@ def test_a_task_file_may_leave_a_shape_to_the_scan(tmp_path: Path) -> None:
     path = tmp_path / "task.toml"
     text = (
         'schema_version = 1\nname = "t"\ninstruction = "i"\nmanipulated = ["mug"]\n'
-        "containers = []\nstages = []\nsuccess = []\n[start]\n"
+        'stages = [{id = "lift", text = "t"}]\nsuccess = [{kind = "allowed_contacts"}]\n'
+        "[start.mug]\nx_m = [0, 1]\ny_m = [0, 1]\nyaw_rad = [0, 1]\n"
         '[objects.mug]\nshape = "SHAPE"\nsize_m = [0.1, 0.08, 0.09]\ncolor_srgb = [1, 2, 200]\n'
     )
     path.write_text(text.replace("SHAPE", SCANNED))
@@ -144,5 +145,5 @@ def test_a_task_file_may_leave_a_shape_to_the_scan(tmp_path: Path) -> None:
     assert mug.rest_height_m == pytest.approx(0.045)
     assert len(mug.panels()) == 1
     path.write_text(text.replace("SHAPE", "sphere"))
-    with pytest.raises(UsageError, match="known: box, open_box, mesh, scanned"):
+    with pytest.raises(UsageError, match="Known: box, mesh, open_box, scanned"):
         load_task(str(path))

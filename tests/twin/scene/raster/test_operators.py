@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from seen_colors import effective_colors
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32, effective_colors
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
 
 CAMERA = Camera(width=50, height=35, fx=60.0, fy=60.0, cx=25.0, cy=17.5)

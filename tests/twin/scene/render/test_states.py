@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_room
+from seen_colors import effective_colors
 from small_scene import CONFIG, QUIET
 
 from bridge.episode.reader import Episode
@@ -20,7 +21,6 @@ from twin.scene import render as compose_module
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
-    effective_colors,
     moved_cloud,
     read_ply,
     write_ply,

@@ -12,7 +12,6 @@ from twin.scene.semantics.describe import scene_from_masks
 from twin.scene.semantics.lift import (
     Viewpoint,
     lift_features,
-    mask_iou,
     observe,
     render_labels,
     visible_weight,
@@ -125,13 +124,6 @@ def test_labels_of_one_gaussian_each_win_where_it_is_brightest(rasteriser: Raste
     expected = np.where(A.max(axis=1) > empty, A.argmax(axis=1) + 1, 0)
     np.testing.assert_array_equal(ids[clear], expected[clear])
     assert len(set(ids.tolist())) > 4
-
-
-def test_iou_of_nothing_with_nothing_is_undefined() -> None:
-    nothing, some = np.zeros((2, 2), dtype=bool), np.ones((2, 2), dtype=bool)
-    assert mask_iou(nothing, nothing) is None
-    assert mask_iou(some, nothing) == 0.0
-    assert mask_iou(some, some) == 1.0
 
 
 def test_lifting_perfect_masks_returns_them(tabletop: World, rasteriser: Rasteriser) -> None:

@@ -1,38 +1,19 @@
-"""Coverage by counting every outcome out: no random numbers, so no noise in the least coverage.
-
-The stored map holds groups of equal size. The smaller group's entry is no bound for others (with 10
-and 16 trials Newcombe's interval covers as little as 88.3 %, with 10 and 10 at least 90.9 %), so
-groups of different size are counted out when they are asked for.
-"""
+"""Coverage by counting every outcome out: no random numbers, so no noise in the least coverage."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.special import gammaln, xlog1py, xlogy
+from scipy.special import gammaln, xlogy
 from scipy.stats import binom
 
 from evaluator.result import Interval
-from evaluator.statistics.intervals import median_rank, wilson
+from evaluator.statistics.coverage import PAIR_RATES, ROOM, Coverage
+from evaluator.statistics.intervals import median_rank
 
 RATES = np.round(np.arange(0.05, 0.9501, 0.01), 2)
 """True rates of one group: 0.05, 0.06 .. 0.95."""
-PAIR_RATES = np.round(np.arange(0.05, 0.9501, 0.05), 2)
-"""True rates of two groups, and of the two ways in which a pair can differ."""
-ROOM = 1e-12
-"""An end that is the truth but for rounding covers it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Coverage:
-    """How often an interval held the truth, over the true rates looked at."""
-
-    n: int
-    worst: float
-    worst_at: str
-    mean: float
 
 
 def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
@@ -42,8 +23,6 @@ def of_rate(interval: Callable[[int, int], Interval], n: int) -> Coverage:
         interval: Gives the interval of k successes in n trials.
         n: Trials.
     """
-    from scipy.stats import binom  # noqa: PLC0415  # half a second, and only the map is made of it
-
     ends = np.array([(i.low, i.high) for i in (interval(k, n) for k in range(n + 1))])
     held = (ends[:, :1] <= RATES + ROOM) & (ends[:, 1:] >= RATES - ROOM)
     chances = binom.pmf(np.arange(n + 1)[:, None], n, RATES)
@@ -59,8 +38,6 @@ def of_difference(interval: Callable[[int, int, int, int], Interval], n: int) ->
             second.
         n: Trials in each group.
     """
-    from scipy.stats import binom  # noqa: PLC0415  # as above
-
     counts = range(n + 1)
     made = [[interval(first, n, second, n) for second in counts] for first in counts]
     low = np.array([[item.low for item in row] for row in made])
@@ -109,52 +86,6 @@ def _summary(n: int, covered: Float64[np.ndarray, " rates"], names: Sequence[str
     return Coverage(
         n=n, worst=float(covered[worst]), worst_at=names[worst], mean=float(covered.mean())
     )
-
-
-MOST = 200
-"""A larger group is taken as one of this size: its own rate is as good as known then."""
-
-
-@lru_cache(maxsize=512)
-def newcombe_coverage(n_first: int, n_second: int) -> Coverage:
-    """Count out how often the interval of second - first holds it, over rates 0.05, 0.10 .. 0.95.
-
-    Args:
-        n_first: Trials of one group, at least 1.
-        n_second: Trials of the other.
-    """
-    sizes = min(n_first, MOST), min(n_second, MOST)
-    (p_first, low_first, high_first), (p_second, low_second, high_second) = map(_ends, sizes)
-    difference = p_second - p_first[:, None]
-    low = difference - np.hypot(p_second - low_second, (high_first - p_first)[:, None])
-    high = difference + np.hypot(high_second - p_second, (p_first - low_first)[:, None])
-    chances_first, chances_second = map(_chances, sizes)
-    worst, worst_at, total = 2.0, "", 0.0
-    for rate_first, chance_first in zip(PAIR_RATES, chances_first, strict=True):
-        for rate_second, chance_second in zip(PAIR_RATES, chances_second, strict=True):
-            truth = rate_second - rate_first
-            covered = float(
-                chance_first @ ((low <= truth + ROOM) & (high >= truth - ROOM)) @ chance_second
-            )
-            total += covered
-            if covered < worst:
-                worst, worst_at = covered, f"p = {rate_first:.2f} and {rate_second:.2f}"
-    mean = total / len(PAIR_RATES) ** 2
-    return Coverage(n=min(n_first, n_second), worst=worst, worst_at=worst_at, mean=mean)
-
-
-def _ends(n: int) -> Float64[np.ndarray, "3 counts"]:
-    """Rate and Wilson's ends of every count."""
-    found = [
-        (k / n, interval.low, interval.high) for k in range(n + 1) for interval in [wilson(k, n)]
-    ]
-    return np.array(found).T
-
-
-def _chances(n: int) -> Float64[np.ndarray, "rates counts"]:
-    k, rates = np.arange(n + 1), PAIR_RATES[:, None]
-    ways = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
-    return np.asarray(np.exp(ways + xlogy(k, rates) + xlog1py(n - k, -rates)))
 
 
 Sample = Float64[np.ndarray, "draws lengths"]

@@ -12,7 +12,7 @@ from scipy.stats import rankdata
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.bootstrap import METHODS, GroupSample, refuse_no_width, remeasure_counts
-from evaluator.statistics.coverage.exact import Coverage
+from evaluator.statistics.coverage import Coverage
 from evaluator.statistics.gate import Confusion
 from evaluator.statistics.weighted import STATISTICS, Values, values_of
 

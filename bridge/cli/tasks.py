@@ -1,0 +1,85 @@
+"""Commands about task files: check them, and write one to start from."""
+
+import re
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from bridge.terminal import Output
+
+OUTPUT = Output()
+
+
+def check(*files: str, output: Output = OUTPUT) -> int:
+    """Say what is wrong with task files, or in words what they ask for.
+
+    Example: robot-gst task check my_task.toml
+    Exit code 0 when all are right, else 2.
+
+    Args:
+        files: Task files, or names of those that ship with robot-gst.
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.task.check import TaskFileError
+    from bridge.task.find import chosen_task_file
+    from bridge.task.summary import describe_task
+
+    if not files:
+        raise UsageError("task check needs one or more files: robot-gst task check my_task.toml.")
+    found: list[dict[str, Any]] = []
+    texts = []
+    for name in files:
+        try:
+            file = chosen_task_file(name)
+            task = file.task()
+        except TaskFileError as error:
+            found.append({"file": name, "ok": False, "problems": list(error.problems)})
+            texts.append(str(error))
+        except UsageError as error:
+            found.append({"file": name, "ok": False, "problems": [str(error)]})
+            texts.append(str(error))
+        else:
+            found.append({"file": name, "ok": True, "sha256": file.sha256, "task": asdict(task)})
+            texts.append(f"{file.origin}: ok\n{describe_task(task)}")
+    output.result({"files": found}, "\n\n".join(texts))
+    return 0 if all(item["ok"] for item in found) else 2
+
+
+def new(name: str, /, *, like: str = "", folder: Path = Path(), output: Output = OUTPUT) -> int:
+    """Write a complete task file with comments, to start from; never overwrites one.
+
+    Example: robot-gst task new cube_onto_block
+
+    Args:
+        name: Of the task and of its file, NAME.toml: letters, digits, '_' and '-'.
+        like: Start from this task, a name or a file, rather than from a cube and a block.
+        folder: Where the file goes; here when not given.
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from bridge.task.find import chosen_task_file
+    from bridge.task.task_file import TaskFile
+
+    text = resources.files("bridge.task").joinpath("template.toml").read_text()
+    if like:
+        file = chosen_task_file(like)
+        text, before = file.data.decode(), file.task().name
+        text = re.sub(
+            rf'^name *= *(["\']){re.escape(before)}\1', f'name = "{name}"', text, flags=re.MULTILINE
+        )
+    else:
+        text = text.replace("NAME", name)
+    path = folder / f"{name}.toml"
+    task = TaskFile(text.encode(), str(path)).task()
+    try:
+        with path.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except FileExistsError as error:
+        raise UsageError(f"{path} exists already. Choose another name, or edit it.") from error
+    output.result(
+        {"file": str(path), "name": task.name},
+        f"wrote {path}. Edit it, then: robot-gst task check {path}",
+    )
+    return 0

@@ -1,0 +1,259 @@
+"""Everything that is wrong with a task file: keys and values, then what refers to nothing.
+
+The keys, types and ranges are those of ``schemas/task.schema.json``. What a schema cannot say is
+asked here: whether objects, containers and bodies that are named exist, whether ranges run upwards,
+and whether every number is one.
+"""
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from bridge.errors import UsageError
+from bridge.task.record import find_problems
+
+if TYPE_CHECKING:
+    from jsonschema.exceptions import ValidationError
+
+SCHEMA_VERSION = 1
+GRIPPER, TABLE = "gripper", "table"
+BODIES = (GRIPPER, TABLE)
+"""What may touch an object, besides other objects."""
+CAVITIES = ("open_box", "basket")
+VERBS = ("grasp", "carry", "release")
+MOST_LISTED = 40
+"""Problems in one message."""
+REFERENCES = ("object", "container", "support")
+"""Keys of a success predicate that name an object."""
+
+
+class TaskFileError(UsageError):
+    """A task file that cannot be used; lists everything that is wrong with it."""
+
+    def __init__(self, *, origin: str, problems: Sequence[str]) -> None:
+        """Remember where the file lies, and each problem with its place."""
+        self.origin = origin
+        self.problems = tuple(problems)
+        count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+        left_out = len(problems) - MOST_LISTED
+        more = [f"and {left_out} more"] if left_out > 0 else []
+        listed = "\n".join(f"  {text}" for text in [*problems[:MOST_LISTED], *more])
+        super().__init__(f"{origin} is not a task file, {count}:\n{listed}\nSee docs/tasks.md.")
+
+
+def task_problems(table: Mapping[str, Any]) -> list[str]:
+    """List what is wrong with the content of a task file; nothing for a good one.
+
+    Args:
+        table: The parsed TOML.
+
+    Returns:
+        One line each: the place, what was found, what is allowed, and the nearest name.
+    """
+    version = table.get("schema_version")
+    if type(version) is int and version > SCHEMA_VERSION:
+        return [
+            f"schema_version: {version} is newer than the {SCHEMA_VERSION} this version reads. "
+            "Upgrade robot-gst."
+        ]
+    found = [_sentence(error) for error in find_problems(table, name="task")]
+    found += [
+        f"{_place(path)}: {value} is not a number"
+        for path, value in _numbers(table)
+        if not math.isfinite(value)
+    ]
+    return list(dict.fromkeys(found)) or list(_references(table))
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Say which known name was probably meant, or nothing."""
+    found = difflib.get_close_matches(name, list(known), n=1)
+    return f" Did you mean {found[0]!r}?" if found else ""
+
+
+def _place(path: Iterable[str | int]) -> str:
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            text += f".{part}" if part.isprintable() and len(part) <= 80 else f".{part!r:.80}"
+    return text.removeprefix(".") or "top level"
+
+
+def _names(known: Iterable[str]) -> str:
+    return ", ".join(sorted(known)) or "none"
+
+
+def _numbers(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, float]]:
+    if isinstance(value, float):
+        yield path, value
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _numbers(inner, (*path, key))
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _numbers(inner, (*path, index))
+
+
+def _sentence(error: "ValidationError") -> str:
+    """One finding of jsonschema, in the words of a task file."""
+    place, value, wanted = _place(error.absolute_path), error.instance, error.validator_value
+    match error.validator:
+        case "additionalProperties":
+            known = error.schema["properties"]
+            wrong = [key for key in value if key not in known]
+            said = "; ".join(f"unknown key {key!r}.{nearest(key, known)}" for key in wrong)
+            return f"{place}: {said} Allowed: {_names(known)}."
+        case "required":
+            missing = error.message.partition(" is a required")[0].strip("'")
+            return f"{place}: {missing} is missing"
+        case "enum":
+            return f"{place}: {value!r} is unknown. Known: {_names(wanted)}.{_near(value, wanted)}"
+        case "minItems" | "maxItems":
+            least, most = error.schema.get("minItems", 0), error.schema.get("maxItems")
+            many = f"{least}" if least == most else f"at least {least}"
+            return f"{place}: has {len(value)} values; it must have {many}"
+        case "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum":
+            word = {
+                "minimum": "at least",
+                "maximum": "at most",
+                "exclusiveMinimum": "above",
+                "exclusiveMaximum": "below",
+            }[error.validator]
+            return f"{place}: {value} makes no sense; it must be {word} {wanted:g}"
+        case "type":
+            return f"{place}: {value!r:.60} should be a TOML {_TOML[wanted]}"
+        case "pattern":
+            return f"{place}: {value!r:.60} may hold letters, digits, '_' and '-' only, at most 80"
+        case "minLength":
+            return f"{place}: is empty"
+    return f"{place}: {error.message:.200}"
+
+
+_TOML = {
+    "object": "table",
+    "array": "list",
+    "string": "text in quotes",
+    "number": "number",
+    "integer": "whole number",
+    "boolean": "true or false",
+}
+
+
+def _near(value: Any, known: Iterable[str]) -> str:
+    return nearest(value, known) if isinstance(value, str) else ""
+
+
+def _references(table: Mapping[str, Any]) -> Iterator[str]:
+    """What a file of the right form names and does not have."""
+    yield from _object_lists(table)
+    yield from _starts(table)
+    yield from _stages(table)
+    yield from _predicates(table)
+
+
+def _is_no_object(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
+    objects = table["objects"]
+    if name not in objects:
+        near = nearest(name, objects)
+        yield f"{place}: there is no object {name!r}. Objects: {_names(objects)}.{near}"
+
+
+def _has_no_cavity(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
+    model = table["objects"].get(name)
+    if model is not None and model["shape"] not in CAVITIES and model.get("mesh") not in CAVITIES:
+        yield f"{place}: {name} is no container; only an open_box or a basket has an inside"
+
+
+def _object_lists(table: Mapping[str, Any]) -> Iterator[str]:
+    objects = table["objects"]
+    for name in objects:
+        if name in BODIES:
+            yield f"objects.{name}: an object cannot be called so; it is the robot's or the cell's"
+        if not all(part.isalnum() for part in name.replace("-", "_").split("_")) or not name:
+            yield f"objects.{name}: may hold letters, digits, '_' and '-' only"
+    for key in ("manipulated", "containers"):
+        names = table.get(key, [])
+        for index, name in enumerate(names):
+            yield from _is_no_object(f"{key}[{index}]", name, table)
+            if name in names[:index]:
+                yield f"{key}[{index}]: {name} is listed twice"
+            if key == "containers":
+                yield from _has_no_cavity(f"{key}[{index}]", name, table)
+            elif objects.get(name, {}).get("fixed"):
+                yield f"{key}[{index}]: {name} is fixed, and nothing can move it"
+
+
+def _starts(table: Mapping[str, Any]) -> Iterator[str]:
+    for name, ranges in table["start"].items():
+        yield from _is_no_object(f"start.{name}", name, table)
+        for key, (low, high) in ranges.items():
+            if low > high:
+                yield f"start.{name}.{key}: runs from {low:g} down to {high:g}; turn it round"
+    for name in table["objects"]:
+        if name not in table["start"]:
+            yield f"start: says nothing of {name}. Add a table start.{name}: x_m, y_m, yaw_rad."
+
+
+def _stages(table: Mapping[str, Any]) -> Iterator[str]:
+    seen: set[str] = set()
+    bodies = [*table["objects"], *BODIES]
+    for index, stage in enumerate(table["stages"]):
+        place = f"stages[{index}]"
+        if stage["id"] in seen:
+            yield f"{place}.id: there is a stage {stage['id']!r} already"
+        seen.add(stage["id"])
+        for verb in VERBS:
+            if verb not in stage:
+                continue
+            name = stage[verb]
+            yield from _is_no_object(f"{place}.{verb}", name, table)
+            if name in table["objects"] and name not in table["manipulated"]:
+                yield f"{place}.{verb}: {name} is not in manipulated"
+        for number, pair in enumerate(stage.get("allowed_contacts", [])):
+            where = f"{place}.allowed_contacts[{number}]"
+            for body in pair:
+                if body not in bodies:
+                    near = nearest(body, bodies)
+                    yield f"{where}: there is no body {body!r}. Bodies: {_names(bodies)}.{near}"
+            if pair[0] == pair[1]:
+                yield f"{where}: {pair[0]} cannot touch itself"
+
+
+def _predicates(table: Mapping[str, Any]) -> Iterator[str]:
+    for index, spec in enumerate(table["success"]):
+        place = f"success[{index}]"
+        for key in REFERENCES:
+            if key in spec:
+                yield from _is_no_object(f"{place}.{key}", spec[key], table)
+        if "container" in spec:
+            yield from _has_no_cavity(f"{place}.container", spec["container"], table)
+        for key in ("container", "support"):
+            if spec.get(key) == spec.get("object", ""):
+                yield f"{place}.{key}: {spec[key]} cannot be in or on itself"
+        if "support" in spec:
+            yield from _has_no_top(f"{place}.support", spec["support"], table)
+        if spec["kind"] == "moved":
+            yield from _moved(place, spec)
+
+
+def _has_no_top(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
+    model = table["objects"].get(name, {})
+    if CAVITIES[0] in model.values() or CAVITIES[1] in model.values():
+        yield f"{place}: {name} is open above; what is put there is inside, not on it"
+
+
+def _moved(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
+    limits = ("at_least_m", "at_most_m", "target_m")
+    if not any(key in spec for key in limits):
+        yield f"{place}: says no limit. Give one or more of {', '.join(limits)}."
+    if ("target_m" in spec) != ("tolerance_m" in spec):
+        yield f"{place}: target_m and tolerance_m belong together"
+    if "direction" in spec and not any(key in spec for key in limits[:2]):
+        yield f"{place}.direction: belongs to at_least_m or at_most_m"
+    if "direction" in spec and not any(spec["direction"]):
+        yield f"{place}.direction: has no length"
+    if spec.get("at_least_m", 0) > spec.get("at_most_m", math.inf):
+        yield f"{place}: at_least_m {spec['at_least_m']} is above at_most_m {spec['at_most_m']}"

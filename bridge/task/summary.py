@@ -1,0 +1,116 @@
+"""Say in words what a task asks for: objects, stages, what counts as success."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from bridge.task.check import VERBS
+from bridge.task.predicate import ON_TOLERANCE_M
+from bridge.task.task_file import ObjectModel, StartRange, Task
+
+
+def describe_task(task: Task) -> str:
+    """Return some lines for a person who wants to know whether the file says what they mean."""
+    stages = [
+        f"  {number}. {stage['id']}: {_handled(stage)}; may touch: {_pairs(stage)}"
+        for number, stage in enumerate(task.stages, start=1)
+    ]
+    return "\n".join(
+        [
+            f"{task.name}: {task.instruction}",
+            f"cell: {task.cell}; moved by the robot: {', '.join(task.manipulated)}",
+            "objects",
+            *(f"  {_object(model, task.start[key])}" for key, model in task.objects.items()),
+            "stages",
+            *stages,
+            "success, when at the end",
+            *(f"  {describe_predicate(spec)}" for spec in task.success),
+        ]
+    )
+
+
+def describe_predicate(spec: Mapping[str, Any]) -> str:
+    """Say in words when one success predicate holds."""
+    return _WORDS[spec["kind"]](spec)
+
+
+def _object(model: ObjectModel, start: StartRange) -> str:
+    size = " x ".join(_mm(length) for length in model.size_m)
+    what = model.mesh or model.shape.replace("_", " ")
+    made = "soft" if model.soft is not None else "rigid"
+    weight = "fixed" if model.fixed else f"{made}, {model.mass_kg * 1e3:g} g"
+    low, high = (math.degrees(limit) for limit in start.yaw_rad)
+    return (
+        f"{model.id}: {what}, {size} mm, {weight}; starts at x {_range(start.x_m)}, "
+        f"y {_range(start.y_m)} m, turned by {low:.0f} to {high:.0f} degrees"
+    )
+
+
+def _range(limits: tuple[float, float]) -> str:
+    return f"{limits[0]:g} to {limits[1]:g}"
+
+
+def _mm(length_m: float) -> str:
+    return f"{length_m * 1e3:.4g}"
+
+
+def _handled(stage: Mapping[str, Any]) -> str:
+    done = [f"{verb}s {stage[verb]}" for verb in VERBS if verb in stage]
+    return " and ".join(done).replace("carrys", "carries") or "handles nothing"
+
+
+def _pairs(stage: Mapping[str, Any]) -> str:
+    pairs = [" and ".join(pair) for pair in stage.get("allowed_contacts", [])]
+    return ", ".join(pairs) or "nothing"
+
+
+def _inside(spec: Mapping[str, Any]) -> str:
+    margin = spec.get("margin_m", 0.0)
+    near = f", {_mm(margin)} mm away from its faces" if margin else ""
+    return f"the middle of {spec['object']} is inside {spec['container']}{near}"
+
+
+def _on(spec: Mapping[str, Any]) -> str:
+    tolerance, margin = spec.get("tolerance_m", ON_TOLERANCE_M), spec.get("margin_m", 0.0)
+    return (
+        f"{spec['object']} rests on {spec['support']}: its underside within {_mm(tolerance)} mm of "
+        f"the top, its middle at least {_mm(margin)} mm within the edges"
+    )
+
+
+def _moved(spec: Mapping[str, Any]) -> str:
+    said = []
+    if "at_least_m" in spec:
+        said.append(f"by at least {_mm(spec['at_least_m'])} mm")
+    if "at_most_m" in spec:
+        said.append(f"by at most {_mm(spec['at_most_m'])} mm")
+    if "direction" in spec:
+        said.append(f"along ({', '.join(f'{part:g}' for part in spec['direction'])})")
+    if "target_m" in spec:
+        point = ", ".join(f"{part:g}" for part in spec["target_m"])
+        said.append(f"to within {_mm(spec['tolerance_m'])} mm of ({point}) m")
+    return f"{spec['object']} has moved from its start {' and '.join(said)}"
+
+
+def _allowed(spec: Mapping[str, Any]) -> str:
+    whose = f"{spec['object']} touches" if "object" in spec else "anything touches"
+    deep = spec.get("tolerance_m", 0.0)
+    than = f" deeper than {_mm(deep)} mm" if deep else ""
+    return f"at no time {whose} what its stage does not allow{than}"
+
+
+_WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "inside": _inside,
+    "on": _on,
+    "moved": _moved,
+    "settled": lambda spec: (
+        f"{spec['object']} lies still: below {_mm(spec['max_speed_m_s'])} mm/s in the last "
+        f"{spec['for_s']:g} s"
+    ),
+    "no_finger_contact": lambda spec: f"no finger touches {spec['object']}",
+    "shape": lambda spec: (
+        f"{spec['object']} has its shape: no extent differs by more than "
+        f"{spec['tolerance_fraction']:.0%}"
+    ),
+    "allowed_contacts": _allowed,
+}

@@ -1,0 +1,159 @@
+"""The scripted planner puts an object where its predicate says: onto another, too."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bridge.task
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
+from bridge.sources.standin.cell_file import CellFile, draw_hidden
+from bridge.sources.standin.kinematics import arm_kinematics, tool_down
+from bridge.sources.standin.operator import execute_plan, label_trial
+from bridge.sources.standin.planner import (
+    NO_ERROR,
+    ON_CLEARANCE_M,
+    GraspError,
+    plan_pick_and_place,
+)
+from bridge.sources.standin.session import run_session
+from bridge.sources.standin.settings import SessionConfig
+from bridge.sources.standin.streams import Streams
+from bridge.task.plan import Plan
+from bridge.task.predicate import Rollout, evaluate_success
+from bridge.task.task_file import Task, TaskFile
+from bridge.terminal import Output
+
+FILE = TaskFile.read(Path(str(bridge.task.__file__)).parent / "template.toml")
+
+
+@pytest.fixture(scope="module")
+def onto() -> Task:
+    return FILE.task()
+
+
+def planned(
+    task: Task, starts: dict[str, np.ndarray], error: GraspError = NO_ERROR, **more: Any
+) -> Plan:
+    arm = arm_kinematics()
+    home_rad = arm.joints_for(tool_down(np.array([0.42, 0.0, 0.42]), 0.0), np.array(HOME_SEED_RAD))
+    values = {"kinematics": arm, "joints_start_rad": home_rad, **more}
+    return plan_pick_and_place(
+        task,
+        starts,
+        error,
+        max_joint_speed_rad_s=1.6,
+        plan_id="p",
+        condition="without_replanning",
+        start_id="s",
+        **values,
+    )
+
+
+def let_go_m(plan: Plan, stage_id: str) -> np.ndarray:
+    """Where the tool is when the hand opens in a stage."""
+    (stage,) = (stage for stage in plan.stages if stage.id == stage_id)
+    inside = [w for w in plan.tau if stage.t_start_ns <= w.t_ns <= stage.t_end_ns]
+    return np.array(next(w for w in inside if w.g == 0).p_m)
+
+
+def test_it_lets_go_just_above_the_top_and_predicts_that_the_predicate_holds(onto: Task) -> None:
+    starts = onto.draw_start(np.random.default_rng(9_000_000))
+    plan = planned(onto, starts)
+    top_m = starts["block"][2, 3] + onto.objects["block"].size_m[2] / 2
+    grip_above_bottom = onto.objects["cube"].grasp_m[2] + onto.objects["cube"].size_m[2] / 2
+    low = let_go_m(plan, "place")
+    assert low[2] == pytest.approx(top_m + grip_above_bottom + ON_CLEARANCE_M, abs=1e-9)
+    assert low[:2] == pytest.approx(starts["block"][:2, 3], abs=1e-9)
+    predicted = se3.pose_from_record(plan.stages[-1].predicted_objects["cube"])
+    rollout = Rollout(
+        stamps_ns=np.array([0]),
+        Ts_base_object={"cube": predicted[None], "block": starts["block"][None]},
+        finger_contact={},
+    )
+    assert evaluate_success(onto, rollout)[0].value is True
+    assert plan.stages[-1].terminal[0]["kind"] == "on"
+
+
+def test_a_stack_is_planned_from_where_its_lower_part_then_lies(onto: Task) -> None:
+    small = {"id": "small", "size_m": (0.03, 0.03, 0.03), "symmetry": "none"}
+    stages = [
+        {**stage, "id": f"{stage['id']}_{name}", verb: name}
+        for name in ("cube", "small")
+        for stage, verb in zip(onto.stages, ("grasp", "release"), strict=True)
+    ]
+    stack = replace(
+        onto,
+        objects=onto.objects | {"small": replace(onto.objects["cube"], **small)},
+        manipulated=("cube", "small"),
+        stages=tuple(stages),
+        success=(*onto.success, {"kind": "on", "object": "small", "support": "cube"}),
+    )
+    starts = onto.draw_start(np.random.default_rng(1))
+    starts["small"] = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.45, 0.0, 0.015]))
+    plan = planned(stack, starts)
+    places = {
+        key: se3.pose_from_record(pose)
+        for stage in plan.stages
+        for key, pose in stage.predicted_objects.items()
+    }
+    assert places["cube"][2, 3] == pytest.approx(0.05 + 0.02, abs=1e-9)
+    assert places["small"][:3, 3] == pytest.approx(places["cube"][:3, 3] + [0, 0, 0.035], abs=1e-9)
+
+
+def test_what_nobody_says_where_to_put_is_not_planned(onto: Task) -> None:
+    nowhere = replace(onto, success=onto.success[1:])
+    with pytest.raises(UsageError, match="what cube is to be inside or on"):
+        planned(nowhere, onto.draw_start(np.random.default_rng(1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("release_m", "result"), [((0.0, 0.0), "success"), ((0.0, 0.11), "failure")]
+)
+@pytest.mark.usefixtures("unchecked")
+def test_the_cell_and_its_label_agree_with_where_it_was_put(
+    make_session: Callable[..., Any],
+    cell_file: CellFile,
+    onto: Task,
+    release_m: tuple[float, float],
+    result: str,
+) -> None:
+    cell = StandinCell(
+        cell_file,
+        onto,
+        draw_hidden(cell_file, 9_000_000),
+        Streams(make_session(), "standin"),
+        config=CellConfig(rate_hz=0.0, scale=0.25),
+        seed=9_000_000,
+        start_ns=1_700_000_000_000_000_000,
+    )
+    starts = onto.draw_start(np.random.default_rng(9_000_000))
+    cell.reset(starts)
+    error = replace(NO_ERROR, release_m=release_m)
+    plan = planned(onto, starts, error, kinematics=cell.kinematics, joints_start_rad=cell.home_rad)
+    execute_plan(cell, plan)
+    outcome = label_trial(onto, cell.truth, executed=True)
+    assert outcome.result == result, outcome.detail
+    assert [stage["result"] for stage in outcome.stages] == ["success", result]
+
+
+def test_every_start_sends_the_task_file_to_the_recorder(
+    make_session: Callable[..., Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(FILE.data.replace(b'name = "NAME"', b'name = "mine"'))
+    session = make_session()
+    config = SessionConfig(
+        seed=9000, task=str(path), trials=1, rate_hz=0.0, image_scale=0.25, scan=False,
+        conditions=("without_replanning",),
+    )  # fmt: skip
+    summary = run_session(session, config, Output(quiet=True), start_ns=1_700_000_000_000_000_000)
+    (request,) = [request for verb, request in session.control if verb == "start"]
+    assert request["task_file"] == path.read_text()
+    assert request["info"]["task"] == summary["task"] == "mine"

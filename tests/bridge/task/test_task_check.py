@@ -1,0 +1,138 @@
+"""Task files are checked strictly: what is wrong is found, with its place and the nearest name."""
+
+import contextlib
+import json
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import bridge.task
+from bridge.data_files import datasets_folder
+from bridge.task.check import TaskFileError
+from bridge.task.meshes.toys import DESIGNS
+from bridge.task.predicate import _RULES
+from bridge.task.task_file import MAX_BYTES, Task, TaskFile
+
+SHIPPED = sorted((datasets_folder() / "tasks").glob("*.toml"))
+CUBE = (datasets_folder() / "tasks" / "cube_into_box.toml").read_text()
+SCHEMA = json.loads(resources.files("bridge.task").joinpath("schemas/task.schema.json").read_text())
+
+
+def problems(text: str) -> tuple[str, ...]:
+    with pytest.raises(TaskFileError, match=r"^my_task\.toml is not a task file") as caught:
+        TaskFile(text.encode(), "my_task.toml").task()
+    assert caught.value.exit_code == 2
+    return caught.value.problems
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_what_is_shipped_is_right_and_named_like_its_file(path: Path) -> None:
+    assert TaskFile.read(path).task().name == path.stem
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "said"),
+    [
+        ('container = "box"', 'contianer = "box"', "success[0]", "Did you mean 'container'?"),
+        ('container = "box"', 'container = "bok"', "success[0].container", "Did you mean 'box'?"),
+        ('container = "box"', 'container = "cube"', "success[0].container", "no container"),
+        ('kind = "settled"', 'kind = "setled"', "success[1].kind", "Did you mean 'settled'?"),
+        ("max_speed_m_s", "max_speed", "success[1]", "Did you mean 'max_speed_m_s'?"),
+        ("for_s = 0.3", "for_s = -0.3", "success[1].for_s", "must be above 0"),
+        ("for_s = 0.3", "for_s = nan", "success[1].for_s", "nan is not a number"),
+        ("[0.04, 0.04, 0.04]", "[0.04, -0.04, 0.04]", "objects.cube.size_m[1]", "above 0"),
+        ("[0.04, 0.04, 0.04]", "[0.04, inf, 0.04]", "objects.cube.size_m[1]", "at most 10"),
+        ("[0.04, 0.04, 0.04]", "[0.04, 0.04]", "objects.cube.size_m", "it must have 3"),
+        ("[0.04, 0.04, 0.04]", '["4 cm", 1, 1]', "objects.cube.size_m[0]", "a TOML number"),
+        ("mass_kg = 0.05", "mass_kg = true", "objects.cube.mass_kg", "a TOML number"),
+        ("[0.40, 0.58]", "[0.58, 0.40]", "start.cube.x_m", "from 0.58 down to 0.4"),
+        ("[start.cube]", "[start.cub]", "start.cub", "Did you mean 'cube'?"),
+        ("[start.box]", "[start.bin]", "start", "says nothing of box"),
+        ('grasp = "cube"', 'grasp = "ball"', "stages[0].grasp", "no object 'ball'"),
+        ('grasp = "cube"', 'grasp = "box"', "stages[0].grasp", "not in manipulated"),
+        ('["gripper", "cube"]]\n\n', '["griper", "cube"]]\n\n', "stages[0].allowed_contacts[1]",
+         "Did you mean 'gripper'?"),
+        ('id = "place"', 'id = "grasp"', "stages[1].id", "already"),
+        ('manipulated = ["cube"]', 'manipulated = ["box"]', "manipulated[0]", "fixed"),
+        ('containers = ["box"]', 'containers = ["cube"]', "containers[0]", "no container"),
+        ('shape = "open_box"', 'shape = "openbox"', "objects.box.shape", "'open_box'?"),
+        ("wall_m = 0.006", "wall = 0.006", "objects.box", "Did you mean 'wall_m'?"),
+        ("[objects.cube]", "[objects.gripper]", "objects.gripper", "cannot be called so"),
+        ('name = "cube_into_box"', 'name = "../box"', "name", "letters, digits"),
+        ("schema_version = 1", "schema_version = 2", "schema_version", "newer than the 1"),
+        ('instruction = "', 'grip_force_N = 0\ninstruction = "', "grip_force_N", "above 0"),
+    ],
+)  # fmt: skip
+def test_an_error_says_where_it_is_and_what_was_probably_meant(
+    old: str, new: str, place: str, said: str
+) -> None:
+    assert old in CUBE
+    found = problems(CUBE.replace(old, new))
+    assert any(text.startswith(f"{place}: ") and said in text for text in found), found
+
+
+def test_all_errors_are_listed_and_not_only_the_first() -> None:
+    broken = CUBE.replace("for_s = 0.3", "for_s = 0").replace('container = "box"', "box = 1")
+    broken = broken.replace("x_m = [0.40, 0.58]", "x_m = [0.40, 0.58, 1]")
+    places = {text.partition(":")[0] for text in problems(broken)}
+    assert places == {"success[1].for_s", "success[0]", "start.cube.x_m"}
+
+
+def test_a_file_as_long_as_a_book_is_refused_unread() -> None:
+    assert problems(CUBE + "#" * MAX_BYTES) == ("longer than 64 KiB",)
+
+
+@pytest.mark.parametrize("text", ["", "name = ", "a = [" + "[" * 5000, "\x00", "a.b.c=1\na=2"])
+def test_what_is_not_toml_is_refused(text: str) -> None:
+    assert len(problems(text)) >= 1
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_a_damaged_file_is_a_task_or_is_refused(data: st.DataObject) -> None:
+    lines = CUBE.splitlines()
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(lines) - 1))
+        key = lines[at].partition("=")[0]
+        values = ["1", "-1", "nan", "[]", "[[1]]", '"cube"', "{}", "true", "1979-05-27"]
+        lines[at] = data.draw(st.sampled_from(["", *(f"{key}= {value}" for value in values)]))
+    with contextlib.suppress(TaskFileError):
+        assert isinstance(TaskFile("\n".join(lines).encode(), "x").task(), Task)
+
+
+ON_BLOCK = (Path(str(bridge.task.__file__)).parent / "template.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("new", "place", "said"),
+    [
+        ('kind = "on"\nobject = "cube"\nsupport = "cube"', "success[0].support", "on itself"),
+        ('kind = "on"\nobject = "cube"\nsuport = "block"', "success[0]", "'support'?"),
+        ('kind = "moved"\nobject = "cube"', "success[0]", "says no limit"),
+        ('kind = "moved"\nobject = "cube"\ntarget_m = [1, 1]', "success[0]", "belong together"),
+        ('kind = "moved"\nobject = "cube"\nat_least_m = 2\nat_most_m = 1', "success[0]", "above"),
+        ('kind = "moved"\nobject = "cube"\nat_least_m = 1\ndirection = [0, 0, 0]',
+         "success[0].direction", "no length"),
+    ],
+)  # fmt: skip
+def test_relations_that_cannot_be_are_refused(new: str, place: str, said: str) -> None:
+    old = 'kind = "on"\nobject = "cube"\nsupport = "block"\ntolerance_m = 0.008\nmargin_m = 0.0'
+    assert old in ON_BLOCK
+    found = problems(ON_BLOCK.replace(old, new))
+    assert any(text.startswith(f"{place}: ") and said in text for text in found), found
+
+
+def test_nothing_lies_on_what_is_open_above() -> None:
+    broken = CUBE.replace('kind = "inside"', 'kind = "on"').replace("container = ", "support = ")
+    assert problems(broken)[0].startswith("success[0].support: box is open above")
+
+
+def test_the_schema_knows_every_predicate_and_every_toy_and_no_other() -> None:
+    kinds = SCHEMA["$defs"]["predicate"]["properties"]["kind"]["enum"]
+    assert kinds == sorted(_RULES)
+    for kind in kinds:
+        assert SCHEMA["$defs"][kind]["properties"]["kind"]["const"] == kind
+    assert SCHEMA["$defs"]["toy"]["properties"]["mesh"]["enum"] == sorted(DESIGNS)
