@@ -9,6 +9,8 @@ import contextlib
 import io
 import json
 import signal
+import socket
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -98,6 +100,54 @@ def robot_gst_output(*words: str) -> str:
     with contextlib.redirect_stdout(io.StringIO()) as stream:
         robot_gst.run(list(words))
     return " ".join(stream.getvalue().split())
+
+
+class Cable:
+    """Carries one connection, until it is cut: then nothing moves and nothing closes."""
+
+    def __init__(self, endpoint: str) -> None:
+        """Wait for the connection on an endpoint of its own."""
+        self._target = ("127.0.0.1", int(endpoint.rpartition(":")[2]))
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
+        self.is_cut = threading.Event()
+        self._sockets: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        near, _ = self._listening.accept()
+        far = socket.create_connection(self._target)
+        self._sockets += [near, far]
+        for source, sink in ((near, far), (far, near)):
+            threading.Thread(target=self._carry, args=(source, sink), daemon=True).start()
+
+    def _carry(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                if self.is_cut.is_set():
+                    return
+                sink.sendall(data)
+
+    def close(self) -> None:
+        for each in (self._listening, *self._sockets):
+            each.close()
+
+
+def test_a_cable_that_is_pulled_is_named_as_a_silence(cell: FaultCell) -> None:
+    recorder = cell.record()
+    cable = Cable(cell.endpoint)
+    asker, far, near = cell.publisher(), cell.publisher(cable.endpoint), cell.publisher()
+    assert asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})["ok"]["ok"]
+    far.flow(60.0, "joints")
+    near.flow(60.0, "gripper")
+    wait_until(asker, lambda status: status["seen"].get(JOINTS, 0) > 600, "600 joints")
+    wait_until(asker, lambda status: status["seen"].get(GRIPPER, 0) > 100, "100 grips")
+    cable.is_cut.set()
+    assert silent(wait_until(asker, silent, "a silence")) == {JOINTS}
+    recorder.wait_for(f"{JOINTS} silent for ")
+    assert asker.ask("stop")["ok"]["lost"] == 0
+    assert [data["topic"] for data in notes(cell, "silent")] == [JOINTS]
+    cable.close()
 
 
 def test_a_recorder_that_was_stopped_blames_no_publisher(cell: FaultCell) -> None:
