@@ -13,6 +13,8 @@ from bridge.record.lifecycle import Lifecycle, counts
 from bridge.record.presence import Silence
 from bridge.record.queue import InputQueue
 
+SLOW_LAG_S = 0.5
+"""A status line says so when small messages have waited longer than this for the disk."""
 STALLED_S = 1.0
 """A writer that has not moved for this long is waiting for its disk."""
 
@@ -110,6 +112,8 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
     if status["state"] == "failed":
         return f"failed: {status['error']}"
     stalled = f", the disk has not answered for {s:.0f} s" if (s := status["stalled_s"]) else ""
+    if (lag_s := status["write_lag_s"]) > SLOW_LAG_S:
+        stalled += f", small messages wait {lag_s:.1f} s for the disk"
     stalled += _hearing(status)
     if status["state"] == "idle":
         ring = f", pre-roll {s:.1f} s" if (s := status["preroll_s"]) else ""
@@ -155,6 +159,7 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
+        line += "".join(f"; goes on in {each['path']}" for each in answer["failovers"])
         return "\n  ".join([line, *presence_lines(answer)])
     remark = f"; {text}" if (text := answer.get("task_remark")) else ""
     if answer.get("missing"):
