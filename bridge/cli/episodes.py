@@ -55,6 +55,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         episode: An episode file, recorded or derived.
         output: How to talk.
     """
+    from bridge.episode.contract import PRESENCE_RECORD, presence_lines
     from bridge.episode.reader import Episode
     from bridge.task.find import HASH_DIGITS
 
@@ -71,6 +72,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "parts": [str(path) for path in opened.parts],
         "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
+        "presence": opened.metadata_records.get(PRESENCE_RECORD),
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -97,12 +99,27 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         )
     if opened.missing_parts:
         lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
+    presence = opened.metadata_records.get(PRESENCE_RECORD, {})
+    lines += [f"  {text}" for text in presence_lines(presence)]
     width = max((len(topic) for topic in topics), default=0)
+    seen = presence.get("topics")
+    shown = seen if isinstance(seen, dict) else {}
     lines += [
-        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}" for item in topics.values()
+        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}{_when(shown.get(item.topic))}"
+        for item in topics.values()
     ]
     output.result(data, "\n".join(lines))
     return 0
+
+
+def _when(report: object) -> str:
+    """From when to when a topic was there, its longest silence, and how many were expected."""
+    if not isinstance(report, dict) or not isinstance(report.get("first_s"), int | float):
+        return ""
+    text = f"  {report['first_s']:.1f} to {report['last_s']:.1f} s"
+    if report.get("longest_silence_s"):
+        text += f", silent up to {report['longest_silence_s']:.2f} s"
+    return text + (f", {report['expected']} expected" if report.get("expected") else "")
 
 
 def _outcome(kind: str, outcome: "Outcome | None") -> str:
@@ -118,22 +135,26 @@ def check(
     /,
     *,
     rerun: bool = False,
+    contract: str | None = None,
     wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
 ) -> int:
-    """Verify episodes (CRCs, indexes, counts, decoding) and list dropped messages.
+    """Verify episodes (CRCs, indexes, counts, decoding) list dropped messages, silent topics.
 
-    Exit code 0: clean, 3: messages were dropped, 1: broken. Example: robot-gst check runs/demo
+    Exit code 0: clean, 3: messages were dropped or a contract was
+    broken, 1: broken. Example: robot-gst check runs/demo
     With --wire it listens to a publisher instead and says what of the contract (docs/wire.md) it
     does not keep: robot-gst check --wire "lab/**" --seconds 5
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
         rerun: Let Rerun's own checker read each file too.
+        contract: Hold them to this TOML file or template, not to what they were recorded under.
         wire: What to listen to, and where.
         output: How to talk.
     """
     from bridge.episode.check import check_all
+    from bridge.episode.contract import find_contract
     from bridge.errors import UsageError
 
     if wire.wire is not None:
@@ -158,7 +179,8 @@ def check(
         raise UsageError(f"no episodes in {listed}. Record some: robot-gst record RUN.")
     reports = []
     with output.progress("check", len(files)) as advance:
-        for report in check_all(files, rerun=rerun):
+        asked = None if contract is None else find_contract(Path(), contract)
+        for report in check_all(files, rerun=rerun, contract=asked):
             reports.append(report)
             advance(min(len(reports), len(files)), report.path.name)
     data = {
@@ -226,7 +248,8 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     Example: robot-gst recover runs/monday
 
     Args:
-        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
+        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``; of a run and its
+            --failover folder the halves of an episode are joined.
         in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
@@ -246,11 +269,11 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
             if len(files) == 1:
                 raise
             reports.append(recovery.RecoveryReport(path=path, output=None, reason=str(error)))
-    text = (
-        "\n".join(_describe(report) for report in reports)
-        or "nothing to recover: every file is finished"
-    )
-    output.result({"files": [asdict(report) for report in reports]}, text)
+    joined = recovery.join_failovers([path for path in paths if path.is_dir()])
+    lines = [_describe(report) for report in reports]
+    lines += [f"{path.name}: joined with the parts before it, now {path}" for path in joined]
+    text = "\n".join(lines) or "nothing to recover: every file is finished"
+    output.result({"files": [asdict(report) for report in reports], "joined": joined}, text)
     return 1 if any(report.output is None for report in reports) else 0
 
 
@@ -370,6 +393,8 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:
         notes.append(f"unknown: {_shown(entry.cause)}")
+    if entry.presence:
+        notes.append(_shown(entry.presence, 400))
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
 
 

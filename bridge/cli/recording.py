@@ -27,6 +27,8 @@ def record(
     *,
     episode: str | None = None,
     duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
+    anyway: bool = False,
+    learn: Path | None = None,
     about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
     config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
     listen: tuple[str, ...] = LOOPBACK,
@@ -44,6 +46,8 @@ def record(
         run: Run folder; made where needed.
         episode: Start this episode at once.
         duration_s: Stop after this long [s]; with --episode.
+        anyway: Start it although topics are missing that cell.toml requires; else it waits.
+        learn: Write the run's cell.toml from this good episode, and record nothing.
         about: What is being recorded, with --episode or the key s.
         config: The recorder's settings.
         listen: Where to listen; other processes connect here.
@@ -57,6 +61,8 @@ def record(
     from bridge.record.status import describe_answer
     from bridge.wire.config import WireConfig
 
+    if learn is not None:
+        return _learn(run, learn, output)
     if duration_s is not None and (episode is None or duration_s <= 0):
         raise UsageError("--duration needs --episode ID and a time above zero.")
     about, task = _with_task_file(about)
@@ -72,10 +78,27 @@ def record(
             episode=info,
             duration_s=duration_s,
             about=about,
+            anyway=anyway,
             task=task,
         )
     data = answer or {"ok": True, "episode": None}
     output.result(data, describe_answer(data) if answer else "stopped; no episode was open")
+    return 0
+
+
+def _learn(run: Path, episode: Path, output: Output) -> int:
+    from bridge.episode.check import learn_from
+    from bridge.episode.contract import CONTRACT_FILE, write_contract
+    from bridge.episode.run_folder import RunFolder
+
+    contract = learn_from(episode)
+    path = RunFolder.create(run).path / CONTRACT_FILE
+    write_contract(contract, path, source=episode.name)
+    output.result(
+        {"file": str(path), "topics": len(contract.topics), "required": contract.required()},
+        f"{path}: {len(contract.topics)} topics, {len(contract.required())} required. "
+        "Look through it; every episode recorded from now on is held to it.",
+    )
     return 0
 
 
@@ -89,6 +112,7 @@ def ctl(
     result: Literal["success", "failure", "unknown"] | None = None,
     detail: str | None = None,
     discard: bool = False,
+    anyway: bool = False,
     last: int = 20,
     recorder: str = "main",
     connect: tuple[str, ...] = LOOPBACK,
@@ -108,6 +132,7 @@ def ctl(
         result: How it went (stop, label).
         detail: What happened, in words (stop, label).
         discard: Throw the open episode away (stop).
+        anyway: Start although topics are missing that cell.toml requires (start).
         last: How many episodes, by name from the end (list).
         recorder: Name of the recorder.
         connect: Where it listens.
@@ -126,7 +151,7 @@ def ctl(
     if result is not None:
         outcome = {"result": result, "k": int(result == "success"), "n": 1, "detail": detail}
     requests: dict[str, dict[str, Any]] = {
-        "start": {"id": id, "info": asdict(about), **sent},
+        "start": {"id": id, "info": asdict(about), "anyway": anyway, **sent},
         "stop": {"outcome": outcome, "discard": discard},
         "mark": {"text": text},
         "label": {"text": text, "outcome": outcome, "episode": id},

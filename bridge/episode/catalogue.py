@@ -25,6 +25,7 @@ from bridge.episode.catalogue_store import (
     trace,
 )
 from bridge.episode.catalogue_store import Entry as Entry
+from bridge.episode.contract import PRESENCE_RECORD, presence_lines
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id, first_part
@@ -227,6 +228,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         messages=messages,
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
+        presence=printable("; ".join(presence_lines(records.get(PRESENCE_RECORD, {})))),
     )
 
 

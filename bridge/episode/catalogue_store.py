@@ -60,6 +60,8 @@ class Entry:
     """Messages the recorder logged as dropped; None when nobody counted."""
     recovered: bool = False
     """Its writer was killed, so its tail is missing."""
+    presence: str = ""
+    """Topics that broke the contract, fell silent, or whose losses nobody can see."""
     error: str = ""
 
 
@@ -237,7 +239,7 @@ def _instant_ns(name: str, text: str | None) -> int | None:
 
 
 FILE_NAME = "catalogue.sqlite"
-VERSION = 2
+VERSION = 3
 """Raise it whenever a column, or the way one is read from an episode, changes."""
 BUSY_S = 5.0
 

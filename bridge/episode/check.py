@@ -2,8 +2,9 @@
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
 that are not what they promise, parts that are missing. Lost is another matter: a drop log with
-losses, or a recording that was cut off and recovered, leaves a whole file (``exit_code`` 3). Files
-of other programs are held to the format only; our contract is asked of ours.
+losses, a topic that fell silent against its contract, or a recording that was cut off and
+recovered, leaves a whole file (``exit_code`` 3). Files of other programs are held to the format
+only; our contract is asked of ours.
 """
 
 import shutil
@@ -17,11 +18,24 @@ from typing import Any
 from bridge.episode import schema, streams
 from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.check_topics import Decoder, Pauses, TopicCheck, TopicWatch
+from bridge.episode.contract import (
+    RECORD_NAME,
+    Contract,
+    ContractError,
+    Presence,
+    Span,
+    breaches_of,
+    contract_from,
+    judge,
+    learn_contract,
+    unknown_tails,
+    unseen_losses,
+)
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
-from bridge.errors import BridgeError, MissingDependencyError
+from bridge.errors import BridgeError, MissingDependencyError, UsageError
 
 TIMEOUT_S = 3600
 
@@ -74,6 +88,12 @@ class CheckReport:
     """Numbers missing on topics of a recording whose drop log does not list them."""
     recovered: dict[str, Any] | None = None
     """What recovery said: the recorder died, and the end of the recording is unknown."""
+    breaches: list[str] = field(default_factory=list)
+    """Where a topic broke the contract of its cell."""
+    unknown_tails: list[str] = field(default_factory=list)
+    """Topics that fell silent before the end, so that nobody knows what they sent after."""
+    presences: dict[str, Presence] = field(default_factory=dict)
+    """When each topic was there."""
 
     @property
     def exit_code(self) -> int:
@@ -81,13 +101,18 @@ class CheckReport:
         if self.faults:
             return 1
         lost = self.declared_losses or self.undeclared_losses or self.recovered is not None
-        return 3 if lost else 0
+        return 3 if lost or self.breaches or self.unknown_tails else 0
 
     @property
     def summary(self) -> str:
         """A word or two."""
-        if self.exit_code == 3 and self.undeclared_losses:
-            return "drops not logged"
+        if self.exit_code == 3:
+            if self.breaches:
+                return "contract broken"
+            if self.undeclared_losses:
+                return "drops not logged"
+            if self.unknown_tails and not self.declared_losses:
+                return "tail unknown"
         return {0: "clean", 1: "broken", 3: "drops logged"}[self.exit_code]
 
     def lines(self) -> list[str]:
@@ -98,6 +123,8 @@ class CheckReport:
         parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
         lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
         lines += [f"  {fault}" for fault in self.faults]
+        lines += [f"  contract: {text}" for text in self.breaches]
+        lines += [f"  {text}" for text in self.unknown_tails]
         if self.num_faults > len(self.faults):
             lines.append(f"  and {self.num_faults - len(self.faults)} more faults")
         return lines + [f"  note: {note}" for note in self.notes]
@@ -113,6 +140,8 @@ class CheckReport:
             "declared_losses": self.declared_losses,
             "undeclared_losses": self.undeclared_losses,
             "recovered": self.recovered,
+            "breaches": self.breaches,
+            "unknown_tails": self.unknown_tails,
             "faults": self.faults,
             "num_faults": self.num_faults,
             "notes": self.notes,
@@ -120,12 +149,15 @@ class CheckReport:
         }
 
 
-def check_episode(path: Path, *, rerun: bool = False) -> CheckReport:
+def check_episode(
+    path: Path, *, rerun: bool = False, contract: Contract | None = None
+) -> CheckReport:
     """Read every byte of an episode and of its parts, and decode every type this project knows.
 
     Args:
         path: The episode; the parts behind it are found.
         rerun: Let Rerun's own checker read each file too.
+        contract: Judge by this one; None takes the one the episode was recorded under.
 
     Raises:
         MissingDependencyError: When ``rerun`` is asked for and not installed.
@@ -147,16 +179,34 @@ def check_episode(path: Path, *, rerun: bool = False) -> CheckReport:
         _check_parts(report, episode, faults)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
+    if episode is not None and _is_recording(episode):
+        _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
     return report
 
 
-def check_all(paths: Iterable[Path], *, rerun: bool = False) -> Iterator[CheckReport]:
+def learn_from(path: Path) -> Contract:
+    """Learn the contract of a cell from a good episode of it.
+
+    Raises:
+        UsageError: When the episode is not clean, or no recorder of ours made it.
+    """
+    report = check_episode(path, contract=Contract(topics={}))
+    if report.exit_code or not report.presences:
+        found = "\n".join(report.lines()) if report.exit_code else "it is no recording"
+        raise UsageError(f"{path} is not an episode to learn from: {found}")
+    return learn_contract(report.presences, cell=Episode.open(path).info.cell)
+
+
+def check_all(
+    paths: Iterable[Path], *, rerun: bool = False, contract: Contract | None = None
+) -> Iterator[CheckReport]:
     """Check every episode among some files; a later part goes with the first of its episode.
 
     Args:
         paths: Files, in any order.
         rerun: Let Rerun's own checker read each file too.
+        contract: Judge by this one; None takes the one each episode was recorded under.
 
     Raises:
         MissingDependencyError: When ``rerun`` is asked for and not installed.
@@ -164,7 +214,7 @@ def check_all(paths: Iterable[Path], *, rerun: bool = False) -> Iterator[CheckRe
     done: set[Path] = set()
     for path in sorted(paths, key=_by_part):
         if path not in done:
-            report = check_episode(path, rerun=rerun)
+            report = check_episode(path, rerun=rerun, contract=contract)
             done.update(report.parts)
             yield report
 
@@ -264,6 +314,7 @@ def _judge_topics(
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
         result.declared_losses = decoder.drop_log.get(topic, 0)
+        result.unnumbered = decoder.unnumbered.get(topic, 0)
         if result.undecodable:
             _say(report, faults if ours else None, result.first_fault)
         if result.time_steps_back:
@@ -278,8 +329,46 @@ def _judge_topics(
                     f"the drop log lists {result.declared_losses}"
                 )
     report.declared_losses = sum(decoder.drop_log.values())
+    report.notes += unseen_losses(decoder.unnumbered)
     for text in decoder.size_faults():
         _say(report, faults if ours else None, text)
+
+
+def _is_recording(episode: Episode) -> bool:
+    """Whether a recorder of ours made it, be it finished or recovered."""
+    records = episode.metadata_records
+    return "recorder" in records or ("recovered" in records and RECORD_NAME in records)
+
+
+def _judge_presence(
+    report: CheckReport,
+    episode: Episode,
+    watch: _Watch,
+    faults: Faults,
+    contract: Contract | None,
+) -> None:
+    records = episode.metadata_records
+    if contract is None and RECORD_NAME in records:
+        try:
+            contract = contract_from(records[RECORD_NAME], name=episode.path.name)
+        except ContractError as error:
+            faults.add(str(error))
+    recorder = records.get("recorder", {})
+    start_ns, end_ns = recorder.get("start_ns"), recorder.get("end_ns")
+    span = Span(
+        start_ns if isinstance(start_ns, int) else episode.start_ns,
+        end_ns if isinstance(end_ns, int) else episode.end_ns,
+        watch.pauses.spans,
+    )
+    report.presences = {topic: found.presence for topic, found in watch.topics.items()}
+    is_stand_in = records.get("episode", {}).get("stand_in") is True
+    reports = judge(
+        report.presences, contract, span, watch.decoder.drop_log, by_habit=not is_stand_in
+    )
+    for topic, found in reports.items():
+        report.topics.setdefault(topic, TopicCheck()).presence = found
+    report.breaches = breaches_of(reports)
+    report.unknown_tails = unknown_tails(reports)
 
 
 def _say(report: CheckReport, faults: Faults | None, text: str) -> None:

@@ -23,6 +23,7 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.check_file import ScannedMessage
+from bridge.episode.contract import Presence, Spans, TopicReport
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
@@ -44,6 +45,8 @@ class Decoder:
         """Start without a drop log."""
         self.drop_log: dict[str, int] = {}
         """Losses declared by topic."""
+        self.unnumbered: dict[str, int] = {}
+        """By topic, messages without a number of their publisher's."""
         self.has_drop_log = False
         self.missing: set[str] = set()
         """Sentences on packages without which something was not decoded."""
@@ -97,7 +100,11 @@ class Decoder:
     def _add_losses(self, record: dict[str, Any]) -> None:
         self.has_drop_log = True
         lost = record["gaps"] + record["queue_drops"] + record.get("shed", 0)
-        self.drop_log[record["topic"]] = self.drop_log.get(record["topic"], 0) + lost
+        topic = record["topic"]
+        self.drop_log[topic] = self.drop_log.get(topic, 0) + lost
+        unnumbered = self.unnumbered.get(topic, 0) + record.get("unnumbered", 0)
+        if unnumbered:
+            self.unnumbered[topic] = unnumbered
 
     def size_faults(self) -> list[str]:
         """Sentences on depth images that are not of the size their camera info says."""
@@ -200,7 +207,8 @@ class Pauses:
 
     def __init__(self, spans_ns: Iterable[tuple[int, int]]) -> None:
         """Take spans that do not overlap [ns]."""
-        ordered = sorted(spans_ns)
+        self.spans: Spans = sorted(spans_ns)
+        ordered = self.spans
         self._starts_ns = [start_ns for start_ns, _ in ordered]
         self._ends_ns = [end_ns for _, end_ns in ordered]
 
@@ -238,6 +246,10 @@ class TopicCheck:
     latency_max_s: float = 0.0
     undecodable: int = 0
     first_fault: str = ""
+    unnumbered: int = 0
+    """Messages that carry no number, so that losses among them cannot be seen."""
+    presence: TopicReport | None = None
+    """When it was there, and what its contract says of that; of recordings only."""
 
 
 @dataclass(kw_only=True)
@@ -248,8 +260,7 @@ class TopicWatch:
     pauses: Pauses
     result: TopicCheck = field(default_factory=TopicCheck)
     sequences: SequenceWatch = field(default_factory=SequenceWatch)
-    first_ns: int | None = None
-    last_ns: int = 0
+    presence: Presence = field(default_factory=Presence)
     latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
@@ -262,13 +273,12 @@ class TopicWatch:
         head, result = message.head, self.result
         result.messages += 1
         result.type_name = message.schema.name if message.schema else ""
-        may_skip = self.pauses.lies_between(self.last_ns, head.log_time_ns)
+        last_ns = self.presence.last_ns
+        may_skip = self.pauses.lies_between(last_ns, head.log_time_ns)
         self.sequences.see(head.sequence, may_skip=may_skip)
-        if self.first_ns is None:
-            self.first_ns = head.log_time_ns
-        elif head.log_time_ns < self.last_ns:
+        if head.log_time_ns < last_ns:
             result.time_steps_back += 1
-        self.last_ns = max(self.last_ns, head.log_time_ns)
+        self.presence.see(head.log_time_ns, self.pauses.spans)
         self.latencies_ns.append(head.log_time_ns - head.publish_time_ns)
         try:
             decoder.decode(self.topic, message)
@@ -282,7 +292,7 @@ class TopicWatch:
         result = self.result
         result.sequence_gaps = self.sequences.gaps
         result.sequences_backward = self.sequences.backward
-        span_s = (self.last_ns - (self.first_ns or 0)) * 1e-9
+        span_s = (self.presence.last_ns - self.presence.first_ns) * 1e-9
         if result.messages > 1 and span_s > 0:
             result.rate_hz = (result.messages - 1) / span_s
         if self.latencies_ns:

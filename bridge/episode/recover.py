@@ -7,21 +7,26 @@ or a finished one is there, and it can be run again.
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from bridge.episode.mcap.damaged import RecordFile, finished_data_end
+from bridge.episode.check_file import Faults, FileCheck
+from bridge.episode.chunk_queue import JOURNAL, journal_path
+from bridge.episode.mcap.damaged import RecordFile, finished_data
+from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.mcap.walk import DAMAGE
+from bridge.episode.run_folder import RunFolder, first_part_name
 from bridge.episode.salvage import (
     RECORD_NAME,
     CopyTarget,
     InPlaceTarget,
     NeedsCopyError,
     RecoveryTally,
+    scan_with_journal,
     to_metadata,
 )
 from bridge.episode.salvage import RecoveryReport as RecoveryReport
@@ -67,15 +72,36 @@ def recover(path: Path, *, in_place: bool | None = None) -> RecoveryReport:
         source = RecordFile(descriptor)
         finished = _report_finished(path, source)
         if finished is not None:
+            _drop_journal(path, finished)
             return finished
         if in_place is None:
             has_room = shutil.disk_usage(path.parent).free >= source.size + SPARE_BYTES
             if not has_room and not is_part:
                 raise _no_room(path, source.size)
             in_place = not has_room
-        if in_place:
-            return _recover_in_place(path, source)
-        return _recover_copy(path, source)
+        with _journal_of(path) as journal:
+            if in_place:
+                report = _recover_in_place(path, source, journal)
+            else:
+                report = _recover_copy(path, source, journal)
+        _drop_journal(path, report)
+        return report
+
+
+@contextmanager
+def _journal_of(path: Path) -> Iterator[RecordFile | None]:
+    """Open the journal of a part, if there is one."""
+    if not path.name.endswith(PART) or not journal_path(path).is_file():
+        yield None
+        return
+    with journal_path(path).open("rb") as stream:
+        yield RecordFile(stream.fileno())
+
+
+def _drop_journal(path: Path, report: RecoveryReport) -> None:
+    """Remove the journal of a part that is finished: everything in it is there."""
+    if report.output is not None and path.name.endswith(PART):
+        journal_path(path).unlink(missing_ok=True)
 
 
 def recover_parts(run: RunFolder) -> list[RecoveryReport]:
@@ -96,7 +122,63 @@ def recover_parts(run: RunFolder) -> list[RecoveryReport]:
             if report.output is None:
                 _set_aside(path)
         reports.append(report)
+    for journal in run.episodes_dir.glob(f"*{SUFFIX}{JOURNAL}"):
+        if journal.with_suffix("").exists():  # killed between the last two steps of an end
+            journal.unlink(missing_ok=True)
     return reports
+
+
+def join_failovers(folders: Iterable[Path]) -> list[Path]:
+    """Bring the halves of episodes together that a failing disk divided.
+
+    Args:
+        folders: Run folders: that of the failed disk, and those that took over.
+
+    Returns:
+        The parts that were moved beside the parts before them, where they are now.
+
+    Raises:
+        RecoveryError: When one cannot be moved.
+    """
+    homes = [found for folder in folders if (found := folder / "episodes").is_dir()]
+    moved = []
+    for path in [each for home in homes for each in sorted(home.glob(f"*{SUFFIX}"))]:
+        if "failover" not in _metadata_names(path):
+            continue
+        first = first_part_name(path)
+        home = next((h for h in homes if h != path.parent and (h / first).is_file()), None)
+        if home is None or (home / path.name).exists():
+            continue
+        try:
+            _move(path, home / path.name)
+        except OSError as error:
+            raise RecoveryError(
+                f"{path} cannot be moved to {home}: {error.strerror}. Copy both folders to a disk "
+                "that works, then recover them there."
+            ) from error
+        moved.append(home / path.name)
+    return moved
+
+
+def _metadata_names(path: Path) -> set[str]:
+    try:
+        return {record.name for record in McapFile(path).metadata}
+    except (OSError, *DAMAGE):
+        return set()
+
+
+def _move(path: Path, target: Path) -> None:
+    """Move a file to another disk: its name appears when every byte is there."""
+    part = target.with_name(target.name + TEMPORARY)
+    try:
+        shutil.copyfile(path, part)
+        with part.open("rb") as stream:
+            os.fsync(stream.fileno())
+        part.rename(target)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(target.parent)
+    path.unlink()
 
 
 def _set_aside(path: Path) -> None:
@@ -122,30 +204,41 @@ def _locked(path: Path, *, write: bool) -> Iterator[int]:
 
 def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     """Rename a file that is whole; None when it is not."""
-    data_end = finished_data_end(source)
-    if data_end is None:
+    data = finished_data(source)
+    if data is None:
+        return None
+    if not data.is_proved and _has_faults(path):  # then its indexes may be wrong all the same
         return None
     tally = RecoveryTally()
     for found in scan(source):
         tally.take(found)
-    if tally.losses or tally.reached_end != data_end:
+    if tally.losses or tally.reached_end != data.end:
         return None
     output = _publish(path) if path.name.endswith(PART) else path
     return tally.report(path, output, finished=True)
 
 
-def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
+def _has_faults(path: Path) -> bool:
+    faults = Faults()
+    for _ in FileCheck(path, faults).messages():
+        pass
+    return bool(faults.count)
+
+
+def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
     temporary = path.with_name(_final_name(path) + TEMPORARY)
     temporary.unlink(missing_ok=True)  # of a recovery that was killed; the lock is ours
     tally = RecoveryTally()
     target: CopyTarget | None = None
     try:
-        for found in scan(source):
+        for found in scan_with_journal(source, journal):
             tally.take(found)
             if tally.has_data and target is None:
                 target = CopyTarget(source, temporary)
             if target is not None:
                 target.take(found)
+        if target is not None:
+            tally.name(target.looked_up)
         report = tally.report(path, None, finished=False)
         if target is None:
             return report
@@ -162,11 +255,11 @@ def _recover_copy(path: Path, source: RecordFile) -> RecoveryReport:
         temporary.unlink(missing_ok=True)
 
 
-def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
+def _recover_in_place(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
     tally = RecoveryTally()
     target = InPlaceTarget(source, PartFile(path, source.descriptor))
     try:
-        for found in scan(source):
+        for found in scan_with_journal(source, journal):
             tally.take(found)
             target.take(found)
     except NeedsCopyError as error:
@@ -187,7 +280,7 @@ def _recover_in_place(path: Path, source: RecordFile) -> RecoveryReport:
 def _prove(path: Path) -> None:
     """Read the copy back; its CRC covers every byte that was found whole before."""
     with path.open("rb") as stream:
-        if finished_data_end(RecordFile(stream.fileno())) is None:
+        if finished_data(RecordFile(stream.fileno())) is None:
             message = f"{path} does not hold what was written to it. Check the disk."
             raise RecoveryError(message)
 

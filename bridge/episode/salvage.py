@@ -5,16 +5,24 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 """
 
 import json
-from dataclasses import dataclass, field
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mcap.records import Channel, Metadata, Schema
 
 from bridge.episode import provenance
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.damaged import Contents, RecordFile, read_plain
+from bridge.episode.mcap.damaged import (
+    Contents,
+    RecordFile,
+    read_plain,
+    summary_definitions,
+    walk_records,
+)
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk
-from bridge.episode.mcap.format import crc32
+from bridge.episode.mcap.format import Buffer, crc32
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.mcap.scan import (
     AttachmentSpan,
@@ -26,8 +34,9 @@ from bridge.episode.mcap.scan import (
     IndexSpan,
     Plain,
     TopMessage,
+    scan,
 )
-from bridge.episode.metadata import from_strings
+from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
 
 RECORD_NAME = "recovered"
 MAX_REASONS = 8
@@ -141,6 +150,10 @@ class RecoveryTally:
             if isinstance(channel, Channel):
                 self.topics.setdefault(channel.id, channel.topic)
 
+    def name(self, definitions: list[bytes]) -> None:
+        """Learn the names of channels whose definition was lost and found elsewhere."""
+        self._define(definitions)
+
     def topic_of(self, channel_id: int) -> str:
         """Name of a channel, also of one whose definition was lost."""
         return self.topics.get(channel_id, unknown_topic(channel_id))
@@ -207,7 +220,50 @@ def unknown_topic(channel_id: int) -> str:
 
 
 CHUNK_BYTES = 1 << 20
-LIBRARY = "robot-gst recover"
+UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"
+"""Of a file whose header was lost: its messages are held to no promise of ours."""
+
+
+def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
+    """What tells a chunk from every other: CRC and size of its records."""
+    return found.head.crc, found.head.uncompressed_size
+
+
+def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
+    """Return what a part holds, then the chunks that only its journal holds.
+
+    A chunk torn at the end of the part is left out where the journal has it whole.
+    """
+    if journal is None:
+        yield from scan(source)
+        return
+    kept = {key_of(found) for found in scan(journal) if isinstance(found, Chunk)}
+    there: set[tuple[int, int]] = set()
+    for found in scan(source):
+        if isinstance(found, Chunk):
+            there.add(key_of(found))
+        if not (isinstance(found, CutChunk) and key_of(found) in kept):
+            yield found
+    for found in scan(journal):
+        if isinstance(found, Chunk) and key_of(found) not in there:
+            there.add(key_of(found))
+            yield replace(found, is_journalled=True)
+
+
+_RECORDS: dict[str, type] = {"episode": EpisodeInfo, "outcome": Outcome, "derived": Derived}
+DAMAGED = ".damaged"
+"""Behind the name of a metadata record of ours that cannot be read; no CRC covers those."""
+
+
+def is_readable(name: str, values: dict[str, str]) -> bool:
+    """Whether a metadata record, if it is one of ours, holds what it should."""
+    if name not in _RECORDS:
+        return True
+    try:
+        build(_RECORDS[name], from_strings(values))
+    except TypeError:
+        return False
+    return True
 
 
 class CopyTarget:
@@ -220,12 +276,15 @@ class CopyTarget:
         self._loose = OpenChunk(compress=False, gather=True)
         self._made_schemas: set[int] = set()
         self._made_channels: set[int] = set()
+        self.looked_up: list[bytes] = []
+        """Definitions that were lost where they were needed, and found elsewhere."""
+        self._elsewhere: dict[tuple[int, int], bytes] | None = None
 
     def take(self, found: Found) -> None:
         """Copy one thing; index spans, damage and the old end are left behind."""
         if self.section.file.offset == 0:
             is_header = isinstance(found, Plain) and found.opcode == mcap.HEADER
-            header = found.raw if is_header else mcap.header("", LIBRARY)  # type: ignore[union-attr]
+            header = found.raw if is_header else mcap.header("", UNKNOWN_LIBRARY)  # type: ignore[union-attr]
             self.section.file.append([mcap.MAGIC + header])
         match found:
             case Plain():
@@ -234,14 +293,23 @@ class CopyTarget:
                 self._define(found.contents)
                 self.section.add_chunk(verbatim(found))
             case CutChunk():
-                self._define(found.contents)
-                self.section.add_chunk(salvaged(found.records, found.contents))
+                records, contents = self._without_contradictions(found)
+                self._define(contents)
+                if contents.num_messages:
+                    self.section.add_chunk(salvaged(records, contents))
             case TopMessage():
                 self._take_message(found)
             case AttachmentSpan():
                 self._take_attachment(found)
             case _:
                 pass
+
+    def _without_contradictions(self, found: CutChunk) -> tuple[bytes, Contents]:
+        """Leave out definitions that no CRC proves and that others contradict."""
+        records = found.records
+        for raw in filter(self._contradicts, found.contents.definitions):
+            records = records.replace(raw, b"", 1)
+        return records, walk_records(records)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Write the rest and sync; the caller verifies, renames and closes.
@@ -259,13 +327,21 @@ class CopyTarget:
     def _take_plain(self, found: Plain) -> None:
         if found.opcode == mcap.HEADER:
             return
-        if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
-            self._book(found.raw)
-        offset = self.section.file.offset
-        self.section.file.append([found.raw])
         if isinstance(found.record, Metadata):
-            name = found.record.name
-            self.section.summary.add_metadata(name, offset=offset, length=found.length)
+            name, values = found.record.name, found.record.metadata
+            self.section.add_metadata(name if is_readable(name, values) else name + DAMAGED, values)
+            return
+        if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
+            if self._contradicts(found.raw):
+                return
+            self._book(found.raw)
+        self.section.file.append([found.raw])
+
+    def _contradicts(self, raw: bytes) -> bool:
+        """Whether a definition is not the one that its id had before."""
+        summary = self.section.summary
+        known = summary.schemas if raw[0] == mcap.SCHEMA else summary.channels
+        return known.get(_id_of(raw)) not in (None, raw)
 
     def _book(self, raw: bytes) -> None:
         """Tell the summary of a definition; the first one of an id counts."""
@@ -276,8 +352,21 @@ class CopyTarget:
             case Channel(id=channel_id, schema_id=schema_id):
                 _define_once(summary.channels, self._made_channels, channel_id, raw)
                 if schema_id and schema_id not in summary.schemas:
+                    if self._look_up(mcap.SCHEMA, schema_id):
+                        return
                     self._make(mcap.schema(schema_id, "unknown", "", b""))
                     self._made_schemas.add(schema_id)
+
+    def _look_up(self, opcode: int, number: int) -> bool:
+        """Define what was lost here and stands in the summary or in another chunk."""
+        if self._elsewhere is None:
+            self._elsewhere = _definitions(self._source)
+        raw = self._elsewhere.get((opcode, number))
+        if raw is None:
+            return False
+        self.looked_up.append(raw)
+        self._make(raw)
+        return True
 
     def _make(self, raw: bytes) -> None:
         """Define a schema or channel whose own definition was lost; readers refuse without."""
@@ -291,7 +380,9 @@ class CopyTarget:
             self._require_channel(channel_id)
 
     def _require_channel(self, channel_id: int) -> None:
-        if channel_id not in self.section.summary.channels:
+        if channel_id in self.section.summary.channels:
+            return
+        if not self._look_up(mcap.CHANNEL, channel_id):
             self._make(mcap.channel(channel_id, 0, unknown_topic(channel_id), ""))
             self._made_channels.add(channel_id)
 
@@ -323,19 +414,57 @@ class CopyTarget:
         )
 
 
+def _definitions(source: RecordFile) -> dict[tuple[int, int], bytes]:
+    """Return every schema and channel of a file by kind and id: of its summary, or of its data."""
+    records = summary_definitions(source)
+    if not records:
+        for found in scan(source):
+            if isinstance(found, Chunk | CutChunk):
+                records += found.contents.definitions
+            elif isinstance(found, Plain) and found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
+                records.append(found.raw)
+    definitions: dict[tuple[int, int], bytes] = {}
+    for raw in records:
+        definitions.setdefault((raw[0], _id_of(raw)), raw)
+    return definitions
+
+
+def _id_of(raw: bytes) -> int:
+    """Return the number of a schema or channel."""
+    record = read_plain(raw)
+    return record.id if isinstance(record, Schema | Channel) else 0
+
+
 def _define_once(known: dict[int, bytes], made: set[int], number: int, raw: bytes) -> None:
     if number not in known or number in made:
         made.discard(number)
         known[number] = raw
 
 
+_TIMES = struct.Struct("<QQ")
+
+
+def has_wrong_times(found: Chunk) -> bool:
+    """Whether a chunk's head states other times than its messages; no CRC covers them."""
+    said = _TIMES.unpack_from(found.raw, mcap.RECORD_HEAD.size)
+    return said != found.contents.time_range()
+
+
 def verbatim(found: Chunk) -> EncodedChunk:
-    """Return a chunk as it stands in the file."""
+    """Return a chunk as it stands in the file, with the times of its messages in its head."""
     start_ns, end_ns = found.contents.time_range()
+    at = mcap.RECORD_HEAD.size
+    buffers: list[Buffer] = [found.raw]
+    if has_wrong_times(found):
+        front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
+        buffers = [front, found.raw[len(front) :]]
+    crc = 0
+    for buffer in buffers:
+        crc = crc32(buffer, crc)
     return EncodedChunk(
-        buffers=[found.raw],
+        buffers=buffers,
         length=found.length,
-        crc=crc32(found.raw, 0),
+        crc=crc,
         start_ns=start_ns,
         end_ns=end_ns,
         compression=found.head.compression,
@@ -403,6 +532,7 @@ class InPlaceTarget:
         self._end = 0
         self._chunk: Chunk | None = None
         self._indexes: list[IndexSpan] = []
+        self._journalled: list[EncodedChunk] = []
         self._cut: CutChunk | None = None
 
     def take(self, found: Found) -> None:
@@ -423,6 +553,9 @@ class InPlaceTarget:
                 self._cut = found
             case CutChunk() | DataEnd():
                 pass
+            case Chunk() if found.is_journalled:
+                self._define(found.contents)
+                self._journalled.append(verbatim(replace(found, raw=memoryview(bytes(found.raw)))))
             case _:
                 self._close_chunk()
                 self._take_whole(found)
@@ -432,6 +565,8 @@ class InPlaceTarget:
         summary = self.section.summary
         match found:
             case Chunk():
+                if has_wrong_times(found):
+                    raise NeedsCopyError
                 self._define(found.contents)
                 self._chunk = found
             case Plain(record=Metadata(name=name)):
@@ -514,6 +649,8 @@ class InPlaceTarget:
             )
         elif self._chunk is not None:
             self.section.add_indexes(verbatim(self._chunk), self._chunk.offset)
+        for encoded in self._journalled:
+            self.section.add_chunk(encoded)
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
         file.sync_data()

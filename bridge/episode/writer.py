@@ -4,6 +4,7 @@ Nothing half-written ever carries the final name; a crash leaves the ``.part`` f
 ``recover`` reads. ``docs/decisions/0003-mcap-files.md`` says why the chunks are our own.
 """
 
+import contextlib
 import json
 import time
 from collections import deque
@@ -14,6 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from bridge.episode import metadata, provenance, schema
+from bridge.episode.chunk_queue import ChunkQueue
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk, OpenChunk, Summary
 from bridge.episode.mcap.format import Buffer, Payload, num_bytes
@@ -23,14 +25,26 @@ from bridge.episode.mcap.part_file import BackgroundSync, cannot_write, open_par
 class Channel:
     """One topic with one schema, and the chunk its messages go to."""
 
-    __slots__ = ("definition", "group", "id", "is_large", "next_sequence", "type_name")
+    __slots__ = (
+        "definition",
+        "group",
+        "id",
+        "is_large",
+        "next_definition",
+        "next_sequence",
+        "times_defined",
+        "type_name",
+    )
 
     def __init__(self, channel_id: int, type_name: str, definition: bytes) -> None:
         """Begin without a group."""
         self.id = channel_id
         self.type_name = type_name
         self.definition = definition
-        """Schema and channel records, repeated in every group the channel writes to."""
+        """Schema and channel records."""
+        self.next_definition = 0
+        """Number of the chunk of its group that holds them next."""
+        self.times_defined = 0
         self.next_sequence = 0
         self.is_large = False
         self.group: OpenChunk | None = None
@@ -38,6 +52,11 @@ class Channel:
 
 About = tuple[tuple[str, str], ...]
 """Names and texts of a channel's metadata."""
+SLOW_FLUSH_S = 0.05
+"""On a slow disk small messages are not held back longer than this [s]: the write takes enough."""
+REPEAT_CHUNKS = 16
+"""Definitions stand in a group's first two chunks that need them, and again after so many: no one
+damaged chunk leaves messages without a name."""
 
 
 class Channels:
@@ -52,6 +71,12 @@ class Channels:
         self._schemas: dict[tuple[str, str, bytes], tuple[int, bytes]] = {}
         self._channels: dict[tuple[str, str, int, About], Channel] = {}
         self._known: dict[tuple[str, int, str, About], tuple[Channel, schema.Schema | None]] = {}
+
+    def move_to(self, summary: Summary) -> None:
+        """Tell another summary from now on, and at once what there is already."""
+        summary.schemas.update(self._summary.schemas)
+        summary.channels.update(self._summary.channels)
+        self._summary = summary
 
     def find(
         self,
@@ -169,6 +194,8 @@ class WriterConfig:
     """A live writer's ``tick`` writes messages older than this [s]; None fills chunks first."""
     sync_s: float | None = None
     """Force data to the disk this often, in a thread [s]; None only at the end."""
+    backlog_bytes: int = 16 << 20
+    """Of a live writer: so much may wait for the disk before a call does."""
     compress: bool = True
     """Pack depth and small topics with zstd level 1."""
 
@@ -181,10 +208,11 @@ class EpisodeWriter:
     after the other; the caller must not change its buffers afterwards.
 
     Every call may raise OSError for a disk that is full or broken, also on behalf of an earlier
-    call. The message of the failed call is not taken, everything before is kept: in the file up
-    to its last whole record, and in memory. When there is space again, calls and ``close`` succeed
-    and nothing is lost. After a failed background sync nothing succeeds any more, for the disk may
-    hold holes: ``abandon`` and ``recover`` what is there.
+    call; a live writer says it with ``tick``, and takes messages while it has room. The message of
+    the failed call is not taken, everything before is kept: in the file up to its last whole
+    record, and in memory. When there is space again, calls and ``close`` succeed and nothing is
+    lost. After a failed background sync nothing succeeds any more, for the disk may hold holes:
+    ``abandon`` and ``recover`` what is there.
     """
 
     def __init__(
@@ -219,13 +247,37 @@ class EpisodeWriter:
         self._small = OpenChunk(compress=config.compress, gather=True)
         self._groups = [self._small]
         self._pending: deque[EncodedChunk] = deque()
+        self._queue: ChunkQueue | None = None
+        if config.flush_s is not None:
+            header = mcap_format.header(PROFILE, LIBRARY)
+            self._queue = ChunkQueue(
+                self._section, self.part_path, header=header, monotonic=monotonic
+            )
         self._sync = BackgroundSync(self._file, config.sync_s) if config.sync_s else None
         self._open = True
 
     @property
     def bytes_written(self) -> int:
-        """Bytes in the file so far; chunks being filled are not among them."""
-        return self._file.offset
+        """Bytes in the file or on their way; chunks being filled are not among them."""
+        return self._file.offset if self._queue is None else self._queue.position()
+
+    @property
+    def backlog_bytes(self) -> int:
+        """Bytes of large messages that wait for the disk."""
+        return 0 if self._queue is None else self._queue.bulk_bytes
+
+    @property
+    def lag_s(self) -> float:
+        """How long the oldest small message has been waiting to be on a disk [s]."""
+        since_s = None if self._queue is None else self._queue.oldest_s()
+        if since_s is None and self._small.has_messages:
+            since_s = self._small.opened_s
+        return 0.0 if since_s is None else max(0.0, self._monotonic() - since_s)
+
+    @property
+    def busy_s(self) -> float:
+        """How long the disk has been at the write under way [s]."""
+        return 0.0 if self._queue is None else self._queue.busy_s()
 
     def write(
         self,
@@ -287,7 +339,7 @@ class EpisodeWriter:
         channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:
-            self._write_pending()
+            self.wait_for_disk()
         group = channel.group
         if group is None or (length >= LARGE_BYTES and not channel.is_large):
             group = self._assign_group(channel, data, length)
@@ -295,6 +347,8 @@ class EpisodeWriter:
             self._flush(group)
         if self.config.flush_s is not None and not group.has_messages:
             group.opened_s = self._monotonic()
+        if group.number >= channel.next_definition:
+            self._define(channel, group)
         if sequence is None:
             sequence = channel.next_sequence
         group.add(
@@ -317,20 +371,42 @@ class EpisodeWriter:
             group = OpenChunk(compress=compress, gather=False)
             self._groups.append(group)
             channel.is_large = True
-        group.define(channel.definition)
         channel.group = group
+        channel.next_definition = channel.times_defined = 0
         return group
 
-    def _flush(self, group: OpenChunk) -> None:
-        if group.has_messages:
-            self._pending.append(group.encode())
-        self._write_pending()
+    @staticmethod
+    def _define(channel: Channel, group: OpenChunk) -> None:
+        group.define(channel.definition)
+        channel.times_defined += 1
+        channel.next_definition = group.number + (
+            1 if channel.times_defined == 1 else REPEAT_CHUNKS
+        )
 
-    def _write_pending(self) -> None:
-        """Write chunks in the order they were closed; those the disk refuses stay here."""
+    def _flush(self, group: OpenChunk) -> None:
+        if self._queue is None:
+            if group.has_messages:
+                self._pending.append(group.encode())
+            self.wait_for_disk()
+            return
+        if group.has_messages:
+            self._queue.wait_for_room(group.size, 2 * self.config.backlog_bytes)
+            since_s = group.opened_s
+            self._queue.add(group.encode(), is_small=group.is_small, since_s=since_s)
+
+    def _refuse_failed(self) -> None:
+        """Raise what the disk said on behalf of an earlier call."""
         failed = self._file.failed
         if failed:
             raise OSError(failed.errno, failed.strerror, str(self.part_path)) from failed
+        if self._queue is not None:
+            self._queue.raise_error()
+
+    def wait_for_disk(self) -> None:
+        """Return when every chunk that was closed is in the file; those the disk refuses stay."""
+        self._refuse_failed()
+        if self._queue is not None:
+            self._queue.drain()
         while self._pending:
             self._section.add_chunk(self._pending[0])
             self._pending.popleft()
@@ -371,7 +447,7 @@ class EpisodeWriter:
             media_type: Such as ``application/xml``.
             log_time_ns: When it was recorded [ns since 1970]; taken as the time it was made, too.
         """
-        self._write_pending()
+        self.wait_for_disk()
         self._section.add_attachment(
             name,
             data,
@@ -382,7 +458,7 @@ class EpisodeWriter:
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record of plain strings; it is in the file at once."""
-        self._write_pending()
+        self.wait_for_disk()
         self._section.add_metadata(name, values)
 
     def describe(
@@ -408,13 +484,63 @@ class EpisodeWriter:
 
     def tick(self) -> None:
         """Write the chunks that have been waiting for ``flush_s``; call it often."""
-        self._write_pending()
-        if self.config.flush_s is None:
+        if self.config.flush_s is None or self._queue is None:
+            self.wait_for_disk()
             return
-        before_s = self._monotonic() - self.config.flush_s
+        self._refuse_failed()
+        self._queue.tick()
+        now_s = self._monotonic()
+        before_s = now_s - self.config.flush_s
+        if self._queue.is_slow() and self._small.has_messages:
+            hurried_s = now_s - min(SLOW_FLUSH_S, self.config.flush_s)
+            if self._small.opened_s <= hurried_s:
+                self._flush(self._small)
         for group in self._groups:
             if group.has_messages and group.opened_s <= before_s:
                 self._flush(group)
+
+    def keep_name(self) -> bool:
+        """Write the file anew where somebody removed it, and say whether that was needed.
+
+        Raises:
+            OSError: When it cannot be written there.
+        """
+        if self._file.is_there():
+            return False
+        self.wait_for_disk()
+        self._file.restore()
+        return True
+
+    def continue_in(self, path: Path) -> "EpisodeWriter":
+        """Go on in another file, with everything that this one's disk has not taken.
+
+        This writer ends; its ``.part`` file stays for recovery.
+
+        Raises:
+            UsageError: When that episode exists.
+            BridgeError: When the other folder cannot be written; this writer is as it was.
+        """
+        other = EpisodeWriter(path, config=self.config, monotonic=self._monotonic)
+        try:
+            other._take_over(self._channels)
+        except OSError as error:
+            other.discard()
+            raise cannot_write(other.part_path, error) from error
+        other._small, other._groups = self._small, self._groups
+        if self._queue is not None and other._queue is not None:
+            other._queue.add_all(self._queue.give_up())
+            self._queue.remove_journal()  # what it holds goes along
+        self._stop()
+        return other
+
+    def _take_over(self, channels: Channels) -> None:
+        """Use the channels of another writer under their numbers; raises OSError."""
+        channels.move_to(self._section.summary)
+        summary = self._section.summary
+        definitions = [*summary.schemas.values(), *summary.channels.values()]
+        if definitions:
+            self._file.append(definitions)
+        self._channels = channels
 
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""
@@ -422,6 +548,7 @@ class EpisodeWriter:
             return self.path
         for group in self._groups:
             self._flush(group)
+        self.wait_for_disk()
         offset, crc = self._file.offset, self._file.crc
         self._section.seal()
         try:
@@ -430,11 +557,16 @@ class EpisodeWriter:
             self._file.truncate(offset, crc)
             raise
         self._stop()
+        if self._queue is not None:
+            self._queue.remove_journal()
         return self.path
 
     def abandon(self) -> None:
         """Stop without finishing; the ``.part`` file stays for recovery."""
         if self._open:
+            if self._queue is not None:
+                with contextlib.suppress(OSError):  # what the disk still takes of what waits for it
+                    self.wait_for_disk()
             self._stop()
 
     def discard(self) -> None:
@@ -442,9 +574,13 @@ class EpisodeWriter:
         if self._open:
             self.part_path.unlink(missing_ok=True)
             self._stop()
+            if self._queue is not None:
+                self._queue.remove_journal()
 
     def _stop(self) -> None:
         self._open = False
+        if self._queue is not None:
+            self._queue.end()
         if self._sync is not None:
             self._sync.stop()
         self._file.close()

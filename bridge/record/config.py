@@ -10,6 +10,7 @@ from bridge.errors import refuse_outside
 
 BYTES_PER_MB = 1_000_000
 UNBOUNDED = float("inf")
+MAX_BACKLOG_BYTES = 16_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +48,9 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
+    failover: Path | None = None
+    """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
+    DIR`` joins the halves."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0
@@ -62,6 +66,12 @@ class DiskConfig:
         refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
+    @property
+    def backlog_bytes(self) -> int:
+        """What may wait for a slow disk; the reserve must take it when the disk is full."""
+        held = self.footer_mb * BYTES_PER_MB // 4
+        return min(MAX_BACKLOG_BYTES, held) if held else MAX_BACKLOG_BYTES
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderConfig:
@@ -71,6 +81,9 @@ class RecorderConfig:
     """Name of this recorder in its control keys ``rec/NAME/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
+    contract: str | None = None
+    """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
+    ``cell.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
     jpeg_quality: int = 90

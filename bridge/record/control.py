@@ -54,7 +54,12 @@ class RecorderClient:
         return answer
 
     def start(
-        self, episode_id: str, info: dict[str, Any] | None = None, task: TaskFile | None = None
+        self,
+        episode_id: str,
+        info: dict[str, Any] | None = None,
+        task: TaskFile | None = None,
+        *,
+        anyway: bool = False,
     ) -> dict[str, Any]:
         """Begin an episode, with its task file where there is one.
 
@@ -63,9 +68,11 @@ class RecorderClient:
             info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
                 known.
             task: What the episode is of; it is attached to it.
+            anyway: Also when topics are missing that the contract requires.
         """
         sent = {} if task is None else {"task_file": task.data.decode()}
-        return self.ask("start", {"id": episode_id, "info": info or {}, **sent})
+        request = {"id": episode_id, "info": info or {}, "anyway": anyway, **sent}
+        return self.ask("start", request)
 
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
@@ -98,9 +105,10 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     """
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
-        _only(request, "start", {"id", "info", "task_file"})
+        _only(request, "start", {"id", "info", "anyway", "task_file"})
         info = parse_info(request.get("id"), request.get("info", {}))
-        return recorder.start(info, parse_task_file(request.get("task_file")))
+        task = parse_task_file(request.get("task_file"))
+        return recorder.start(info, task, anyway=request.get("anyway") is True)
 
     def stop(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "stop", {"outcome", "discard"})

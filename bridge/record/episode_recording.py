@@ -11,6 +11,16 @@ from typing import Any
 
 from bridge.clock import ns_from_s
 from bridge.episode import metadata, schema
+from bridge.episode.contract import (
+    PRESENCE_RECORD,
+    RECORD_NAME,
+    Contract,
+    Span,
+    TopicReport,
+    breaches_of,
+    judge,
+    unknown_tails,
+)
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import part_name
 from bridge.episode.topics import DROPS, EVENT, cell_topic
@@ -25,6 +35,8 @@ from bridge.task.task_file import TaskFile
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
 
+FAILOVER_RECORD = "failover"
+"""Of the metadata record of a part that lies on another disk than the parts before."""
 HASH_PREFIX = "RIHS01_"
 _SHOWN = len(HASH_PREFIX) + 12
 
@@ -162,15 +174,17 @@ class EpisodeFiles:
         info: EpisodeInfo,
         config: DiskConfig,
         now_ns: int,
-        task: TaskFile | None = None,
+        contract: Contract | None,
+        task: TaskFile | None,
     ) -> None:
         """Create the first part.
 
         Args:
             folder: Where episodes lie.
             info: What is being recorded.
-            config: When to begin another part.
-            now_ns: The recorder's clock.
+            config: How it lies on the disk.
+            now_ns: When the first part begins [ns], by the recorder's clock.
+            contract: What the topics promise; each part holds it.
             task: Attached to every part.
 
         Raises:
@@ -178,11 +192,16 @@ class EpisodeFiles:
             BridgeError: When the folder cannot be written.
         """
         self._folder = folder
+        self._first_path = folder / part_name(info.id, 1)
         self._info = info
+        self._contract = contract
         self._task = task
         self._split_bytes = config.split_mb * BYTES_PER_MB
         self._split_ns = ns_from_s(config.split_s)
-        self._config = WriterConfig(flush_s=config.flush_s, sync_s=config.sync_s)
+        self._is_split = bool(config.split_mb or config.split_s)
+        self._config = WriterConfig(
+            flush_s=config.flush_s, sync_s=config.sync_s, backlog_bytes=config.backlog_bytes
+        )
         self._full: list[EpisodeWriter] = []
         self._finisher: threading.Thread | None = None
         self._error: OSError | None = None
@@ -194,7 +213,7 @@ class EpisodeFiles:
     @property
     def first_path(self) -> Path:
         """The finished first file; its name is the episode's."""
-        return self._folder / part_name(self._info.id, 1)
+        return self._first_path
 
     @property
     def open_path(self) -> Path:
@@ -203,20 +222,25 @@ class EpisodeFiles:
 
     def _open(self, now_ns: int) -> EpisodeWriter:
         path = self._folder / part_name(self._info.id, self.index)
+        self._opened_ns = now_ns
         writer = EpisodeWriter(path, config=self._config)
         try:
-            writer.describe(self._info)
-            if self._task is not None:
-                data = self._task.data
-                writer.attach(ATTACHMENT, data, media_type=MEDIA_TYPE, log_time_ns=now_ns)
+            self._say_what_it_is(writer)
         except OSError as error:
             writer.discard()
             raise BridgeError(
                 f"cannot write {writer.part_path}: {error.strerror}. Choose another folder."
             ) from error
-        self._opened_ns = now_ns
         self._paths.append(path)
         return writer
+
+    def _say_what_it_is(self, writer: EpisodeWriter) -> None:
+        writer.describe(self._info)
+        if self._contract is not None:
+            writer.add_metadata(RECORD_NAME, self._contract.to_record())
+        if self._task is not None:
+            data = self._task.data
+            writer.attach(ATTACHMENT, data, media_type=MEDIA_TYPE, log_time_ns=self._opened_ns)
 
     def is_full(self, now_ns: int) -> bool:
         """Say whether the next message belongs into the next part."""
@@ -245,8 +269,28 @@ class EpisodeFiles:
         self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
         self._finisher.start()
 
+    def fail_over(self, folder: Path, cause: str) -> Path:
+        """Go on in another folder, with all that the disk has not taken.
+
+        Raises:
+            UsageError: When the part exists there.
+            BridgeError: When that folder cannot be written either.
+            OSError: The same, a moment later.
+        """
+        before = self.writer
+        path = folder / part_name(self._info.id, self.index + 1)
+        self.writer = before.continue_in(path)
+        self.index += 1
+        self._is_split = True
+        self._paths.append(path)
+        self._say_what_it_is(self.writer)
+        values = {"of": json.dumps(str(before.path)), "cause": json.dumps(cause)}
+        self.writer.add_metadata(FAILOVER_RECORD, values)
+        self._folder = folder
+        return path
+
     def _say_part(self, writer: EpisodeWriter, *, is_last: bool) -> None:
-        if (self._split_bytes or self._split_ns) and writer is not self._said:
+        if self._is_split and writer is not self._said:
             values = {"index": json.dumps(self.index), "last": json.dumps(is_last)}
             writer.add_metadata("split", values)
             self._said = writer
@@ -315,6 +359,7 @@ class EpisodeRecording:
         start_ns: int,
         latched: Callable[[], list[WireSample]],
         others: Mapping[str, Callable[[], object]],
+        contract: Contract | None = None,
         task: TaskFile | None = None,
     ) -> None:
         """Create the episode file and say in it who and what it is.
@@ -326,6 +371,7 @@ class EpisodeRecording:
             start_ns: When it begins [ns].
             latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
+            contract: What the topics promise.
             task: The task file, to be attached.
 
         Raises:
@@ -336,6 +382,11 @@ class EpisodeRecording:
         self.ledger = Ledger(config.queues.max_topics)
         self.start_ns = start_ns
         self.outcome: metadata.Outcome | None = None
+        self.presence: dict[str, TopicReport] = {}
+        """By topic, when it was there; known at the end."""
+        self.failovers: list[dict[str, str]] = []
+        """Where it went on when a disk failed."""
+        self._contract = contract
         self._config = config
         self._latched = latched
         self._others = others
@@ -346,7 +397,7 @@ class EpisodeRecording:
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
-        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, task)
+        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract, task)
         try:
             self._repeat_latched(start_ns)
         except OSError as error:
@@ -364,6 +415,28 @@ class EpisodeRecording:
     def path(self) -> Path:
         """The episode's file when it is finished; its first one if it is split."""
         return self._parts.first_path
+
+    def keep_name(self) -> bool:
+        """Write the file anew where somebody removed it; raises OSError when that fails."""
+        return self._parts.writer.keep_name()
+
+    def fail_over(self, folder: Path, cause: str) -> Path:
+        """Go on in another folder; see ``EpisodeFiles.fail_over``."""
+        path = self._parts.fail_over(folder, cause)
+        self.failovers.append({"path": str(path), "cause": cause})
+        self.ledger.warn(f"the disk failed ({cause}); the rest is in {path}")
+        return path
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether little enough waits for the disk to give it more images."""
+        return self._parts.writer.backlog_bytes < self._config.disk.backlog_bytes
+
+    @property
+    def disk(self) -> dict[str, float]:
+        """How far the disk is behind, for the status."""
+        writer = self._parts.writer
+        return {"write_lag_s": writer.lag_s, "busy_s": writer.busy_s}
 
     @property
     def num_parts(self) -> int:
@@ -494,7 +567,9 @@ class EpisodeRecording:
     def resume(self, command: Command) -> None:
         """Record and count again what comes after this command."""
         self.ledger.resume(command.ticket)
-        self._paused_ns[-1].append(command.received_ns)
+        span = self._paused_ns[-1]
+        span.append(command.received_ns)
+        self.ledger.pauses.append((span[0], span[1]))
         self.write_event("resumed", stamp_ns=command.received_ns)
 
     def refuse(self, entries: Iterable[Item | Dropped]) -> None:
@@ -534,6 +609,8 @@ class EpisodeRecording:
         if outcome is not None:
             writer.add_metadata("outcome", metadata.to_strings(outcome))
         writer.add_metadata("drops", self.ledger.to_metadata())
+        paused = [(span[0], span[1] if len(span) > 1 else end_ns) for span in self._paused_ns]
+        self._judge_presence(Span(self.start_ns, end_ns, paused))
         recorder = {
             "settings": asdict(self._config),
             "start_ns": self.start_ns,
@@ -541,12 +618,28 @@ class EpisodeRecording:
             "stopped_by": reason,
             "latched_messages_repeated": self._num_latched,
             "clock_steps_ns": self._clock_steps_ns,
-            "paused": [[*span, end_ns][:2] for span in self._paused_ns],
+            "paused": paused,
             "parts": self.num_parts,
+            "failovers": self.failovers,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}
         writer.add_metadata("recorder", values)
+
+    def _judge_presence(self, span: Span) -> None:
+        totals = self.ledger.totals()
+        lost = {topic: tally.lost for topic, tally in totals.items()}
+        self.presence = judge(
+            self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
+        )
+        record = {
+            "topics": {topic: asdict(report) for topic, report in self.presence.items()},
+            "breaches": breaches_of(self.presence),
+            "unknown_tails": unknown_tails(self.presence),
+            "unnumbered": self.ledger.unnumbered(),
+        }
+        values = {name: json.dumps(value) for name, value in record.items()}
+        self._parts.writer.add_metadata(PRESENCE_RECORD, values)
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""

@@ -1,8 +1,18 @@
 """What can go wrong while recording."""
 
+import errno
 from pathlib import Path
 
 from bridge.errors import BridgeError, UsageError
+
+MAX_NAMED = 4
+"""Topics that a sentence names."""
+
+
+def in_short(words: list[str]) -> str:
+    """Join a few of several sentences about topics, and say how many there are besides."""
+    more = f"; and {len(words) - MAX_NAMED} more" if len(words) > MAX_NAMED else ""
+    return "; ".join(words[:MAX_NAMED]) + more
 
 
 class LifecycleError(UsageError):
@@ -11,6 +21,45 @@ class LifecycleError(UsageError):
 
 class ControlError(UsageError):
     """A control command is malformed."""
+
+
+class MissingTopicsError(LifecycleError):
+    """An episode was not started: the contract of the cell requires topics that are not there."""
+
+    def __init__(self, *, episode: str, missing: list[str]) -> None:
+        """Remember what is not there."""
+        self.missing = missing
+        super().__init__(
+            f"{episode} was not started: {in_short(missing)}. The contract requires it. "
+            "Start its publisher, or start with --anyway."
+        )
+
+
+_WORDS = {
+    errno.EIO: "the disk, or the connection to it, is failing",
+    errno.EROFS: "the system has stopped writing to this disk, often after an error of it",
+    errno.ENOENT: "the file or its folder was removed while it was written",
+    errno.ESTALE: "the folder on the network was removed or replaced",
+}
+
+
+def cause_of(error: OSError) -> str:
+    """Say what a disk said, in words a person can act on."""
+    said = error.strerror or str(error)
+    words = _WORDS.get(error.errno or 0)
+    return f"{said} ({words})" if words else said
+
+
+class FolderTakenError(UsageError):
+    """Another recorder writes into the folder."""
+
+    def __init__(self, *, run: Path) -> None:
+        """Remember the folder."""
+        self.run = run
+        super().__init__(
+            f"another recorder records into {run} already. Stop it, or give this one a run folder "
+            "of its own."
+        )
 
 
 class NoSpaceError(BridgeError):
@@ -39,5 +88,6 @@ class DiskError(BridgeError):
         )
         super().__init__(
             f"cannot write {path}: {cause}. The recorder stopped. {kept}. "
-            "Free some space or choose another disk, then record again."
+            "Free some space or choose another disk, then record again; "
+            "--failover DIR lets another disk take over by itself."
         )

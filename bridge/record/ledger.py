@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
+from bridge.episode.contract import Presence
 from bridge.record.inspection import GOOD, MessageState
 from bridge.record.queue import MAX_WARNINGS, Dropped, Item, second_of
 
@@ -79,6 +80,10 @@ class Ledger:
     def __init__(self, max_topics: int = 4096) -> None:
         """Start empty."""
         self.warnings: list[str] = []
+        self.presences: dict[str, Presence] = {}
+        """When each topic was there."""
+        self.pauses: list[tuple[int, int]] = []
+        """Begin and end of each pause that is over [ns]."""
         self._max_topics = max_topics
         self._totals: dict[str, Tally] = {}
         self._open: dict[tuple[int, str], Tally] = {}
@@ -141,6 +146,11 @@ class Ledger:
         gid = sample.source_gid
         if gid is not None and self._first_gid.setdefault(sample.topic, gid) != gid:
             self._shared.add(sample.topic)
+        presence = self.presences.get(sample.topic)
+        if presence is None and len(self.presences) < self._max_topics:
+            presence = self.presences[sample.topic] = Presence()
+        if presence is not None:
+            presence.see(sample.received_ns, self.pauses)
         if sample.source_ns is not None:
             tally.see_offset(sample.received_ns - sample.source_ns)
         if finding is not GOOD:
@@ -192,6 +202,11 @@ class Ledger:
         for tally in self.totals().values():
             total.add(tally)
         return total
+
+    def unnumbered(self) -> dict[str, int]:
+        """By topic, messages without a number: losses among them cannot be seen."""
+        totals = self.totals()
+        return {topic: tally.unnumbered for topic, tally in totals.items() if tally.unnumbered}
 
     def to_metadata(self) -> dict[str, str]:
         """The ``drops`` metadata record: totals, counts by topic, and warnings.

@@ -12,8 +12,9 @@ from typing import Any
 
 from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
+from bridge.episode.contract import Contract, breaches_of, unknown_tails
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import UsageError
+from bridge.errors import GstError, UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
@@ -176,6 +177,8 @@ class Lifecycle:
         self.latched = LatchedMessages(latched)
         self.others: dict[str, Callable[[], object]] = {}
         """What others have to say of each episode, by name."""
+        self.contract: Contract | None = None
+        """What the topics of the next episode promise."""
         self.ring = PreRoll(
             seconds=config.preroll_s,
             max_bytes=config.preroll_mb * BYTES_PER_MB,
@@ -187,11 +190,17 @@ class Lifecycle:
         self._queued_bytes = queued_bytes
         self._reserve = DiskReserve(run.episodes_dir, config.disk.footer_mb)
         self._unwritable: set[str] = set()
+        self._has_failed_over = False
 
     @property
     def is_quiet(self) -> bool:
         """Say whether messages are of no use now, but for what is latched."""
         return (self.take is None or self.is_paused) and not self.ring.is_on
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether the disk may be given images; small messages it is given at any time."""
+        return self.take is None or self.take.keeps_up
 
     @property
     def state(self) -> str:
@@ -237,6 +246,41 @@ class Lifecycle:
         self.ring.trim(now_ns)
         if self.take is not None:
             self.take.tick(now_ns, self._health())
+
+    def look_at_file(self) -> str:
+        """Return what happened to the open file from outside, or ""; raises OSError."""
+        take = self.take
+        if take is None or not take.keep_name():
+            return ""
+        return f"{take.part_path} was removed while it was written; it was written there anew"
+
+    def fail_over(self, cause: str) -> str:
+        """Let another disk take over the open episode and all later ones.
+
+        Returns:
+            What happened, in words; "" when there is no other disk, or it fails as well.
+        """
+        folder = self._config.disk.failover
+        if folder is None or self.take is None or self.is_finishing or self._has_failed_over:
+            return ""
+        self._has_failed_over = True
+        before = self.take.part_path
+        try:
+            run = RunFolder.create(folder)
+            path = self.take.fail_over(run.episodes_dir, cause)
+        except (GstError, OSError):
+            return ""
+        self._run = run
+        self._reserve.release()
+        self._reserve = DiskReserve(run.episodes_dir, self._config.disk.footer_mb)
+        with contextlib.suppress(NoSpaceError):  # then there is none to hold back
+            self._reserve.hold()
+        return f"cannot write {before}: {cause}. The recording goes on in {path}"
+
+    @property
+    def run(self) -> RunFolder:
+        """Where episodes go now."""
+        return self._run
 
     def look_at_disk(self) -> str:
         """Return why the open episode must end now, or ""."""
@@ -333,6 +377,7 @@ class Lifecycle:
             start_ns=min([*first_ns, command.received_ns]),
             latched=self.latched.all,
             others=self.others,
+            contract=self.contract,
             task=task,
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
@@ -466,4 +511,8 @@ def counts(take: EpisodeRecording) -> Answer:
         "unknown_type": total.unknown_type,
         "shed": total.shed,
         "parts": take.num_parts,
+        "failovers": take.failovers,
+        "unnumbered": take.ledger.unnumbered(),
+        "breaches": breaches_of(take.presence),
+        "unknown_tails": unknown_tails(take.presence),
     }

@@ -9,7 +9,9 @@ with open_recorder(Path("runs/monday")) as recorder:
 """
 
 import contextlib
+import fcntl
 import json
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +24,7 @@ from bridge.episode.catalogue import read_entry
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
 from bridge.episode.cdr.messages import CompressedColor
+from bridge.episode.contract import find_contract
 from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
@@ -30,6 +33,8 @@ from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.errors import FolderTakenError
+from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
@@ -157,6 +162,7 @@ class PublisherLiveliness:
     def __init__(self, session: WireSession, recorder: Recorder) -> None:
         """Begin to watch."""
         self._recorder = recorder
+        self._presence: PresenceMonitor = recorder.presence
         self._lock = threading.Lock()
         self._tokens: dict[str, str] = {}
         self._watching: list[Subscriber] = [
@@ -170,8 +176,12 @@ class PublisherLiveliness:
             subscriber.close()
 
     def _on_source(self, key: str, alive: bool) -> None:
-        if not alive and not key.startswith("rec/"):
-            self._recorder.forget(f"/{key.removesuffix(ALIVE)}/")
+        if key.startswith("rec/"):
+            return
+        prefix = f"/{key.removesuffix(ALIVE)}/"
+        self._presence.publisher(prefix, is_there=alive)
+        if not alive:
+            self._recorder.forget(prefix)
 
     def _on_ros(self, key: str, alive: bool) -> None:
         endpoint = rmw.parse_token(key)
@@ -180,10 +190,12 @@ class PublisherLiveliness:
         with self._lock:
             if alive:
                 self._tokens[key] = endpoint.topic
+                self._presence.publisher(endpoint.topic, is_there=True)
                 return
             was_there = self._tokens.pop(key, None) is not None
             is_last = endpoint.topic not in self._tokens.values()
         if was_there and is_last:
+            self._presence.publisher(endpoint.topic, is_there=False)
             self._recorder.forget(endpoint.topic)
 
 
@@ -214,11 +226,14 @@ class LiveRecorder:
             task: The task file of episodes that name this task or none.
 
         Raises:
-            UsageError: When ``msg_folder`` holds no definitions, or one that is none.
+            UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
+                contract cannot be used, or when another recorder writes into the folder.
         """
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
+        find_contract(run.path, config.contract)  # the same
         self.run = run
+        self._folder_lock = _lock_folder(run)
         self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
@@ -241,6 +256,10 @@ class LiveRecorder:
         self._departures = PublisherLiveliness(session, core)
         self._graph = watch_ros2(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
+        core.also_tell("receive_errors", lambda: session.receive_errors)
+        core.also_tell("last_receive_error", lambda: session.last_receive_error)
+        self._links = session.watch_links(self._on_link)
+        self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -256,8 +275,16 @@ class LiveRecorder:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
 
+    def _on_link(self, is_open: bool) -> None:
+        if not is_open:
+            self.core.presence.link_closed()
+
     def _tell(self) -> None:
-        while not self._ended.wait(STATUS_PERIOD_S):
+        while True:
+            self.core.news_arrived.wait(STATUS_PERIOD_S)
+            self.core.news_arrived.clear()
+            if self._ended.is_set():
+                return
             with contextlib.suppress(WireError):  # the session is closing
                 self.core.input_queue.watched = self._previews.look(
                     self.core.input_queue.image_topics()
@@ -283,14 +310,19 @@ class LiveRecorder:
             data = json.dumps({**about, **entry}).encode()
             self._episodes.put(data, source_ns=self.session.now_ns())
 
-    def start(self, episode_id: str, **about: Any) -> dict[str, Any]:
-        """Begin an episode; ``about`` are fields of ``EpisodeInfo``: task, operator, tags ...
+    def start(self, episode_id: str, *, anyway: bool = False, **about: Any) -> dict[str, Any]:
+        """Begin an episode.
+
+        Args:
+            episode_id: Its name.
+            anyway: Warn of topics that are required and missing, instead of refusing.
+            about: Fields of ``EpisodeInfo``: task, operator, tags ...
 
         Raises:
             UsageError: When the id or a field is wrong, or another episode is open.
             BridgeError: When the disk has no space.
         """
-        return self.core.start(parse_info(episode_id, about))
+        return self.core.start(parse_info(episode_id, about), anyway=anyway)
 
     def stop(
         self, *, result: str | None = None, detail: str | None = None, discard: bool = False
@@ -339,6 +371,8 @@ class LiveRecorder:
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
         self._ended.set()
+        self.core.news_arrived.set()
+        self._heartbeat.close()
         if self.core.error is not None:  # whoever listens hears why, before the next second
             with contextlib.suppress(WireError):
                 self._say_status()
@@ -347,9 +381,15 @@ class LiveRecorder:
         for subscriber in self._subscribers:
             subscriber.close()
         self._departures.close()
+        if self._links is not None:
+            self._links.close()
         self._graph.close()
         self._thread.join(timeout=STATUS_PERIOD_S)
-        return self.core.close()
+        try:
+            return self.core.close()
+        finally:
+            if self._folder_lock is not None:
+                os.close(self._folder_lock)
 
 
 @contextlib.contextmanager
@@ -382,6 +422,24 @@ def open_recorder(
             recorder.close()
         if recorder.core.error is not None:
             raise recorder.core.error
+
+
+def _lock_folder(run: RunFolder) -> int | None:
+    """Keep other recorders out of a run folder, until the process ends.
+
+    Raises:
+        FolderTakenError: When another one is at work there.
+    """
+    descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise FolderTakenError(run=run.path) from error
+    except OSError:  # some network file systems lock no folders
+        os.close(descriptor)
+        return None
+    return descriptor
 
 
 def _outcome(result: str | None, detail: str | None) -> Outcome | None:

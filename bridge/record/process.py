@@ -11,11 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from bridge.episode.contract import presence_lines
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.record.control import parse_info
+from bridge.record.errors import MissingTopicsError, in_short
 from bridge.record.live import LiveRecorder
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
@@ -26,7 +28,8 @@ from bridge.wire.errors import is_loopback
 from bridge.wire.session import open_session
 
 HELP = (
-    "keys: s start, x stop, p pause or resume, m mark, y success, n failure, "
+    "keys: s start (S although topics are missing), x stop, p pause or resume, m mark, "
+    "y success, n failure, "
     "w write the pre-roll; Ctrl-C ends"
 )
 
@@ -90,8 +93,9 @@ class Keys:
 
     def _act(self, key: str) -> str:
         recorder = self._recorder
-        if key == "s":
-            return f"started {recorder.start(next_info(self._run, self._about))['episode']}"
+        if key in ("s", "S"):
+            info = next_info(self._run, self._about)
+            return f"started {recorder.start(info, anyway=key == 'S')['episode']}"
         if key == "x":
             return _summary(recorder.stop(reason="keyboard"))
         if key == "p":
@@ -110,10 +114,13 @@ class Keys:
 
 
 def _summary(answer: dict[str, Any]) -> str:
-    return f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost"
+    line = f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost"
+    return "\n  ".join([line, *presence_lines(answer)])
 
 
 STATUS_PERIOD_S = 5.0
+WAIT_S = 0.25
+"""How often it looks whether the required topics are there."""
 LIVE_PERIOD_S = 0.5
 
 
@@ -127,6 +134,7 @@ def run_recorder(
     episode: EpisodeInfo | None = None,
     duration_s: float | None = None,
     about: EpisodeAbout | None = None,
+    anyway: bool = False,
     task: TaskFile | None = None,
 ) -> dict[str, Any] | None:
     """Record until ``stop`` is set, the duration is over, or the disk fails.
@@ -140,6 +148,8 @@ def run_recorder(
         episode: Start this one at once instead of waiting for a command.
         duration_s: With ``episode``, stop after this long [s].
         about: What episodes started from the keyboard are.
+        anyway: Start ``episode`` although topics are missing that the contract requires; else it
+            waits for them.
         task: The task file of episodes that name this task or none.
 
     Returns:
@@ -153,10 +163,8 @@ def run_recorder(
         recorder = LiveRecorder(session, run, config, output.say, task)
         _say_where(output, wire, config.recorder, run)
         try:
-            if episode is not None:
-                started = recorder.core.start(episode)
-                if remark := started.get("task_remark"):
-                    output.say(str(remark))
+            if episode is not None and not _start(recorder.core, episode, stop, output, anyway):
+                return None
             with single_keys() as has_keys:
                 keys = Keys(recorder.core, run, about or EpisodeAbout()) if has_keys else None
                 _watch(recorder.core, stop, duration_s, output, keys)
@@ -165,6 +173,28 @@ def run_recorder(
         if recorder.core.error is not None:
             raise recorder.core.error
     return answer
+
+
+def _start(
+    recorder: Recorder, episode: EpisodeInfo, stop: threading.Event, output: Output, anyway: bool
+) -> bool:
+    """Start an episode when the topics are there that its contract requires; say what lacks."""
+    told = ""
+    while True:
+        try:
+            answer = recorder.start(episode, anyway=anyway)
+        except MissingTopicsError as error:
+            if (text := f"waiting: {in_short(error.missing)}") != told:
+                output.say(text)
+                told = text
+            if stop.wait(WAIT_S):
+                return False
+        else:
+            if remark := answer.get("task_remark"):
+                output.say(str(remark))
+            if answer.get("missing"):
+                output.say(f"warning: started although {in_short(answer['missing'])}")
+            return True
 
 
 def _say_where(output: Output, wire: WireConfig, recorder: str, run: RunFolder) -> None:
@@ -194,6 +224,8 @@ def _watch(
         while not stop.wait(0.1) and not recorder.failed.is_set():
             if keys is not None and (said := keys.poll()):
                 say(said)
+            while recorder.news:
+                say(recorder.news.popleft())
             now_s = time.monotonic()
             if end_s is not None and now_s >= end_s:
                 return

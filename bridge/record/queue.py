@@ -17,6 +17,7 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import transforms_from_cdr
 from bridge.episode.topics import DROPS, TF_STATIC, is_latched
+from bridge.episode.writer import LARGE_BYTES
 from bridge.record.config import BYTES_PER_MB, QueueConfig
 from bridge.record.inspection import MessageState, resolve_type
 from bridge.record.sequence import SequenceTracker, Step
@@ -230,8 +231,8 @@ def second_of(stamp_ns: int) -> int:
     return stamp_ns // NS_PER_S
 
 
-BULK_BYTES = 1_000_000
-"""A message of this size counts as bulk whatever its type."""
+BULK_BYTES = LARGE_BYTES
+"""A topic with a message of this size counts as bulk from then on, whatever its type."""
 OVERHEAD_BYTES = 512
 """What a queued message costs beside its data, roughly."""
 IMAGE_TYPES = frozenset((schema.IMAGE, schema.COMPRESSED_IMAGE))
@@ -244,10 +245,11 @@ class Flow:
     topic: str
     type_name: str
     is_image: bool
-    is_bulk: bool
-    """Also video, which goes past the encoders."""
     is_ledger: bool
     """The topic on which a recorder says what it lost; nobody else may."""
+    is_bulk: bool
+    """Takes space from the budget of images, and waits for the disk with them; also video, which
+    goes past the encoders."""
     seen: int = 0
     second: int = 0
     in_second: int = 0
@@ -285,7 +287,7 @@ class InputQueue:
         self._flows: dict[tuple[str, str], Flow] = {}
         self._ticket = 0
         self.images_in = 0
-        """Images handed over so far."""
+        """Images and other bulk taken in so far."""
         self._commands = 0
         self._bulk_bytes = 0
         self._small_in = 0
@@ -325,18 +327,18 @@ class InputQueue:
                 if not for_preview:
                     return
             size = len(sample.data)
-            is_bulk = flow.is_bulk or size >= BULK_BYTES
+            is_bulk = flow.is_bulk = flow.is_bulk or size >= BULK_BYTES
             cost = size + OVERHEAD_BYTES
             if not self._fits(flow, sample, step, cost=cost, is_bulk=is_bulk):
                 return
             item = Item(sample, step, ticket, flow.type_name, size, is_bulk)
             if is_bulk:
                 self._bulk_bytes += cost
+                self.images_in += 1
             else:
                 self._small_in += cost
             if flow.is_image:
                 item.for_preview = for_preview
-                self.images_in += 1
                 self._hand_over(item)
             else:
                 self._entries.append(item)
@@ -474,15 +476,17 @@ class InputQueue:
             self._is_quiet = self._commands == after
 
 
-# Small messages never wait for images. A barrier command (start, stop ...) waits until every image
-# received before it has come out of its encoder, and holds back everything received after it.
+# Small messages never wait for images; images wait while the disk is behind. A barrier command
+# (start, stop ...) waits until every image received before it has come out of its encoder, and
+# holds back everything received after it.
 
 
 class Merge:
     """Fed with what the input_queue gives; yields what may be dealt with now."""
 
-    def __init__(self) -> None:
-        """Start empty."""
+    def __init__(self, may_write_bulk: Callable[[], bool] = lambda: True) -> None:
+        """Start empty; ``may_write_bulk`` says whether the disk keeps up with images."""
+        self._may_write_bulk = may_write_bulk
         self._entries: deque[Entry] = deque()
         self._held: deque[Item] = deque()
         self.images_out = 0
@@ -499,8 +503,10 @@ class Merge:
         return bool(self._entries)
 
     def feed(self, entries: Iterable[Entry], images: Iterable[Item]) -> None:
-        """Add what came in."""
-        self._entries.extend(entries)
+        """Add what came in; bulk that needs no encoder is held with the images."""
+        for entry in entries:
+            is_bulk = isinstance(entry, Item) and entry.is_bulk
+            (self._held if is_bulk else self._entries).append(entry)  # type: ignore[arg-type]
         self._held.extend(images)
 
     def ready(self) -> Iterator[Entry]:
@@ -510,17 +516,19 @@ class Merge:
                 yield self._entries.popleft()
             barrier = self._entries[0] if self._entries else None
             if not isinstance(barrier, Command):
-                yield from self._images_before(None)
+                yield from self._images_before(None, self._may_write_bulk)
                 return
-            yield from self._images_before(barrier.ticket)
+            yield from self._images_before(barrier.ticket, self._may_write_bulk)
             if self.images_out < barrier.images_before:
                 return
             yield self._entries.popleft()
 
-    def _images_before(self, ticket: int | None) -> Iterator[Item]:
+    def _images_before(
+        self, ticket: int | None, may_go_on: Callable[[], bool] = lambda: True
+    ) -> Iterator[Item]:
         # One by one: what has not been yielded must be found by rest(), called in between.
         at = 0
-        while at < len(self._held):
+        while at < len(self._held) and may_go_on():
             item = self._held[at]
             if ticket is None or item.ticket < ticket:
                 del self._held[at]

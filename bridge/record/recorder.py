@@ -8,6 +8,7 @@ import contextlib
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, replace
@@ -16,12 +17,20 @@ from pathlib import Path
 from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
+from bridge.episode.contract import find_contract
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
-from bridge.record.errors import ControlError, DiskError, LifecycleError
+from bridge.record.errors import (
+    ControlError,
+    DiskError,
+    LifecycleError,
+    MissingTopicsError,
+    cause_of,
+)
 from bridge.record.lifecycle import Answer, Lifecycle
+from bridge.record.presence import News, PresenceMonitor
 from bridge.record.queue import Command, Dropped, InputQueue, Item, Merge
 from bridge.record.status import Status
 from bridge.task.find import MissingTaskError, find_task_file, keep_task_file
@@ -33,6 +42,7 @@ POLL_S = 0.02
 IDLE_POLL_S = 0.1
 BARRIER_POLL_S = 0.002
 SECOND_S = 1.0
+MAX_NEWS = 1000
 LAST_IMAGES_S = 2.0
 """How long a failed disk waits for images in the encoders, to count them."""
 
@@ -59,6 +69,9 @@ class Recorder:
             preview: Called with images of which somebody wants a preview.
             task: The task file of episodes that name this task or none.
             wall_ns: The system clock, watched for steps.
+
+        Raises:
+            ContractError: When the contract of the cell cannot be used.
         """
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
@@ -68,11 +81,19 @@ class Recorder:
         encoder = ImageEncoder(self.config, lambda: self.input_queue.shed)
         self._encoders = EncoderThreads(encoder, self._take_back, preview)
         self.input_queue = InputQueue(self.config.queues, self._encoders.submit, encoder.kinds)
-        self._merge = Merge()
+        self._merge = Merge(lambda: self._life.keeps_up)
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
-        self._status = Status(run, self.config, self.input_queue, self._life, now_ns)
+        self.presence = PresenceMonitor(self.input_queue.seen, tell=self._note)
+        self.news: deque[str] = deque(maxlen=MAX_NEWS)
+        """What a person should hear of at once, for one reader who takes it out."""
+        self.news_arrived = threading.Event()
+        """Set with each piece of news; for one waiter, who clears it."""
+        self.read_contract()
+        self._status = Status(
+            run, self.config, self.input_queue, self._life, now_ns, self.presence.status
+        )
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
         self._tell: Callable[[Path], None] = lambda path: None
         self._next_second_s = 0.0
@@ -103,23 +124,48 @@ class Recorder:
     def _take_back(self, item: Item, saved: int) -> None:
         self.input_queue.put_image(item, saved)
 
-    def start(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
+    def read_contract(self) -> None:
+        """Read the contract of the cell anew; it may have been learned or edited.
+
+        Raises:
+            ContractError: When it cannot be used.
+        """
+        contract = find_contract(self._run.path, self.config.contract)
+        self._life.contract = self.presence.contract = contract
+
+    def start(
+        self, info: metadata.EpisodeInfo, task: TaskFile | None = None, *, anyway: bool = False
+    ) -> Answer:
         """Begin an episode, with the pre-roll if there is one.
 
         Args:
             info: What is being recorded.
             task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked
                 up by the name in ``info`` when it is not given.
+            anyway: Warn of topics that are required and missing, instead of refusing.
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
+            MissingTopicsError: When the contract requires topics that are not there.
             BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
+        self.read_contract()
         task = self._task_of(info) if task is None else task
         info = described_by(info, task)
-        answer = self._command(lambda command: self._life.start(info, command, task))
-        return {**answer, **self._keep(task)}
+        missing = self.presence.missing(self._life.contract)
+        if missing and not anyway:
+            raise MissingTopicsError(episode=info.id, missing=missing)
+
+        def act(command: Command) -> Answer:
+            answer = self._life.start(info, command, task)
+            if missing and self._life.take is not None:
+                self._life.take.ledger.warn(f"started without what is required: {missing}")
+            self.presence.begin(by_habit=not info.stand_in)
+            return answer
+
+        answer = {**self._command(act), **self._keep(task)}
+        return {**answer, "missing": missing} if missing else answer
 
     def _task_of(self, info: metadata.EpisodeInfo) -> TaskFile | None:
         """The recorder's own task file, or the one there is of the name; None for other names."""
@@ -148,6 +194,24 @@ class Recorder:
             )
         return answer
 
+    def _note(self, news: News) -> None:
+        """Tell people of something, and write it into the open episode."""
+        self.news.append(news.text)
+        self.news_arrived.set()
+
+        def act(command: Command) -> None:
+            take = self._life.take
+            if take is not None and not self._life.is_finishing:
+                stamp_ns = command.received_ns
+                take.write_event("note", stamp_ns=stamp_ns, text=news.text, data=news.data)
+
+        command = Command(
+            action=lambda command: self._guard(lambda: act(command)),
+            received_ns=self._now_ns(),
+            is_barrier=False,
+        )
+        self.input_queue.put_command(command)
+
     def stop(
         self,
         *,
@@ -162,9 +226,12 @@ class Recorder:
             discard: Throw it away.
             reason: Who or what stopped it, for the metadata.
         """
-        answer = self._command(
-            lambda command: self._life.stop(outcome, command, discard=discard, reason=reason)
-        )
+
+        def act(command: Command) -> Answer:
+            self.presence.end()
+            return self._life.stop(outcome, command, discard=discard, reason=reason)
+
+        answer = self._command(act)
         if not discard:
             self._enter(answer["episode"])
         return answer
@@ -182,11 +249,16 @@ class Recorder:
 
     def pause(self) -> Answer:
         """Leave messages out until ``resume``; what is latched is recorded all the same."""
-        return self._command(self._life.pause)
+        answer = self._command(self._life.pause)
+        self.presence.end()
+        return answer
 
     def resume(self) -> Answer:
         """Record again."""
-        return self._command(self._life.resume)
+        answer = self._command(self._life.resume)
+        take = self._life.take
+        self.presence.begin(by_habit=take is None or not take.info.stand_in)
+        return answer
 
     def snapshot(self, info: metadata.EpisodeInfo, task: TaskFile | None = None) -> Answer:
         """Write the pre-roll as an episode; needs ``preroll_s``, and no open episode."""
@@ -303,7 +375,7 @@ class Recorder:
             except GstError as error:
                 future.set_exception(error)
             except OSError as error:
-                future.set_exception(self._fail(error))
+                self._answer_failed(future, error, lambda: act(command))
             except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
                 future.set_exception(error)
 
@@ -335,6 +407,21 @@ class Recorder:
             if is_over:
                 self._life.end()
                 return
+
+    def _answer_failed(
+        self, future: "Future[Answer]", error: OSError, again: Callable[[], Answer]
+    ) -> None:
+        """Answer a command that the disk refused: by another disk, or with the error."""
+        failure = self._fail(error)
+        if failure is not None:
+            future.set_exception(failure)
+            return
+        try:
+            future.set_result(again())
+        except GstError as refusal:
+            future.set_exception(refusal)
+        except OSError as second:
+            future.set_exception(self._fail(second) or second)
 
     def _drain(self) -> None:
         for entry in self._merge.ready():
@@ -371,8 +458,10 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
+            if happened := self._life.look_at_file():
+                self._note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
-            if cause and not self._status.failing:
+            if cause and not self._status.failing and not self._take_over(cause):
                 self._end_because(cause)
 
     def _end_because(self, cause: str) -> None:
@@ -385,10 +474,22 @@ class Recorder:
         self._status.failing = cause
         self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
-    def _fail(self, error: OSError) -> DiskError:
-        cause = error.strerror or str(error)
+    def _take_over(self, cause: str) -> bool:
+        """Let another disk take over, if there is one."""
+        happened = self._life.fail_over(cause)
+        if not happened:
+            return False
+        self._run = self._life.run
+        self._note(News(text=happened, data={"kind": "failover"}))
+        return True
+
+    def _fail(self, error: OSError) -> DiskError | None:
+        """End the recording; None when another disk has taken over."""
+        cause = cause_of(error)
         if self._life.error is not None:
             return self._life.error
+        if self._take_over(cause):
+            return None
         self._status.failing = f"cannot write: {cause}. Finishing what there is."
         self._encoders.is_passing = True
         failure = self._life.fail(cause, self._now_ns(), self._rest)

@@ -5,11 +5,16 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.clock import s_from_ns
+from bridge.episode.contract import presence_lines
 from bridge.episode.run_folder import RunFolder
 from bridge.record.config import RecorderConfig
+from bridge.record.errors import in_short
 from bridge.record.lifecycle import Lifecycle, counts
+from bridge.record.presence import Silence
 from bridge.record.queue import InputQueue
 
+SLOW_LAG_S = 0.5
+"""A status line says so when small messages have waited longer than this for the disk."""
 STALLED_S = 1.0
 """A writer that has not moved for this long is waiting for its disk."""
 
@@ -24,8 +29,10 @@ class Status:
         input_queue: InputQueue,
         life: Lifecycle,
         now_ns: Callable[[], int],
+        presence: Callable[[], dict[str, Any]],
     ) -> None:
-        """Remember whom to ask."""
+        """Remember whom to ask; ``presence`` says which topics are silent."""
+        self._presence = presence
         self.failing = ""
         """What the disk said, while the episode is still being finished."""
         self.clock_steps = 0
@@ -62,7 +69,8 @@ class Status:
         life = self._life
         take = life.take  # the writer thread may put another one there at any time
         error = str(life.error) if life.error else self.failing or None
-        stalled_s = time.monotonic() - self._beat_s
+        disk = take.disk if take else {"write_lag_s": 0.0, "busy_s": 0.0}
+        stalled_s = max(time.monotonic() - self._beat_s, disk["busy_s"])
         answer: dict[str, Any] = {
             "ok": error is None,
             "recorder": self._config.recorder,
@@ -74,6 +82,7 @@ class Status:
             "queue_bytes": self._input_queue.queued_bytes,
             "disk_free_bytes": life.free_bytes,
             "shedding": self._input_queue.shed.name.lower(),
+            "write_lag_s": round(disk["write_lag_s"], 2),
             "stalled_s": round(stalled_s, 1) if stalled_s > STALLED_S else 0.0,
             "clock_steps": self.clock_steps,
             "preroll_s": round(life.ring.seconds(self._now_ns()), 1),
@@ -81,6 +90,7 @@ class Status:
             "seen": self._input_queue.seen(),
             "rates_hz": self._rates_hz,
         }
+        answer.update(self._presence())
         answer.update({name: ask() for name, ask in self.others.items()})
         if take is not None:
             answer["duration_s"] = s_from_ns(self._now_ns() - take.start_ns)
@@ -102,6 +112,9 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
     if status["state"] == "failed":
         return f"failed: {status['error']}"
     stalled = f", the disk has not answered for {s:.0f} s" if (s := status["stalled_s"]) else ""
+    if (lag_s := status["write_lag_s"]) > SLOW_LAG_S:
+        stalled += f", small messages wait {lag_s:.1f} s for the disk"
+    stalled += _hearing(status)
     if status["state"] == "idle":
         ring = f", pre-roll {s:.1f} s" if (s := status["preroll_s"]) else ""
         return f"idle, {len(status['seen'])} topics seen{ring}, {free}{stalled}"
@@ -121,14 +134,34 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
     )
 
 
+def _hearing(status: dict[str, Any]) -> str:
+    """Which topics are silent or missing, and whether the recorder hears at all."""
+    told = ""
+    if status["deaf_s"]:
+        told += f", DEAF: the recorder has not heard even itself for {status['deaf_s']:.1f} s"
+    if status.get("receive_errors"):
+        told += f", {status['receive_errors']} messages could not be received"
+    silent = [Silence(**silence) for silence in status["silent"]]
+    named = {silence.topic for silence in silent}
+    missing = [text for text in status["missing"] if text.split(" ")[0] not in named]
+    words = [*map(str, silent), *missing]
+    if words:
+        told += f", {in_short(words)}"
+    return told
+
+
 def describe_answer(answer: dict[str, Any]) -> str:
-    """One line about the answer to a command."""
+    """One line about the answer to a command, and one for each topic that was not there."""
     if answer.get("discarded"):
         return f"{answer['episode']}: discarded"
     if "messages" in answer:
-        return (
+        line = (
             f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
+        line += "".join(f"; goes on in {each['path']}" for each in answer["failovers"])
+        return "\n  ".join([line, *presence_lines(answer)])
     remark = f"; {text}" if (text := answer.get("task_remark")) else ""
+    if answer.get("missing"):
+        remark += f", although {in_short(answer['missing'])}"
     return f"{answer['episode']}: ok{remark}"

@@ -13,7 +13,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import TracebackType
 from typing import Any
@@ -225,9 +225,13 @@ class AliveToken:
 class WireSession:
     """A live connection; use as a context manager."""
 
-    def __init__(self, inner: Any, *, shared_memory_mb: int = 0) -> None:
+    def __init__(self, inner: Any, *, shared_memory_mb: int = 0, config: WireConfig) -> None:
         """Use ``open_session``."""
         self._inner = inner
+        self._config = config
+        self.receive_errors = 0
+        """Messages that could not be taken in; the numbers of their publishers show which."""
+        self.last_receive_error = ""
         self._clock = AnchoredClock()
         self._services: list[Service] = []
         self._alive: list[AliveToken] = []
@@ -288,9 +292,14 @@ class WireSession:
         """
 
         def on_sample(sample: Any) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
+            if sample.kind != zenoh.SampleKind.PUT:
+                return
+            try:
                 now_ns, known = self._clock.now_ns(), self._definitions
                 callback(copy_sample(sample, now_ns, max_bytes=max_bytes, definitions=known))
+            except BaseException as error:  # noqa: BLE001  # let out, it ends this link's thread
+                self.receive_errors += 1
+                self.last_receive_error = f"{type(error).__name__}: {error}"
 
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         try:
@@ -334,6 +343,36 @@ class WireSession:
         self.subscribe(everything, learn, max_bytes=MAX_DEFINITION_BYTES)
         for sample in self.query_all(everything, timeout_s=timeout_s):
             learn(sample)
+
+    def open_loopback(self) -> "WireSession":
+        """Open a client of the endpoint this session listens on, else of one it connects to.
+
+        What it publishes reaches this session through the network, as everybody else's does.
+
+        Raises:
+            WireError: When that endpoint cannot be reached from here.
+        """
+        endpoints = self._config.listen or self._config.connect
+        own = replace(
+            self._config, mode="client", connect=endpoints[:1], listen=(), shared_memory_mb=0
+        )
+        return open_session(own)
+
+    def watch_links(self, callback: Callable[[bool], None]) -> Subscriber | None:
+        """Hear of connections that open (True) and close (False), on a thread of zenoh's.
+
+        Returns:
+            What ends it; None when this zenoh cannot tell.
+        """
+
+        def on_event(event: Any) -> None:
+            callback(event.kind == zenoh.SampleKind.PUT)
+
+        try:
+            listener = self._inner.info.declare_transport_events_listener(on_event)
+        except (zenoh.ZError, AttributeError):
+            return None
+        return Subscriber(listener)
 
     def serve(
         self,
@@ -518,7 +557,7 @@ def open_session(config: WireConfig) -> WireSession:
             "An endpoint looks like tcp/127.0.0.1:7447."
         ) from error
     try:
-        return WireSession(inner, shared_memory_mb=config.shared_memory_mb)
+        return WireSession(inner, shared_memory_mb=config.shared_memory_mb, config=config)
     except WireConfigError:
         inner.close()
         raise

@@ -4,6 +4,7 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import zstandard
 from mcap.records import McapRecord, Schema
@@ -77,26 +78,52 @@ class RecordFile:
         return crc
 
 
-def finished_data_end(file: RecordFile) -> int | None:
-    """Return where the data of a finished file ends, None unless its closing CRCs are right."""
-    size = mcap.RECORD_HEAD.size + mcap.FOOTER_FIELDS.size + len(mcap.MAGIC)
-    if file.size < 2 * size:
+_FOOTER_BYTES = mcap.RECORD_HEAD.size + mcap.FOOTER_FIELDS.size + len(mcap.MAGIC)
+
+
+def _summary_start(file: RecordFile) -> int | None:
+    """Return where the summary of a file begins, None unless its CRC is right."""
+    if file.size < 2 * _FOOTER_BYTES:
         return None
-    footer = file.read(file.size - size, size)
+    footer = file.read(file.size - _FOOTER_BYTES, _FOOTER_BYTES)
     expected = mcap.RECORD_HEAD.pack(mcap.FOOTER, mcap.FOOTER_FIELDS.size)
     if not (footer.startswith(expected) and footer.endswith(mcap.MAGIC)):
         return None
-    start, _, summary_crc = mcap.FOOTER_FIELDS.unpack_from(footer, mcap.RECORD_HEAD.size)
-    end = start - mcap.RECORD_HEAD.size - 4
-    if end < len(mcap.MAGIC) or start > file.size - size:
+    start, _, crc = mcap.FOOTER_FIELDS.unpack_from(footer, mcap.RECORD_HEAD.size)
+    if not len(mcap.MAGIC) <= start <= file.size - _FOOTER_BYTES:
         return None
-    if summary_crc != file.crc(start, file.size - start - len(mcap.MAGIC) - 4):
+    is_right = crc == file.crc(start, file.size - start - len(mcap.MAGIC) - 4)
+    return int(start) if is_right else None
+
+
+def summary_definitions(file: RecordFile) -> list[bytes]:
+    """Return the schemas and channels of a summary that is intact, none of another."""
+    start = _summary_start(file)
+    if start is None:
+        return []
+    return walk_records(file.read(start, file.size - _FOOTER_BYTES - start)).definitions
+
+
+class FinishedData(NamedTuple):
+    """Where the data of a finished file ends, and whether its CRC proves every byte of it."""
+
+    end: int
+    is_proved: bool
+
+
+def finished_data(file: RecordFile) -> FinishedData | None:
+    """Look at the end of a file; None unless its closing CRCs are right."""
+    start = _summary_start(file)
+    end = -1 if start is None else start - mcap.RECORD_HEAD.size - 4
+    if start is None or end < len(mcap.MAGIC):
         return None
     data_end = file.read(end, start - end)
     crc = int.from_bytes(data_end[-4:], "little")
     if not data_end.startswith(mcap.RECORD_HEAD.pack(mcap.DATA_END, 4)):
         return None
-    return end if crc in (0, file.crc(0, end)) else None
+    if crc not in (0, file.crc(0, end)):
+        return None
+    return FinishedData(end, is_proved=crc != 0)
 
 
 # A megabyte asked of the system for every chunk costs 256 page faults, a third of the time a

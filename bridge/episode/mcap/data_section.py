@@ -1,6 +1,6 @@
 """The data section of an MCAP file being written: records, chunks, and the summary at its end."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import zstandard
@@ -169,6 +169,10 @@ class OpenChunk:
         self.size = 0
         self.opened_s = 0.0
         """When the first message came, for the owner to set and read."""
+        self.number = 0
+        """Of this chunk among those of its group."""
+        self.is_small = gather
+        """Whether it holds small messages."""
         self._compressor = _compressor(gather=gather) if compress else None
         self._gather = gather
         self._clear()
@@ -281,6 +285,7 @@ class OpenChunk:
             index=self._index,
         )
         self._clear()
+        self.number += 1
         return encoded
 
 
@@ -304,11 +309,22 @@ class DataSection:
 
     def add_chunk(self, chunk: EncodedChunk) -> None:
         """Write a chunk and its message indexes."""
-        start = self.file.offset
-        indexes, offsets = index_records(chunk.index, start + chunk.length)
-        crc = joined_crc(self.file.crc, chunk.crc, chunk.length)
-        self.file.append([*chunk.buffers, indexes], crc=crc32(indexes, crc))
-        self.book(chunk, start, offsets, len(indexes))
+        self.add_chunks([chunk])
+
+    def add_chunks(self, chunks: Sequence[EncodedChunk]) -> None:
+        """Write chunks, each with its message indexes, all or none."""
+        start, crc = self.file.offset, self.file.crc
+        buffers: list[Buffer] = []
+        places = []
+        for chunk in chunks:
+            indexes, offsets = index_records(chunk.index, start + chunk.length)
+            crc = crc32(indexes, joined_crc(crc, chunk.crc, chunk.length))
+            buffers += [*chunk.buffers, indexes]
+            places.append((chunk, start, offsets, len(indexes)))
+            start += chunk.length + len(indexes)
+        self.file.append(buffers, crc=crc)
+        for place in places:
+            self.book(*place)
 
     def add_indexes(self, chunk: EncodedChunk, start: int) -> None:
         """Write the message indexes of a chunk that lies at ``start``, at the end of the file.

@@ -59,6 +59,8 @@ class Chunk(Span):
     """The whole record, until the walk goes on."""
     head: ChunkHead
     contents: Contents
+    is_journalled: bool = False
+    """It lies in the journal beside the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,12 +237,13 @@ def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
 def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
     front = file.read(offset, min(length, BLOCK_BYTES))[mcap.RECORD_HEAD.size :]
     fields = attachment_fields(front, offset)
-    if mcap.RECORD_HEAD.size + fields.data_at + fields.data_size + 4 != length:
+    body = mcap.RECORD_HEAD.size
+    end = body + fields.data_at + fields.data_size
+    if end + 4 > length:  # later versions of the format may add fields behind the CRC
         message = "the lengths of an attachment contradict each other"
         raise BrokenRecordError(message)
-    (crc,) = struct.unpack("<I", file.read(offset + length - 4, 4))
-    body = mcap.RECORD_HEAD.size
-    if crc and crc != file.crc(offset + body, length - body - 4):
+    (crc,) = struct.unpack("<I", file.read(offset + end, 4))
+    if crc and crc != file.crc(offset + body, end - body):
         message = f"the CRC of the attachment {fields.name!r} is wrong"
         raise BrokenRecordError(message)
     return AttachmentSpan(

@@ -516,7 +516,9 @@ class Operator:
         record = {key: value for key, value in asdict(info).items() if value is not None}
         record["tags"] = list(info.tags)
         del record["id"]
-        answer = self._control("start", {"id": info.id, "info": record, **self._sent})
+        # A simulated cell publishes nothing before its episode begins: nothing can be missing yet.
+        request = {"id": info.id, "info": record, "anyway": True, **self._sent}
+        answer = self._control("start", request)
         if remark := answer.get("task_remark"):
             self._output.detail(str(remark))
         self._open = True

@@ -154,6 +154,7 @@ def test_tick_writes_what_has_waited_long_enough(tmp_path: Path) -> None:
     clock.now_s = 0.45
     writer.tick()
     assert writer.bytes_written > joints_only
+    writer.wait_for_disk()
     assert writer.part_path.stat().st_size == writer.bytes_written
     writer.close()
     assert len(read_all(writer.path)) == 2

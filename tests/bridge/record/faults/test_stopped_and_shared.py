@@ -1,15 +1,13 @@
-"""A recorder that hangs, publishers that die, messages too large, two recorders on one folder."""
+"""A recorder that hangs, publishers that die, messages too large."""
 
 import base64
 import signal
 import time
-from pathlib import Path
 
 import pytest
 from fault_account import accounts_are_exact, check_code, ledger, lost, nothing_invented, read
 from fault_cell import FaultCell, PublisherChild
 from fault_messages import JOINTS, MIX, streams
-from loopback import free_endpoint
 
 from bridge.wire.publisher import Attachment, encode
 
@@ -120,53 +118,3 @@ def test_messages_of_200_megabytes_are_refused_and_counted(cell: FaultCell) -> N
     # The network's own buffer, the assembled message and our copy; the allocator keeps some.
     assert max(peaks_mb) - before_mb < 3.5 * HUGE_BYTES / 1e6
     assert peaks_mb[-1] - peaks_mb[2] < 0.5 * HUGE_BYTES / 1e6  # six are no worse than three
-
-
-def test_two_recorders_share_a_folder_but_no_episode(cell: FaultCell) -> None:
-    """Law: one id, one writer; nobody touches a file that another is writing."""
-    cell.record("--episode", "t1", "--cell", "cell")
-    publisher = cell.publisher()
-    publisher.flow(1.0, "joints", "gripper")
-    part = cell.path("t1").with_suffix(".mcap.part")
-    inode, size = part.stat().st_ino, part.stat().st_size
-    other_endpoint = free_endpoint()
-    other = cell.record(endpoint=other_endpoint)  # its recovery at start-up sees the live part
-    assert "recovered" not in other.said()
-    asker = cell.publisher(other_endpoint)
-    assert asker.ask("status")["ok"]["recovered"] == []
-    refused = asker.ask("start", {"id": "t1"})["refused"]
-    assert refused.startswith(str(part))
-    assert "choose another episode id" in refused
-    assert "\n" not in refused
-    assert asker.ask("start", {"id": "t2", "info": {"cell": "cell"}})["ok"]["ok"]
-    asker.flow(0.3, *MIX)
-    asker.answer()
-    assert asker.ask("stop")["ok"]["lost"] == 0
-    publisher.answer()
-    publisher.flow(0.5, "joints", "gripper")
-    publisher.answer()
-    assert part.stat().st_ino == inode
-    assert part.stat().st_size > size
-    assert publisher.ask("stop")["ok"]["lost"] == 0
-    accounts_are_exact(cell.path("t1"), publisher.sent())
-    accounts_are_exact(cell.path("t2"), asker.sent())
-    assert [check_code(cell.path(name)) for name in ("t1", "t2")] == [0, 0]
-    assert asker.ask("start", {"id": "t1"})["refused"].endswith("move it away.")
-    assert names(cell) == ["t1.mcap", "t2.mcap"]
-
-
-def names(cell: FaultCell) -> list[str]:
-    return sorted(path.name for path in Path(cell.run / "episodes").iterdir())
-
-
-def test_a_recorder_given_an_id_in_use_ends_with_one_sentence(cell: FaultCell) -> None:
-    cell.record("--episode", "t1")
-    part = cell.path("t1").with_suffix(".mcap.part")
-    end_s = time.monotonic() + 10.0
-    while not part.exists() and time.monotonic() < end_s:
-        time.sleep(0.02)
-    second = cell.start_recording("--episode", "t1", endpoint=free_endpoint())
-    assert second.process.wait(timeout=60.0) == 2
-    (sentence,) = [line for line in second.said().splitlines() if "listens on" not in line]
-    assert "t1.mcap.part is being written" in sentence
-    assert names(cell) == ["t1.mcap.part"]

@@ -1,0 +1,472 @@
+"""What a cell's topics promise, and whether a recording shows it: presence, not only gaps.
+
+A contract is a TOML file: ``cell.toml`` in a run folder, or a template of ``datasets/cells``. The
+recorder watches it live and keeps a copy in every episode, so that ``check`` judges a file by what
+was promised when it was recorded. Without a contract only one thing is judged: a regular stream
+that ends long before the recording does.
+"""
+
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bridge.clock import NS_PER_S, s_from_ns
+from bridge.data_files import dataset_file
+from bridge.episode.topics import DROPS, is_latched, is_truth
+from bridge.errors import UsageError
+from bridge.whole_file import write_whole
+
+SCHEMA_VERSION = 1
+CONTRACT_FILE = "cell.toml"
+"""Of a run folder."""
+TEMPLATES = "cells/contracts"
+RECORD_NAME = "contract"
+"""Of the metadata record that holds an episode's contract."""
+PRESENCE_RECORD = "presence"
+"""Of the metadata record that holds what was there, by topic."""
+
+REGULAR_MESSAGES = 20
+"""A stream with fewer messages has shown no rate."""
+REGULAR_SPAN_NS = NS_PER_S
+LEAST_SILENCE_S = 1.0
+"""Without a contract no shorter silence is remarkable [s]."""
+HABIT = 5
+"""Without a contract a silence is remarkable beyond so many times the longest one before it."""
+FEWEST_FOR_RATE = 10
+"""A rate is judged when the contract promises at least so many messages."""
+
+
+class ContractError(UsageError):
+    """A contract cannot be used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TopicRule:
+    """What one topic promises."""
+
+    rate_hz: float | None = None
+    """Messages per second [1/s]; None promises none."""
+    tolerance: float = 0.2
+    """By which part of it the mean rate may differ."""
+    silence_s: float | None = None
+    """The longest time without a message [s]; None allows any."""
+    required: bool = True
+    """Whether a recording without the topic is broken; else it may be absent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contract:
+    """What a cell's topics promise."""
+
+    topics: Mapping[str, TopicRule]
+    cell: str = ""
+    """Name of the cell, for people."""
+
+    def to_record(self) -> dict[str, str]:
+        """The ``contract`` metadata record; every value is JSON."""
+        rules = {topic: asdict(rule) for topic, rule in self.topics.items()}
+        values = {"schema_version": SCHEMA_VERSION, "cell": self.cell, "topics": rules}
+        return {name: json.dumps(value) for name, value in values.items()}
+
+    def required(self) -> list[str]:
+        """Topics without which nothing should be recorded."""
+        return [topic for topic, rule in self.topics.items() if rule.required]
+
+
+def read_contract(path: Path) -> Contract:
+    """Read a contract.
+
+    Raises:
+        ContractError: When it is no TOML, or holds what a contract cannot hold: names the key, what
+            is allowed there and what was probably meant.
+    """
+    try:
+        values = tomllib.loads(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise ContractError(f"the contract {path} cannot be read: {error}.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ContractError(f"the contract {path} is no TOML: {error}.") from error
+    return contract_from(values, name=str(path))
+
+
+def find_contract(run: Path, name: str | None) -> Contract | None:
+    """Return the contract of a recording.
+
+    Args:
+        run: The run folder; its ``cell.toml`` holds unless another is named.
+        name: A TOML file, or a template by name.
+
+    Raises:
+        ContractError: When it cannot be used.
+        UsageError: When there is no such template; lists those that are there.
+    """
+    if name is not None:
+        return read_contract(dataset_file(TEMPLATES, name))
+    path = run / CONTRACT_FILE
+    return read_contract(path) if path.is_file() else None
+
+
+def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
+    """Build a contract from parsed values.
+
+    Args:
+        values: As they stand in the TOML file, or in an episode's metadata record.
+        name: Where they come from, for errors.
+
+    Raises:
+        ContractError: When something in it is not what a contract holds.
+    """
+    _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
+    version, topics = values.get("schema_version"), values.get("topics")
+    if version != SCHEMA_VERSION:
+        found = "is missing" if version is None else f"is {version!r:.40}"
+        raise ContractError(f"{name}: schema_version {found}; it must be {SCHEMA_VERSION}.")
+    if not isinstance(topics, dict):
+        raise ContractError(f'{name}: topics must be tables, for example [topics."/lab/TOPIC"].')
+    cell = values.get("cell", "")
+    if not isinstance(cell, str):
+        raise ContractError(f"{name}: cell must be a text, got {cell!r:.40}.")
+    rules = {topic: _rule(topic, rule, name) for topic, rule in topics.items()}
+    return Contract(topics=rules, cell=cell)
+
+
+def _rule(topic: str, values: Any, name: str) -> TopicRule:
+    whose = f"topics.{json.dumps(topic)}"
+    if not topic.startswith("/"):
+        raise ContractError(f"{name}: {whose}: a topic starts with a slash: /{topic}.")
+    if not isinstance(values, dict):
+        raise ContractError(f"{name}: {whose} must be a table, got {values!r:.40}.")
+    _refuse_unknown(values, [item.name for item in fields(TopicRule)], where=name, prefix=whose)
+    numbers: dict[str, float] = {}
+    for key in ("rate_hz", "tolerance", "silence_s"):
+        value = values.get(key)
+        if value is None:  # TOML has no null; an episode's record has
+            continue
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not 0 < value < math.inf:
+            raise ContractError(f"{name}: {whose}.{key} must be above zero, got {value!r:.40}.")
+        numbers[key] = float(value)
+    if not isinstance(values.get("required", True), bool):
+        found = values["required"]
+        raise ContractError(f"{name}: {whose}.required must be true or false, got {found!r:.40}.")
+    return TopicRule(**numbers, required=values.get("required", True))
+
+
+def _refuse_unknown(
+    values: Mapping[str, Any], allowed: Sequence[str], *, where: str, prefix: str
+) -> None:
+    for key in values:
+        if key in allowed:
+            continue
+        nearest = difflib.get_close_matches(key, allowed, n=1, cutoff=0.5)
+        meant = f" Did you mean {nearest[0]}?" if nearest else ""
+        whole = f"{prefix}.{key}" if prefix else key
+        raise ContractError(
+            f"{where}: the key {whole} is not known. Allowed: {', '.join(allowed)}.{meant}"
+        )
+
+
+def write_contract(contract: Contract, path: Path, *, source: str) -> None:
+    """Write a contract as a TOML file; one that is there is not replaced.
+
+    Args:
+        contract: What to write.
+        path: Where.
+        source: What it was learned from; goes into its first line.
+
+    Raises:
+        ContractError: When there is one already.
+    """
+    if path.exists():
+        raise ContractError(f"{path} exists already. Move it away, or edit it.")
+    lines = [
+        f"# What this cell publishes, learned from {source}. Edit it freely.",
+        "# rate_hz [1/s] may differ by the part of it that tolerance says; silence_s: the longest",
+        "# time without a message [s]; no recording starts without a required topic.",
+        f"schema_version = {SCHEMA_VERSION}",
+        *([f"cell = {json.dumps(contract.cell)}"] if contract.cell else []),
+    ]
+    for topic, rule in contract.topics.items():
+        lines += ["", f"[topics.{json.dumps(topic)}]"]
+        values = {key: value for key, value in asdict(rule).items() if value is not None}
+        lines += [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+    write_whole(path, ("\n".join(lines) + "\n").encode())
+
+
+Spans = Sequence[tuple[int, int]]
+"""Begin and end of each pause [ns], which do not overlap."""
+
+
+@dataclass(kw_only=True, slots=True)
+class Presence:
+    """When the messages of one topic were there."""
+
+    messages: int = 0
+    first_ns: int = 0
+    """0 without messages."""
+    last_ns: int = 0
+    longest_ns: int = 0
+    """The longest silence between two messages, pauses not counted."""
+    longest_at_ns: int = 0
+    """When it began."""
+
+    def see(self, stamp_ns: int, pauses: Spans) -> None:
+        """Take the next message.
+
+        Args:
+            stamp_ns: When it was received [ns].
+            pauses: When nothing was to be recorded.
+        """
+        self.messages += 1
+        last_ns = self.last_ns
+        if not last_ns:
+            self.first_ns = self.last_ns = stamp_ns
+            return
+        if stamp_ns <= last_ns:
+            return
+        self.last_ns = stamp_ns
+        if stamp_ns - last_ns > self.longest_ns:
+            silent_ns = _silence_ns(last_ns, stamp_ns, pauses)
+            if silent_ns > self.longest_ns:
+                self.longest_ns, self.longest_at_ns = silent_ns, last_ns
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether it has shown a rate, so that an end of it is remarkable."""
+        span_ns = self.last_ns - self.first_ns
+        return self.messages >= REGULAR_MESSAGES and span_ns >= REGULAR_SPAN_NS
+
+
+def _silence_ns(start_ns: int, end_ns: int, pauses: Spans) -> int:
+    paused = sum(max(0, min(end_ns, end) - max(start_ns, start)) for start, end in pauses)
+    return max(0, end_ns - start_ns - paused)
+
+
+class Span(NamedTuple):
+    """What was to be recorded."""
+
+    start_ns: int
+    end_ns: int
+    pauses: Spans = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TopicReport:
+    """What one topic shows over a recording."""
+
+    messages: int
+    first_s: float | None
+    """After the recording's start [s]; None without messages."""
+    last_s: float | None
+    longest_silence_s: float
+    """Between two messages [s]; what is before the first and after the last is not among it."""
+    longest_silence_at_s: float
+    """When it began, after the recording's start [s]."""
+    tail_s: float
+    """From the last message to the recording's end [s]."""
+    expected: int | None
+    """Messages the contract promises for this time; None when it promises no rate."""
+    tail: str
+    """``known``, or ``unknown``: it fell silent, and nobody knows what was sent after."""
+    breaches: tuple[str, ...] = ()
+    """Where it broke its contract."""
+
+
+def judge(
+    presences: Mapping[str, Presence],
+    contract: Contract | None,
+    span: Span,
+    lost: Mapping[str, int],
+    *,
+    by_habit: bool = True,
+) -> dict[str, TopicReport]:
+    """Compare what was there with what was promised.
+
+    Args:
+        presences: By topic.
+        contract: What was promised, if anybody said.
+        span: When it was recorded.
+        lost: By topic, messages that were sent and are not in the episode; they are not taken for
+            silence of their publisher.
+        by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
+            its clock is not the wall's, and may stand.
+
+    Returns:
+        A report for each topic that was there or was promised.
+    """
+    rules = contract.topics if contract else {}
+    absent = Presence()
+    return {
+        topic: _report(
+            topic,
+            presences.get(topic, absent),
+            rules.get(topic),
+            span,
+            lost.get(topic, 0),
+            by_habit=by_habit,
+        )
+        for topic in sorted({*presences, *rules} - {DROPS})
+    }
+
+
+def _report(
+    topic: str,
+    presence: Presence,
+    rule: TopicRule | None,
+    span: Span,
+    lost: int,
+    *,
+    by_habit: bool,
+) -> TopicReport:
+    total_ns = _silence_ns(span.start_ns, span.end_ns, span.pauses)
+    rate_hz = rule.rate_hz if rule else None
+    expected = None if rate_hz is None else round(rate_hz * s_from_ns(total_ns))
+    was_there = presence.messages > 0
+    tail_ns = _silence_ns(presence.last_ns, span.end_ns, span.pauses) if was_there else total_ns
+    return TopicReport(
+        messages=presence.messages,
+        first_s=s_from_ns(presence.first_ns - span.start_ns) if was_there else None,
+        last_s=s_from_ns(presence.last_ns - span.start_ns) if was_there else None,
+        longest_silence_s=s_from_ns(presence.longest_ns),
+        longest_silence_at_s=s_from_ns(presence.longest_at_ns - span.start_ns)
+        if presence.longest_ns
+        else 0.0,
+        tail_s=s_from_ns(tail_ns),
+        expected=expected,
+        tail="unknown" if _fell_silent(topic, presence, rule, tail_ns, by_habit) else "known",
+        breaches=tuple(_breaches(topic, presence, rule, span, lost)) if rule else (),
+    )
+
+
+def _fell_silent(
+    topic: str, presence: Presence, rule: TopicRule | None, tail_ns: int, by_habit: bool
+) -> bool:
+    if rule is not None:
+        limit_s = rule.silence_s
+        return limit_s is not None and presence.messages > 0 and s_from_ns(tail_ns) > limit_s
+    if not by_habit or is_latched(topic) or not presence.is_regular:
+        return False
+    return s_from_ns(tail_ns) > max(LEAST_SILENCE_S, HABIT * s_from_ns(presence.longest_ns))
+
+
+def _breaches(
+    topic: str, presence: Presence, rule: TopicRule, span: Span, lost: int
+) -> Iterable[str]:
+    if not presence.messages:
+        if rule.required:
+            yield f"{topic}: no message, and the contract requires it"
+        return
+    dropped = f" ({lost} messages of it were dropped)" if lost else ""
+    limit_s = rule.silence_s
+    if limit_s is not None:
+        allowed = f"at most {limit_s:g} s is allowed{dropped}"
+        head_s = s_from_ns(_silence_ns(span.start_ns, presence.first_ns, span.pauses))
+        tail_s = s_from_ns(_silence_ns(presence.last_ns, span.end_ns, span.pauses))
+        longest_s = s_from_ns(presence.longest_ns)
+        if head_s > limit_s and rule.required:
+            yield f"{topic}: silent for the first {head_s:.1f} s; {allowed}"
+        if longest_s > limit_s:
+            at_s = s_from_ns(presence.longest_at_ns - span.start_ns)
+            yield f"{topic}: silent for {longest_s:.1f} s from {at_s:.1f} s on; {allowed}"
+        if tail_s > limit_s:
+            yield f"{topic}: silent for the last {tail_s:.1f} s; {allowed}"
+    yield from _rate_breach(topic, presence, rule, span, lost)
+
+
+def _rate_breach(
+    topic: str, presence: Presence, rule: TopicRule, span: Span, lost: int
+) -> Iterable[str]:
+    there_s = s_from_ns(_silence_ns(presence.first_ns, presence.last_ns, span.pauses))
+    if rule.rate_hz is None or rule.rate_hz * there_s < FEWEST_FOR_RATE:
+        return
+    found_hz = (presence.messages + lost - 1) / there_s
+    if abs(found_hz - rule.rate_hz) > rule.tolerance * rule.rate_hz:
+        yield (
+            f"{topic}: {found_hz:.1f} messages a second; the contract says {rule.rate_hz:g} "
+            f"± {100 * rule.tolerance:g} %"
+        )
+
+
+def breaches_of(reports: Mapping[str, TopicReport]) -> list[str]:
+    """Every place where the contract was broken, in words."""
+    return [text for report in reports.values() for text in report.breaches]
+
+
+def unknown_tails(reports: Mapping[str, TopicReport]) -> list[str]:
+    """Sentences on topics that fell silent before the end."""
+    return [
+        f"{topic}: tail unknown, nothing came in the last {report.tail_s:.1f} s"
+        for topic, report in reports.items()
+        if report.tail == "unknown"
+    ]
+
+
+def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
+    """Sentences on topics whose losses nobody can see, by their number of such messages."""
+    return [
+        f"{topic}: {count} messages carry no sequence number; losses of it cannot be seen"
+        for topic, count in sorted(unnumbered.items())
+        if count
+    ]
+
+
+def presence_lines(record: Mapping[str, Any]) -> list[str]:
+    """Sentences on what an episode lacks without a number missing.
+
+    Args:
+        record: A ``presence`` record, or the answer to a stop; anything else says nothing.
+    """
+    breaches, tails = record.get("breaches"), record.get("unknown_tails")
+    unnumbered = record.get("unnumbered")
+    return [
+        *(f"contract: {text}" for text in (breaches if isinstance(breaches, list) else [])),
+        *(str(text) for text in (tails if isinstance(tails, list) else [])),
+        *unseen_losses(unnumbered if isinstance(unnumbered, dict) else {}),
+    ]
+
+
+LEARNED_TOLERANCE = 0.2
+LEARNED_SILENCE_S = 0.5
+"""No learned contract allows less: machines hesitate."""
+LEARNED_HABIT = 3
+"""A learned contract allows so many times the longest silence of the good episode."""
+LEARNED_PERIODS = 5
+
+
+def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
+    """Take what a good episode shows for what the cell promises.
+
+    Regular streams get rate and silence, latched topics need only be there, and what comes when
+    something happens (events, plans) is optional. Ground truth and our own records are left out.
+
+    Args:
+        presences: By topic, of an episode that is clean.
+        cell: Name of the cell.
+    """
+    rules = {
+        topic: _learned(topic, presence)
+        for topic, presence in sorted(presences.items())
+        if topic != DROPS and not is_truth(topic)
+    }
+    return Contract(topics=rules, cell=cell)
+
+
+def _learned(topic: str, presence: Presence) -> TopicRule:
+    if is_latched(topic):
+        return TopicRule()
+    span_s = s_from_ns(presence.last_ns - presence.first_ns)
+    longest_s = s_from_ns(presence.longest_ns)
+    if not presence.is_regular or longest_s > span_s / 4:
+        return TopicRule(required=False)
+    rate_hz = (presence.messages - 1) / span_s
+    silence_s = max(LEARNED_SILENCE_S, LEARNED_HABIT * longest_s, LEARNED_PERIODS / rate_hz)
+    return TopicRule(
+        rate_hz=float(f"{rate_hz:.3g}"),
+        tolerance=LEARNED_TOLERANCE,
+        silence_s=math.ceil(silence_s * 10) / 10,
+    )

@@ -1,0 +1,206 @@
+"""Contracts of cells: what they may hold, what they are learned from, and when they are broken."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.clock import NS_PER_S
+from bridge.data_files import datasets_folder
+from bridge.episode.contract import (
+    Contract,
+    ContractError,
+    Presence,
+    Span,
+    TopicRule,
+    breaches_of,
+    contract_from,
+    find_contract,
+    judge,
+    learn_contract,
+    presence_lines,
+    read_contract,
+    unknown_tails,
+    unseen_losses,
+    write_contract,
+)
+from bridge.episode.metadata import from_strings
+from bridge.errors import UsageError
+
+JOINTS = "/lab/joint_states"
+RULE = TopicRule(rate_hz=100.0, tolerance=0.2, silence_s=0.5)
+
+
+def seen(*stamps_s: float, pauses: tuple[tuple[int, int], ...] = ()) -> Presence:
+    presence = Presence()
+    for stamp_s in stamps_s:
+        presence.see(round(stamp_s * NS_PER_S), pauses)
+    return presence
+
+
+def steady(start_s: float, end_s: float, rate_hz: float = 100.0) -> list[float]:
+    count = round((end_s - start_s) * rate_hz)
+    return [start_s + number / rate_hz for number in range(count + 1)]
+
+
+def broken(
+    presence: Presence | None, rule: TopicRule = RULE, *, end_s: float = 10.0, lost: int = 0,
+    pauses: tuple[tuple[int, int], ...] = (),
+) -> list[str]:  # fmt: skip
+    span = Span(NS_PER_S, NS_PER_S + round(end_s * NS_PER_S), pauses)
+    presences = {} if presence is None else {JOINTS: presence}
+    reports = judge(presences, Contract(topics={JOINTS: rule}), span, {JOINTS: lost})
+    return breaches_of(reports)
+
+
+def test_a_contract_that_is_kept_is_not_broken() -> None:
+    assert broken(seen(*steady(1.0, 11.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("stamps", "found"),
+    [
+        (steady(1.0, 4.0), "silent for the last 7.0 s; at most 0.5 s is allowed"),
+        (steady(4.0, 11.0), "silent for the first 3.0 s"),
+        (steady(1.0, 4.0) + steady(6.0, 11.0), "silent for 2.0 s from 3.0 s on"),
+        (steady(1.0, 11.0, 60.0), "60.0 messages a second; the contract says 100 ± 20 %"),
+        (steady(1.0, 11.0, 150.0), "150.0 messages a second"),
+    ],
+)
+def test_each_way_to_break_it_is_named(stamps: list[float], found: str) -> None:
+    assert any(found in text for text in broken(seen(*stamps)))
+
+
+def test_what_the_recorder_dropped_is_not_held_against_the_rate() -> None:
+    """Law: a publisher that sent at its rate kept it, whoever lost its messages."""
+    half = seen(*steady(1.0, 11.0, 50.0))
+    assert any("50.0 messages" in text for text in broken(half))
+    assert broken(half, lost=500) == []
+
+
+def test_a_required_topic_that_never_spoke_breaks_it_and_an_optional_one_does_not() -> None:
+    assert broken(None) == [f"{JOINTS}: no message, and the contract requires it"]
+    assert broken(None, TopicRule(rate_hz=100.0, silence_s=0.5, required=False)) == []
+
+
+def test_a_pause_is_no_silence() -> None:
+    pauses = ((4 * NS_PER_S, 7 * NS_PER_S),)
+    stamps = steady(1.0, 4.0) + steady(7.0, 11.0)
+    assert broken(seen(*stamps, pauses=pauses), pauses=pauses) == []
+    assert any("silent for 3.0 s" in text for text in broken(seen(*stamps)))
+
+
+@given(
+    stamps=st.lists(st.integers(NS_PER_S, 20 * NS_PER_S), min_size=1, max_size=50).map(sorted),
+    limit_s=st.floats(0.1, 5.0),
+)
+def test_a_silence_is_told_exactly_when_one_is_longer_than_allowed(
+    stamps: list[int], limit_s: float
+) -> None:
+    """Law: compared with the differences of all stamps, ends included."""
+    presence = Presence()
+    for stamp in stamps:
+        presence.see(stamp, ())
+    edges = [NS_PER_S, *stamps, 21 * NS_PER_S]
+    longest_ns = max(b - a for a, b in itertools.pairwise(edges))
+    rule = TopicRule(silence_s=limit_s)
+    found = broken(presence, rule, end_s=20.0)
+    assert bool(found) == (longest_ns / NS_PER_S > limit_s)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "is_unknown"),
+    [
+        (steady(1.0, 4.0), True),
+        (steady(1.0, 10.5), False),
+        (steady(1.0, 1.5), False),  # too short to have shown a rate
+        ([1.0, 4.0, 5.0], False),
+        (steady(1.0, 3.0) + steady(4.5, 6.0), False),  # it is silent for so long now and then
+    ],
+)
+def test_without_a_contract_only_a_regular_stream_that_ends_early_has_an_unknown_tail(
+    stamps: list[float], is_unknown: bool
+) -> None:
+    reports = judge({JOINTS: seen(*stamps)}, None, Span(NS_PER_S, 11 * NS_PER_S), {})
+    assert bool(unknown_tails(reports)) == is_unknown
+    assert breaches_of(reports) == []
+
+
+def test_a_contract_survives_its_file_and_its_record(tmp_path: Path) -> None:
+    contract = Contract(topics={JOINTS: RULE, "/lab/plan": TopicRule(required=False)}, cell="lab")
+    write_contract(contract, tmp_path / "cell.toml", source="good.mcap")
+    assert read_contract(tmp_path / "cell.toml") == contract
+    assert find_contract(tmp_path, None) == contract
+    assert contract_from(from_strings(contract.to_record()), name="e1") == contract
+    with pytest.raises(ContractError, match="exists already"):
+        write_contract(contract, tmp_path / "cell.toml", source="good.mcap")
+    assert find_contract(tmp_path / "elsewhere", None) is None
+
+
+HEAD = "schema_version = 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "schema_version is missing; it must be 1"),
+        ("schema_version = 2", "schema_version is 2; it must be 1"),
+        (HEAD, "topics must be tables"),
+        ("schema_version = 1 1", "is no TOML"),
+        (HEAD + "topic = 1\n[topics]", "key topic is not known. .*Did you mean topics?"),
+        (HEAD + '[topics."/a"]\nrate = 1', r'"/a"\.rate is not known.*Did you mean rate_hz?'),
+        (HEAD + '[topics."/a"]\nwobble = 1', "Allowed: rate_hz, tolerance, silence_s, required.$"),
+        (HEAD + '[topics."a"]\nrate_hz = 1', "starts with a slash: /a"),
+        (HEAD + '[topics."/a"]\nrate_hz = -1', "rate_hz must be above zero, got -1"),
+        (HEAD + '[topics."/a"]\nsilence_s = "x"', "silence_s must be above zero, got 'x'"),
+        (HEAD + '[topics."/a"]\nrequired = 1', "required must be true or false, got 1"),
+        (HEAD + "cell = 3\n[topics]", "cell must be a text"),
+        (HEAD + 'topics."/a" = 3', "must be a table, got 3"),
+    ],
+)
+def test_what_a_contract_cannot_hold_is_named(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(text)
+    with pytest.raises(ContractError, match=words):
+        read_contract(path)
+
+
+def test_the_templates_can_be_read_and_an_unknown_one_lists_them() -> None:
+    names = sorted(path.stem for path in (datasets_folder() / "cells/contracts").glob("*.toml"))
+    assert names
+    for name in names:
+        contract = find_contract(Path("nowhere"), name)
+        assert contract is not None
+        assert contract.required()
+    with pytest.raises(UsageError, match=f"There are: {', '.join(names)}"):
+        find_contract(Path("nowhere"), "kitchen")
+
+
+def test_what_is_learned_is_kept_by_the_episode_it_was_learned_from() -> None:
+    """Law: learn, then judge the same episode: nothing is broken."""
+    presences = {
+        JOINTS: seen(*steady(1.0, 11.0)),
+        "/lab/cam/side/color/image": seen(*steady(1.1, 10.9, 30.0)),
+        "/lab/event": seen(1.5, 3.0, 9.0),
+        "/tf_static": seen(1.0),
+        "/standin/truth/object/cube/pose": seen(*steady(1.0, 11.0)),
+        "/recorder/drops": seen(*steady(1.0, 11.0, 3.0)),
+    }
+    contract = learn_contract(presences, cell="lab")
+    assert contract.required() == ["/lab/cam/side/color/image", JOINTS, "/tf_static"]
+    assert contract.topics["/lab/event"] == TopicRule(required=False)
+    assert contract.topics[JOINTS].rate_hz == pytest.approx(100.0)
+    assert set(presences) - set(contract.topics) == {
+        "/standin/truth/object/cube/pose",
+        "/recorder/drops",
+    }
+    assert breaches_of(judge(presences, contract, Span(NS_PER_S, 11 * NS_PER_S), {})) == []
+
+
+def test_records_of_other_programs_are_no_sentences() -> None:
+    assert presence_lines({"breaches": 3, "unknown_tails": None, "unnumbered": [1]}) == []
+    assert unseen_losses({"/b": 2, "/a": 0}) == [
+        "/b: 2 messages carry no sequence number; losses of it cannot be seen"
+    ]

@@ -1,0 +1,170 @@
+"""Disks that are slow or break, and files that are taken away while they are written.
+
+The law: no small message is dropped, and none is missing that is older than half a second and one
+write; whatever happens is said within a second; and what can be kept is kept.
+"""
+
+import os
+import random
+import shutil
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from fault_account import accounts_are_exact, check_code, ledger, lost, nothing_invented, read
+from fault_cell import FaultCell, PublisherChild
+from fault_messages import GRIPPER, JOINTS, MIX
+from loopback import free_endpoint
+
+import robot_gst
+from bridge.episode.reader import Episode
+
+HERE = Path(__file__).parent
+IMAGES = ("color", "depth", "raw")
+WRITE_S = 0.4
+TAIL_S = 0.5
+KILLS = int(os.environ.get("GST_SLOW_KILLS", "2"))
+WAIT_S = 60.0
+
+
+def slow(delay_s: float) -> str:
+    return f"{HERE / 'slow_recorder.py'} {delay_s}"
+
+
+def wait_for_messages(asker: PublisherChild, count: int) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while asker.ask("status")["ok"].get("messages", 0) < count:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(KILLS))
+def test_a_kill_on_a_slow_disk_costs_half_a_second_and_one_write(
+    cell: FaultCell, number: int
+) -> None:
+    recorder = cell.record("--episode", "t1", "--cell", "cell", program=slow(WRITE_S))
+    small, images = cell.publisher(), cell.publisher()
+    small.flow(60.0, "joints", "gripper", period_s=0.001)
+    images.flow(60.0, *IMAGES, qos="own")
+    time.sleep(random.Random(number).uniform(2.0, 6.0))  # the instant of the fault
+    killed_ns = time.time_ns()
+    recorder.kill()
+    small.kill()
+    images.kill()
+    path = cell.path("t1")
+    assert path.with_suffix(".mcap.journal").exists()
+    assert robot_gst.run(["recover", str(cell.run), "-q"]) == 0
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+    found = read(path)
+    nothing_invented(
+        found, [*small.sent(), *images.sent()], transcoded=("/cell/cam/raw/color/image",)
+    )
+    for topic in (JOINTS, GRIPPER):
+        numbers = [item.sequence for item in found if item.topic == topic]
+        assert numbers == list(range(len(numbers)))
+        old_ns = killed_ns - (TAIL_S + WRITE_S) * 1e9
+        old = sum(item.topic == topic and item.put_ns < old_ns for item in small.sent())
+        assert len(numbers) >= old
+    assert check_code(path) == 3
+
+
+@pytest.mark.slow
+def test_a_slow_disk_drops_no_joints(cell: FaultCell) -> None:
+    """Law: images wait in their own queue, and the lag of the small ones is in the status."""
+    cell.record("--episode", "t1", "--cell", "cell", program=slow(0.2))
+    small, images, asker = cell.publisher(), cell.publisher(), cell.publisher()
+    small.flow(3.0, "joints", "gripper", period_s=0.001)
+    images.flow(3.0, *IMAGES)
+    wait_for_messages(asker, 500)
+    assert asker.ask("status")["ok"]["write_lag_s"] < 2.0
+    small.answer()
+    images.answer()
+    assert small.ask("status")["ok"]["ok"]  # in line behind the last message
+    assert images.ask("stop")["ok"]["lost"] == 0
+    topics = accounts_are_exact(
+        cell.path("t1"), [*small.sent(), *images.sent()], transcoded=("/cell/cam/raw/color/image",)
+    )
+    assert lost(topics[JOINTS]) == lost(topics[GRIPPER]) == 0
+    assert not list(cell.path("t1").parent.glob("*.journal"))
+    assert check_code(cell.path("t1")) == 0
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_a_file_that_is_removed_while_it_is_written_is_written_anew(
+    cell: FaultCell, what: str
+) -> None:
+    recorder = cell.record("--episode", "t1", "--cell", "cell")
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(60.0, *MIX)
+    wait_for_messages(asker, 300)
+    part = cell.path("t1").with_suffix(".mcap.part")
+    if what == "file":
+        part.unlink()
+    else:
+        shutil.rmtree(cell.run)
+    recorder.wait_for("t1.mcap.part was removed while it was written; it was written there anew")
+    assert part.exists()
+    flow.kill()
+    assert asker.ask("stop")["ok"]["lost"] == 0
+    sent = Counter(item.topic for item in flow.sent())
+    for topic, tally in ledger(cell.path("t1")).items():
+        assert tally["received"] in (sent[topic], sent[topic] - 1)  # the last may have died with it
+    nothing_invented(read(cell.path("t1")), flow.sent())
+
+
+def test_a_disk_that_breaks_is_named_and_another_takes_over(cell: FaultCell) -> None:
+    """Law: joined by recover, both halves hold everything that was sent."""
+    other = cell.folder / "other"
+    recorder = cell.record(
+        "--episode", "t1", "--cell", "cell", "--failover", str(other),
+        program=str(HERE / "failing_recorder.py"),
+    )  # fmt: skip
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(3.0, *MIX)
+    wait_for_messages(asker, 300)
+    recorder.send(signal.SIGUSR1)
+    recorder.wait_for("The recording goes on in ")
+    assert "Input/output error (the disk, or the connection to it, is failing)" in recorder.said()
+    flow.answer()
+    answer = asker.ask("stop")["ok"]
+    assert (answer["lost"], answer["parts"]) == (0, 2)
+    assert asker.ask("start", {"id": "t2", "info": {"cell": "cell"}})["ok"]["ok"]
+    assert asker.ask("stop")["ok"]["ok"]
+    assert (other / "episodes" / "t2.mcap").exists()
+    recorder.finish()
+    assert robot_gst.run(["recover", str(cell.run), str(other), "-q"]) == 0
+    parts = Episode.open(cell.path("t1")).parts
+    assert [part.name for part in parts] == ["t1.mcap", "t1.2.mcap"]
+    found = [item for part in parts for item in read(part)]
+    nothing_invented(found, flow.sent())
+    assert len(found) == len(flow.sent())
+    assert check_code(cell.path("t1")) == 3
+
+
+def test_a_disk_that_breaks_without_another_ends_the_recorder_with_clear_words(
+    cell: FaultCell,
+) -> None:
+    recorder = cell.record(
+        "--episode", "t1", "--cell", "cell", program=str(HERE / "failing_recorder.py")
+    )
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(60.0, "joints")
+    wait_for_messages(asker, 100)
+    recorder.send(signal.SIGUSR1)
+    assert recorder.process.wait(timeout=WAIT_S) == 1
+    said = recorder.said()
+    assert "Input/output error (the disk, or the connection to it, is failing)" in said
+    assert "--failover DIR" in said
+    assert "Traceback" not in said
+
+
+def test_a_second_recorder_on_one_folder_is_refused(cell: FaultCell) -> None:
+    first = cell.record()
+    second = cell.start_recording(endpoint=free_endpoint())
+    assert second.process.wait(timeout=WAIT_S) == 2
+    assert f"another recorder records into {cell.run} already" in second.said()
+    first.finish()
+    cell.record().finish()  # the folder is free again
