@@ -192,7 +192,9 @@ def _runs(
     recorded: Sequence[Episode], files: Sequence[DerivedFile]
 ) -> tuple[list[Run], list[Exclusion]]:
     runs, left_out = [], []
-    found = [(e, engine_of(e.info), None) for e in recorded if e.info.kind == "imported"]
+    found: list[tuple[Episode, str | None, Derived | None]] = [
+        (e, engine_of(e.info), None) for e in recorded if e.info.kind == "imported"
+    ]
     found += [(file.episode, _side_name(file.derived), file.derived) for file in _newest(files)]
     for episode, engine, derived in found:
         track = tcp_track(episode)

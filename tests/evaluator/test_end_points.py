@@ -178,7 +178,7 @@ def test_of_two_replays_of_one_run_the_newest_counts(lab: Any) -> None:
         engine="twin",
         calibration_id="ffff0000",
     )
-    bodies = {"tool": way(0.3), "cube": old + [0.05, 0.0, 0.0]}
+    bodies = {"tool": way(0.3), "cube": old + np.array([0.05, 0.0, 0.0])}
     write(run.derived_dir / "push_0.again.mcap", info, bodies, derived)
     table = next(t for t in compare_run(run).tables if t.id == "runs_of_end_points_0")
     [row] = [row for row in table.rows if row[:3] == ("cube", ENGINE, "push_0")]
