@@ -83,9 +83,8 @@ def motion_replays(
         force: Redo what is there.
     """
     calibration = read_calibration(run)
-    physics = calibrated(config, calibration).physics
-    record = _fit_of(calibration)
-    angle = record.get("parameters", {}).get("finger_rad", {}).get("value", 0.0)
+    fit = _fit_of(calibration)
+    with_boxes = calibrated(config, calibration).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}
     for name in names:
@@ -97,15 +96,17 @@ def motion_replays(
         if motion is None:
             continue
         trajectories: tuple[Trajectory, ...] = ("planned", "executed")
+        used = fit if motion.boxes else {}  # a tool alone meets no friction
+        angle = used.get("parameters", {}).get("finger_rad", {}).get("value", 0.0)
         items += [
             MotionReplay(
                 run_path=run.path.resolve(),
                 episode_id=name,
                 trajectory=trajectory,
-                physics=physics,
+                physics=with_boxes if motion.boxes else config.physics,
                 finger_rad=float(angle),
-                fitted_to=tuple(record.get("fitted_to", ())) if motion.boxes else (),
-                calibration_id=calibration.calibration_id if calibration and record else None,
+                fitted_to=tuple(used.get("fitted_to", ())),
+                calibration_id=calibration.calibration_id if calibration and used else None,
                 force=force,
             )
             for trajectory in (trajectories if motion.boxes else trajectories[:1])
