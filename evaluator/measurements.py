@@ -770,6 +770,24 @@ REPEATABILITY = {
 }
 """By the field of ``Repeatability``."""
 
+_BODY = "body.{task}.{engine}.{body}."
+BODY_DISTANCES = {
+    name: _new(
+        f"{_BODY}{name.removesuffix('_m')}_median_m",
+        "m",
+        "lower",
+        None,
+        f"{{what}}: {words}, median over recorded runs; replays against the run that they were made from, other simulated runs against every recorded one",
+    )
+    for name, words in (
+        ("end_point_m", "distance of the end points"),
+        ("displacement_m", "difference of the displacements from start to end"),
+        ("over_time_m", f"mean distance over normalised time, {WHOLE}"),
+        ("moving_over_time_m", f"mean distance over normalised time, {MOVING}"),
+    )
+}
+"""By the field of ``BodyDistance``."""
+
 _STATE = "state.{{by}}_to_{{against}}.{{task}}.{{condition}}.{name}"
 _STATE_WORDS = "{{quantity}} after its last stage, {{who}} against {{other}}, in {{where}}: {kind} over {{count}} episodes of each one's mean over its objects"
 STATES = {

@@ -139,10 +139,10 @@ def check(
     wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
 ) -> int:
-    """Verify episodes (CRCs, indexes, counts, decoding) list dropped messages, silent topics.
+    """Verify episodes (CRCs, indexes, counts, decoding); list drops and silent topics.
 
-    Exit code 0: clean, 3: messages were dropped or a contract was
-    broken, 1: broken. Example: robot-gst check runs/demo
+    Exit code 0: clean, 3: messages were dropped or a contract was broken, 1: broken.
+    Example: robot-gst check runs/demo
     With --wire it listens to a publisher instead and says what of the contract (docs/wire.md) it
     does not keep: robot-gst check --wire "lab/**" --seconds 5
 

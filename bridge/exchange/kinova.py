@@ -15,6 +15,7 @@ listed and skipped; the others are imported.
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, PathNotFoundError
 from bridge.geometry import se3
+from bridge.task.scripted_motion import RECORD_NAME, JointTarget, PushedBox, ScriptedMotion
 
 CELL = "kinova"
 FRAME = "world"
@@ -58,6 +60,28 @@ _SIM_NAME = re.compile(
 )
 FARTHEST_M = 10.0
 """Nothing on the table goes so far; the simulations that explode end at 1e13 m and more."""
+ROBOT_FOLDER = "robot"
+"""Of the data set, and of a run: URDF and meshes, which belong to the data set."""
+URDF = "m1n6s300.urdf"
+_JOINTS = tuple(f"m1n6s300_joint_{number}" for number in range(1, 7))
+_SCRIPTS: dict[str, tuple[float, tuple[tuple[float, dict[int, float]], ...]]] = {
+    "cubeexp": (
+        20.0,
+        (
+            (0.0, {1: 30, 2: 120, 3: 90}),
+            (8.0, {1: -60, 2: 65, 3: 90}),
+            (14.0, {1: -67, 2: 30, 3: 90}),
+        ),
+    ),
+    "single": (6.0, ((0.0, {1: -100}),)),
+}
+"""By task: duration [s], and from which time which joints (counted from 0) go where [deg]. From the
+authors' software; checked against the recordings."""
+_GAIN_HZ, _LIMIT_DEG_S, _PERIOD_S = 10.0, 30.0, 0.05
+_BASE_M = (0.0, 0.0, 0.055)
+"""The arm stands higher than the origin: with all joints zero the simulators' end effector, link 6
+of the description, is at 0.872 m, which is 55 mm more than the description alone gives."""
+_CUBE = PushedBox(size_m=(0.075, 0.075, 0.075), mass_kg=0.0884)
 CITATION = "Collins, Howard, Leitner: Quantifying the reality gap, ICRA 2019"
 
 
@@ -206,6 +230,7 @@ def import_runs(
     """
     real_paths, sim_paths = find_runs(folder)
     faults = [] if skipped is None else skipped
+    _copy_robot(folder, run)
     durations: dict[tuple[str, str], list[float]] = {}
     for path in real_paths:
         try:
@@ -230,6 +255,40 @@ def import_runs(
         yield _write_sim(simulated, run, num_real=len(of_task)), simulated
 
 
+def _copy_robot(folder: Path, run: RunFolder) -> None:
+    """Put URDF and meshes beside the episodes, so that later steps find them."""
+    source, target = folder / ROBOT_FOLDER, run.path / ROBOT_FOLDER
+    if (source / URDF).is_file() and not target.exists():
+        shutil.copytree(source, target, copy_function=shutil.copyfile)
+        for each in (target, *target.rglob("*")):  # what is read-only there is not so here
+            each.chmod(0o755 if each.is_dir() else 0o644)
+
+
+def scripted_motion(task: str) -> ScriptedMotion | None:
+    """Return what the authors told the arm in a task; None for a task that is not known."""
+    if task not in _SCRIPTS:
+        return None
+    duration_s, targets = _SCRIPTS[task]
+    return ScriptedMotion(
+        robot=f"{ROBOT_FOLDER}/{URDF}",
+        hand_link="m1n6s300_link_6",
+        joints=_JOINTS,
+        base_m=_BASE_M,
+        targets=tuple(
+            JointTarget(
+                t_s=t_s,
+                joints_rad={_JOINTS[index]: float(np.deg2rad(deg)) for index, deg in each.items()},
+            )
+            for t_s, each in targets
+        ),
+        gain_hz=_GAIN_HZ,
+        limit_rad_s=float(np.deg2rad(_LIMIT_DEG_S)),
+        period_s=_PERIOD_S,
+        duration_s=duration_s,
+        boxes={"cube": _CUBE} if task == "cubeexp" else {},
+    )
+
+
 def _info(kinova: KinovaRun, suffix: str) -> EpisodeInfo:
     return EpisodeInfo(
         id=f"{kinova.task}_{suffix}",
@@ -251,6 +310,9 @@ def _write_real(kinova: KinovaRun, run: RunFolder) -> Path:
         writer.describe(info)
         _write_poses(writer, kinova)
         writer.add_metadata("source", _source(kinova, "seconds since the start of the capture"))
+        motion = scripted_motion(kinova.task)
+        if motion is not None:
+            writer.add_metadata(RECORD_NAME, motion.to_record())
     return path
 
 

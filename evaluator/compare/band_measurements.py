@@ -1,7 +1,7 @@
 """Numbers of recorded against simulated runs of one motion."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from statistics import median
 
@@ -44,6 +44,16 @@ class Run:
     engine: str | None
     """None for a recorded run."""
     track: PoseTrajectory
+    """Of the tool."""
+    objects: Mapping[str, PoseTrajectory] = field(default_factory=dict)
+    replayed_from: str | None = None
+    """The recorded run that a replay was made from; None where it belongs to no single one."""
+    fitted_to: frozenset[str] = frozenset()
+    """Recorded runs from which something was identified that a replay uses."""
+
+    def body(self, name: str) -> PoseTrajectory | None:
+        """Return the motion of the tool or of an object; None where it was not recorded."""
+        return self.track if name == "tool" else self.objects.get(name)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,9 @@ simulated run says so by its ``derived`` record or by a tag ``simulated`` or ``e
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
+from bridge.episode.streams import object_pose_topics, pose_track
 from evaluator.compare.band_measurements import (
     BandCurve as BandCurve,  # part of what the report says
 )
@@ -19,6 +20,7 @@ from evaluator.compare.band_measurements import (
     inside_band,
     spread_measurements,
 )
+from evaluator.compare.end_points import compare_end_points
 from evaluator.compare.measure import Part, degrees, millimetres
 from evaluator.compare.trial import tcp_track
 from evaluator.errors import UndefinedStatisticError
@@ -36,6 +38,8 @@ from evaluator.metrics.trajectory import band_distance, moving_part, repeatabili
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 
+FITTED_TO = "fitted_to"
+"""Setting of a replay: ids of the recorded runs from which something was identified."""
 OVER_TIME = range(0, 101, 10)
 """Places on the curves that the table shows, in percent of the motion."""
 
@@ -138,19 +142,12 @@ def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> 
         recorded: Recorded episodes; only imported ones are looked at.
         files: Derived episodes; only imported replays without a plan are looked at.
     """
-    imported = [(e, engine_of(e.info)) for e in recorded if e.info.kind == "imported"]
-    imported += [
-        (file.episode, file.derived.engine or "unnamed engine")
-        for file in files
-        if file.info.kind == "imported"
-        and file.derived.kind == "replay"
-        and file.derived.plan_id is None
-    ]
-    runs, left_out = _runs(imported)
+    runs, left_out = _runs(recorded, files)
     if not runs:  # nothing imported, or imported without a robot, as an RGB-D folder
         return BandReport()
     measurements: list[Measurement] = []
     tables: list[Table] = []
+    more: list[Table] = []
     curves: list[BandCurve] = []
     missing: list[str] = []
     for task in sorted({run.task for run in runs}):
@@ -168,10 +165,15 @@ def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> 
         measurements += found
         if real.runs and simulated:
             rows = [band_row(task, side.name, by_id) for side in simulated]
-            tables.append(band_table(f"bands_{len(tables)}", task, rows))
+            number = len(tables)
+            tables.append(band_table(f"bands_{number}", task, rows))
+            bodies = compare_end_points(task, real, simulated, f"bands_end_points_{number}")
+            measurements += bodies.measurements
+            more += bodies.tables
+            left_out += bodies.exclusions
     return BandReport(
         measurements=tuple(measurements),
-        tables=(*tables, *profile_table(curves)),
+        tables=(*tables, *more, *profile_table(curves)),
         exclusions=tuple(left_out),
         missing=tuple(missing),
         curves=tuple(curves),
@@ -186,17 +188,64 @@ def engine_of(info: EpisodeInfo) -> str | None:
     return "unnamed engine" if "simulated" in info.tags else None
 
 
-def _runs(imported: Sequence[tuple[Episode, str | None]]) -> tuple[list[Run], list[Exclusion]]:
+def _runs(
+    recorded: Sequence[Episode], files: Sequence[DerivedFile]
+) -> tuple[list[Run], list[Exclusion]]:
     runs, left_out = [], []
-    for episode, engine in imported:
+    found: list[tuple[Episode, str | None, Derived | None]] = [
+        (e, engine_of(e.info), None) for e in recorded if e.info.kind == "imported"
+    ]
+    found += [(file.episode, _side_name(file.derived), file.derived) for file in _newest(files)]
+    for episode, engine, derived in found:
         track = tcp_track(episode)
         if track is None or len(track) < 2:
             reason = "no end-effector poses (a topic ending with /tcp/pose)"
             left_out.append(Exclusion(episode=episode.info.id, scope="bands", reason=reason))
             continue
         info = episode.info
-        runs.append(Run(episode=info.id, task=info.task, engine=engine, track=track))
+        objects = {
+            name: pose_track(episode, topic) for name, topic in object_pose_topics(episode).items()
+        }
+        runs.append(
+            Run(
+                episode=episode.path.stem if derived and derived.source_episode else info.id,
+                task=info.task,
+                engine=engine,
+                track=track,
+                objects={name: each for name, each in objects.items() if len(each) > 1},
+                replayed_from=None if derived is None else derived.source_episode or None,
+                fitted_to=frozenset() if derived is None else _fitted_to(derived),
+            )
+        )
     return runs, left_out
+
+
+def _fitted_to(derived: Derived) -> frozenset[str]:
+    """Recorded runs from which something was identified that a replay uses."""
+    named = derived.settings.get(FITTED_TO, ())
+    return (
+        frozenset(str(name) for name in named) if isinstance(named, list | tuple) else frozenset()
+    )
+
+
+def _newest(files: Sequence[DerivedFile]) -> list[DerivedFile]:
+    """Imported replays without a plan; of several of one run by the same name the newest."""
+    newest: dict[tuple[str, str], DerivedFile] = {}
+    for file in sorted(files, key=lambda file: file.path.stat().st_mtime_ns):
+        derived = file.derived
+        if file.info.kind == "imported" and derived.kind == "replay" and derived.plan_id is None:
+            source = derived.source_episode or file.name
+            newest[_side_name(derived), source] = file
+    return sorted(newest.values(), key=lambda file: file.name)
+
+
+def _side_name(derived: Derived) -> str:
+    """Name an engine; a replay of a recorded run says which trajectory it followed, too."""
+    engine = derived.engine or "unnamed engine"
+    if not derived.source_episode:
+        return engine
+    words = [engine, derived.trajectory or "", "calibrated" if derived.calibration_id else ""]
+    return " ".join(word for word in words if word)
 
 
 def _sides(task: str, runs: Sequence[Run]) -> tuple[Side, list[Side]]:

@@ -17,6 +17,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
+from twin.replay.imported import MotionReplay, motion_replays, run_motion_replay
 from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
 from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes
 from twin.replay.scene import localised_starts
@@ -222,14 +223,17 @@ def replay_trajectories(
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
-        with reasons, what was said ``against_recorded`` labels, and the scene hash.
+        with reasons, replays of ``imported`` recordings, what was said ``against_recorded`` labels,
+        and the scene hash.
 
     Raises:
         UsageError: When an episode named in the configuration is not in the run.
         PathNotFoundError: When pictures are asked for and no scene was rebuilt.
     """
+    imported, unusable = _replay_imported(run, config, runner, output)
     scene_hash = _scene_hash(run, config, output)
     jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+    skipped |= unusable
     _say_what_is_missing(run, jobs, output)
     if config.render:
         for note in describe_undrawn(read_record(run) or {}, _tasks(jobs)):
@@ -255,8 +259,29 @@ def replay_trajectories(
         "executions": executions,
         "against_recorded": against_recorded(executions),
         "skipped_episodes": skipped,
+        "imported": imported,
         "rows": rows,
     }
+
+
+def _replay_imported(
+    run: RunFolder, config: ReplayRunConfig, runner: Runner, output: Output
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Replay recordings that have no plan; rows, and why others cannot be replayed."""
+    items, skipped = motion_replays(run, _chosen(run, config), config.replay, force=config.force)
+    rows = []
+    with output.progress("imported", len(items)) as advance:
+        for done, (item, answer) in enumerate(
+            runner.run(run_motion_replay, items, MotionReplay.cost), start=1
+        ):
+            if isinstance(answer, Failed):
+                skipped[item.episode_id] = answer.message
+                output.detail(answer.trace)
+            else:
+                rows.append(answer)
+            advance(done, f"{item.episode_id} {item.trajectory}")
+    rows.sort(key=lambda row: (row["episode"], row["trajectory"]))
+    return rows, skipped
 
 
 def _all_jobs(

@@ -14,6 +14,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.verdict import SAME_ENGINE
 from twin.replay.failure import NOT_EVALUATED
+from twin.replay.imported import describe_motions
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 LABELS = ("success", "failure", "unknown")
@@ -148,9 +149,10 @@ def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
 def describe_run(summary: Mapping[str, Any]) -> str:
     """The final tables as text."""
     skipped = _skipped_lines(summary.get("skipped_episodes", {}))
+    imported = describe_motions(summary.get("imported", []))
     if not summary["rows"]:
-        return "\n".join(["No trial with a plan to replay.", *skipped])
-    lines = _count_lines(summary["counts"])
+        return "\n".join([*(imported or ["No trial with a plan to replay."]), *skipped])
+    lines = imported + _count_lines(summary["counts"])
     executions = summary.get("executions", [])
     if executions:
         lines += ["", *_cross_lines(executions), "", *_divergence_lines(executions)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.episode.reader import Episode
+from bridge.episode.reader import Episode, record_of
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
 from bridge.errors import PathNotFoundError
@@ -19,8 +19,10 @@ from bridge.exchange.kinova import (
     import_runs,
     read_real_run,
     read_sim_run,
+    scripted_motion,
 )
 from bridge.geometry import se3
+from bridge.task.scripted_motion import RECORD_NAME, ScriptedMotion
 
 BESIDE = Path(__file__).parents[4] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
@@ -203,3 +205,35 @@ def test_the_quaternion_order_is_the_one_that_agrees_with_the_real_robot(engine:
     # V-REP writes its first row after a step, in which the cube settles by a few microradians
     atol = 1e-5 if engine.startswith("VRep") else 1e-6
     np.testing.assert_allclose(simulated[CUBE_TOPIC][0, :3, :3], np.eye(3), atol=atol)
+
+
+def test_real_runs_say_what_the_arm_was_told_and_the_robot_comes_along(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "data")
+    meshes = folder / "robot" / "meshes"
+    meshes.mkdir(parents=True)
+    (folder / "robot" / "m1n6s300.urdf").write_text("<robot name='m'/>")
+    (meshes / "base.STL").write_bytes(b"solid")
+    (meshes / "base.STL").chmod(0o444)
+    run = RunFolder.create(tmp_path / "run")
+    [(real, _), *simulated] = import_runs(folder, run)
+    motion = ScriptedMotion.from_record(record_of(Episode.open(real).files[0], RECORD_NAME))
+    assert motion == scripted_motion("single")
+    assert (run.path / motion.robot).read_text() == "<robot name='m'/>"
+    copied = run.path / "robot" / "meshes" / "base.STL"
+    assert copied.read_bytes() == b"solid"
+    assert copied.stat().st_mode & 0o200
+    for path, _ in simulated:
+        assert record_of(Episode.open(path).files[0], RECORD_NAME) == {}
+    # Before the robot was given, a run is imported all the same.
+    bare = RunFolder.create(tmp_path / "bare")
+    list(import_runs(write_folder(tmp_path / "without"), bare))
+    assert not (bare.path / "robot").exists()
+
+
+def test_the_schedule_ends_where_the_authors_sent_the_joints() -> None:
+    motion = scripted_motion("cubeexp")
+    assert motion is not None
+    _, joints = motion.joint_path_rad()
+    np.testing.assert_allclose(np.rad2deg(joints[-1]), [0, -67, 30, 90, 0, 0], atol=1e-6)
+    assert motion.boxes["cube"].mass_kg == 0.0884
+    assert scripted_motion("juggling") is None

@@ -28,6 +28,12 @@ from twin.calibrate.physics.parameters import (
     SURFACE_FRICTION,
     rigid_parameters,
 )
+from twin.calibrate.physics.push_fit import (
+    METHOD,
+    calibrate_pushes,
+    describe_pushes,
+    has_motions,
+)
 from twin.calibrate.physics.simulate import Evaluator
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
@@ -232,6 +238,8 @@ def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
         record: As ``physics_record`` makes it.
         calibration_id: Of the calibration that holds now.
     """
+    if record.get("method") == METHOD:
+        return describe_pushes(record, calibration_id)
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
     if "cut_short" in record:
         lines.append(
@@ -274,6 +282,8 @@ def calibrate_physics(
 ) -> tuple[Mapping[str, Any], str]:
     """Find out about physics from a run's probes and trials, and write ``calibration.json``.
 
+    A run of imported pushes without plans is fitted on a grid, see ``push_fit``.
+
     Args:
         run: Whose probes and trials are read, and in whose scene folder the calibration goes.
         config: Evaluations, time budget, samples, workers and seed.
@@ -285,6 +295,8 @@ def calibrate_physics(
     Raises:
         NothingToCalibrateError: No probe or trial can be used.
     """
+    if has_motions(run):
+        return calibrate_pushes(run, config, output)
     cases, skipped = read_cases(run, output)
     physics = PhysicsConfig()
     parameters = rigid_parameters(physics)

@@ -1,0 +1,151 @@
+"""What an arm was told and what it pushes, where a recording has poses and no plan.
+
+A recording of somebody else may hold poses of a tool and of boxes, and neither joints nor a plan.
+The metadata record ``scripted_motion`` of its episode says the rest: which robot, which of its
+links carries the tool, the schedule that the joints were given, and the boxes on the table.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import InvalidRecordError
+
+RECORD_NAME = "scripted_motion"
+_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushedBox:
+    """A box that stands on the table."""
+
+    size_m: tuple[float, float, float]
+    mass_kg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTarget:
+    """Where joints are told to go from some time on; the others keep their targets."""
+
+    t_s: float
+    joints_rad: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScriptedMotion:
+    """Robot, schedule and boxes. All joints are zero at the start."""
+
+    robot: str
+    """Path of the URDF in the run folder; its meshes lie beside it."""
+    hand_link: str
+    """Link that carries the tool; it and all links behind it may touch boxes."""
+    joints: tuple[str, ...]
+    """The arm's, base to hand."""
+    base_m: tuple[float, float, float]
+    """Where the root of the URDF stands, its axes along those of the world."""
+    targets: tuple[JointTarget, ...]
+    """In the order of their times."""
+    gain_hz: float
+    """Speed that a joint is told per distance to its target."""
+    limit_rad_s: float
+    """Largest speed of each joint."""
+    period_s: float
+    """Between two commands."""
+    duration_s: float
+    boxes: Mapping[str, PushedBox] = field(default_factory=dict)
+    """By object id; empty where the tool alone moves."""
+
+    def joint_path_rad(
+        self,
+    ) -> tuple[Float[np.ndarray, " num_commands"], Float[np.ndarray, "num_commands num_joints"]]:
+        """Follow the velocity commands without error: their times, and where the joints are then.
+
+        Speed = clip(gain x (target - joint), +- limit), held until the next command.
+
+        Returns:
+            Times from the start [s], and joints [rad] in the order of ``joints``; linear between.
+        """
+        count = round(self.duration_s / self.period_s)
+        times_s = np.arange(count + 1) * self.period_s
+        q = np.zeros((count + 1, len(self.joints)))
+        target = np.zeros(len(self.joints))
+        waiting = list(self.targets)
+        for index in range(count):
+            while waiting and waiting[0].t_s <= times_s[index] + 1e-9:
+                for name, value in waiting.pop(0).joints_rad.items():
+                    target[self.joints.index(name)] = value
+            speed = np.clip(self.gain_hz * (target - q[index]), -self.limit_rad_s, self.limit_rad_s)
+            q[index + 1] = q[index] + speed * self.period_s
+        return times_s, q
+
+    def to_record(self) -> dict[str, str]:
+        """Return the metadata record of an episode."""
+        record = {"schema_version": _VERSION, **asdict(self)}
+        return {name: json.dumps(value) for name, value in record.items()}
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> "ScriptedMotion":
+        """Read a metadata record whose values are parsed.
+
+        Raises:
+            InvalidRecordError: When a field is missing, of another kind, or of a later version.
+        """
+        try:
+            if record["schema_version"] != _VERSION:
+                found = f"schema version {record['schema_version']!r}, known is {_VERSION}"
+                raise InvalidRecordError(name=RECORD_NAME, where="schema_version", found=found)
+            motion = ScriptedMotion(
+                robot=str(record["robot"]),
+                hand_link=str(record["hand_link"]),
+                joints=tuple(map(str, record["joints"])),
+                base_m=_position(record["base_m"]),
+                targets=tuple(
+                    JointTarget(
+                        t_s=float(item["t_s"]),
+                        joints_rad={k: float(v) for k, v in item["joints_rad"].items()},
+                    )
+                    for item in record["targets"]
+                ),
+                gain_hz=float(record["gain_hz"]),
+                limit_rad_s=float(record["limit_rad_s"]),
+                period_s=float(record["period_s"]),
+                duration_s=float(record["duration_s"]),
+                boxes={name: _box(item) for name, item in record["boxes"].items()},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InvalidRecordError(
+                name=RECORD_NAME, where="", found=f"{type(error).__name__}: {error}"
+            ) from error
+        motion._check()
+        return motion
+
+    def _check(self) -> None:
+        numbers = (self.gain_hz, self.limit_rad_s, self.period_s, self.duration_s)
+        if not all(np.isfinite(value) and value > 0 for value in numbers):
+            raise InvalidRecordError(
+                name=RECORD_NAME, where="gain, limit, period or duration", found="not above zero"
+            )
+        unknown = {name for item in self.targets for name in item.joints_rad} - set(self.joints)
+        if unknown:
+            raise InvalidRecordError(
+                name=RECORD_NAME,
+                where="targets",
+                found=f"{', '.join(sorted(unknown))} is none of {', '.join(self.joints)}",
+            )
+
+
+def _position(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _box(record: Mapping[str, Any]) -> PushedBox:
+    box = PushedBox(size_m=_position(record["size_m"]), mass_kg=float(record["mass_kg"]))
+    if not all(np.isfinite(value) and value > 0 for value in (*box.size_m, box.mass_kg)):
+        message = f"a size or mass that is not above zero: {record}"
+        raise ValueError(message)
+    return box

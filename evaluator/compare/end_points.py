@@ -1,0 +1,265 @@
+"""Where bodies of imported runs end, the tool and the objects it moves: recorded against simulated.
+
+A simulated run that was replayed from one recorded run is compared with that run alone; one that
+belongs to no single recorded run is compared with each of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from statistics import median
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry.trajectory import PoseTrajectory
+from evaluator.compare.band_measurements import Side
+from evaluator.compare.measure import Part, ends, interval_or_reason, measured, millimetres
+from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import BODY_DISTANCES, Defined
+from evaluator.metrics.trajectory import MOVING_THRESHOLD_M, NORMALISED_SAMPLES, moving_part
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.statistics.intervals import median_interval
+
+TOOL_BODY = "tool"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyDistance:
+    """How far a simulated body is from the recorded one; over several simulated runs the mean."""
+
+    end_point_m: float
+    displacement_m: float
+    """Difference of end minus start: where both began plays no part."""
+    over_time_m: float
+    """Mean over normalised time."""
+    moving_over_time_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyComparison:
+    """One recorded run against the simulated runs it is compared with."""
+
+    recorded: str
+    simulated: tuple[str, ...]
+    distance: BodyDistance
+    fitted: bool
+    """Something was fitted to this very run, so it says nothing about other runs."""
+
+
+class _Course:
+    """What of a track enters a distance; resampled once, however often it is compared."""
+
+    def __init__(self, track: PoseTrajectory) -> None:
+        self._track = track
+
+    @property
+    def end_m(self) -> Float[np.ndarray, "3"]:
+        return np.asarray(self._track.p_m[-1])
+
+    @property
+    def way_m(self) -> Float[np.ndarray, "3"]:
+        return np.asarray(self._track.p_m[-1] - self._track.p_m[0])
+
+    @cached_property
+    def whole_m(self) -> Float[np.ndarray, "num_samples 3"]:
+        return np.asarray(self._track.normalised_time(NORMALISED_SAMPLES).p_m)
+
+    @cached_property
+    def moving_m(self) -> Float[np.ndarray, "num_samples 3"]:
+        return np.asarray(moving_part(self._track).normalised_time(NORMALISED_SAMPLES).p_m)
+
+    def distance(self, other: "_Course") -> BodyDistance:
+        def between(a: np.ndarray, b: np.ndarray) -> float:
+            return float(np.linalg.norm(a - b, axis=-1).mean())
+
+        return BodyDistance(
+            end_point_m=between(self.end_m, other.end_m),
+            displacement_m=between(self.way_m, other.way_m),
+            over_time_m=between(self.whole_m, other.whole_m),
+            moving_over_time_m=between(self.moving_m, other.moving_m),
+        )
+
+
+def moved_bodies(real: Side) -> list[str]:
+    """List the tool and the objects that recorded runs move: by 10 mm, in the median over runs."""
+    found = [TOOL_BODY]
+    for name in sorted({name for run in real.runs for name in run.objects}):
+        ways = [
+            float(np.linalg.norm(run.objects[name].p_m[-1] - run.objects[name].p_m[0]))
+            for run in real.runs
+            if name in run.objects
+        ]
+        if median(ways) > MOVING_THRESHOLD_M:
+            found.append(name)
+    return found
+
+
+def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyComparison]:
+    """Compare one body run by run; recorded runs without a counterpart are left out.
+
+    Args:
+        real: Recorded runs of a task.
+        simulated: Runs of one engine.
+        body: ``tool`` or the id of an object.
+    """
+    courses = {run.episode: _Course(track) for run in simulated.runs if (track := run.body(body))}
+    found = []
+    for run in real.runs:
+        mine = run.body(body)
+        others = [
+            other
+            for other in simulated.runs
+            if other.replayed_from in (None, run.episode) and other.episode in courses
+        ]
+        if mine is None or not others:
+            continue
+        course = _Course(mine)
+        each = [course.distance(courses[other.episode]) for other in others]
+        found.append(
+            BodyComparison(
+                recorded=run.episode,
+                simulated=tuple(other.episode for other in others),
+                distance=BodyDistance(
+                    **{
+                        field.name: float(np.mean([getattr(item, field.name) for item in each]))
+                        for field in fields(BodyDistance)
+                    }
+                ),
+                fitted=any(run.episode in other.fitted_to for other in others),
+            )
+        )
+    return found
+
+
+def body_measurements(
+    task: str, engine: str, body: str, compared: Sequence[BodyComparison]
+) -> list[Measurement]:
+    """Measure the medians over recorded runs; runs that something was fitted to do not count.
+
+    Args:
+        task: Task of the runs, a part of the ids.
+        engine: The simulated side, another part.
+        body: ``tool`` or the id of an object.
+        compared: One for each recorded run.
+    """
+    counted = [item for item in compared if not item.fitted]
+    words = f"{body}, {len(counted)} recorded runs against {engine}"
+    episodes = [name for item in counted for name in (item.recorded, *item.simulated)]
+    return [
+        _median_of(
+            quantity.of(task=task, engine=engine, body=body, what=words),
+            [getattr(item.distance, name) for item in counted],
+            list(dict.fromkeys(episodes)),
+        )
+        for name, quantity in BODY_DISTANCES.items()
+    ]
+
+
+def _median_of(defined: Defined, values_m: list[float], episodes: list[str]) -> Measurement:
+    interval, why_none = interval_or_reason(median_interval, values_m)
+
+    def compute() -> tuple[float, Interval | None]:
+        if not values_m:
+            raise UndefinedStatisticError(
+                statistic="median", reason="no recorded run is left to compare with"
+            )
+        return float(median(values_m)), interval
+
+    return measured(
+        defined,
+        compute,
+        n=len(values_m),
+        counted="run",
+        reason_without_interval=why_none,
+        episodes=episodes,
+    )
+
+
+def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: str) -> Part:
+    """Compare every moved body of a task with every engine.
+
+    Args:
+        task: Task of the runs.
+        real: Recorded runs.
+        sides: Simulated runs, by engine.
+        table_id: Id of the table, its file name too.
+    """
+    measurements: list[Measurement] = []
+    rows: list[dict[str, Cell]] = []
+    each: list[dict[str, Cell]] = []
+    left_out: list[Exclusion] = []
+    for body in moved_bodies(real):
+        for side in sides:
+            compared = compare_bodies(real, side, body)
+            if not compared:
+                continue
+            found = body_measurements(task, side.name, body, compared)
+            measurements += found
+            rows.append(_row(body, side, compared, found))
+            each += [_row_of_run(body, side, item) for item in compared]
+            left_out += _fitted(side, compared) if body != TOOL_BODY else []
+    tables = (
+        Table.of(
+            rows,
+            id=table_id,
+            title=f"End points: {task}",
+            note="Medians over recorded runs. A replay is compared with the run that it was made "
+            "from, other simulated runs with every recorded one (mean over them). Displacement: "
+            "end minus start, so where a body began plays no part. Intervals of the end point: "
+            "order statistics, 95 %. Runs that something was fitted to do not count.",
+        ),
+        Table.of(
+            each,
+            id=table_id.replace("bands_", "runs_of_"),
+            title=f"End points of each recorded run: {task}",
+            note="Also of runs that something was fitted to; they are marked.",
+        ),
+    )
+    return Part(
+        measurements=tuple(measurements),
+        tables=tables if rows else (),
+        exclusions=tuple(dict.fromkeys(left_out)),
+    )
+
+
+def _row(
+    body: str, side: Side, compared: Sequence[BodyComparison], found: Sequence[Measurement]
+) -> dict[str, Cell]:
+    by_name = dict(zip(BODY_DISTANCES, found, strict=True))
+    low, high = ends(by_name["end_point_m"].interval, 1e3)
+    return {
+        "body": body,
+        "engine": side.name,
+        "recorded runs": by_name["end_point_m"].n,
+        "fitted to": sum(item.fitted for item in compared),
+        "end-point error (mm)": millimetres(by_name["end_point_m"].value),
+        "low (mm)": None if low is None else round(low, 2),
+        "high (mm)": None if high is None else round(high, 2),
+        "displacement error (mm)": millimetres(by_name["displacement_m"].value),
+        "error over normalised time (mm)": millimetres(by_name["over_time_m"].value),
+        "the same, moving part (mm)": millimetres(by_name["moving_over_time_m"].value),
+    }
+
+
+def _row_of_run(body: str, side: Side, item: BodyComparison) -> dict[str, Cell]:
+    return {
+        "body": body,
+        "engine": side.name,
+        "recorded run": item.recorded,
+        "simulated runs": len(item.simulated),
+        "fitted to": item.fitted,
+        "end-point error (mm)": millimetres(item.distance.end_point_m),
+        "displacement error (mm)": millimetres(item.distance.displacement_m),
+        "error over normalised time (mm)": millimetres(item.distance.over_time_m),
+        "the same, moving part (mm)": millimetres(item.distance.moving_over_time_m),
+    }
+
+
+def _fitted(side: Side, compared: Sequence[BodyComparison]) -> list[Exclusion]:
+    reason = f"the replays of {side.name} were fitted to this run; only held-out runs count"
+    return [
+        Exclusion(episode=item.recorded, scope="end points", reason=reason)
+        for item in compared
+        if item.fitted
+    ]

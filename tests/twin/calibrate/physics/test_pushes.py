@@ -1,0 +1,200 @@
+"""Imported pushes: physics laws of the pushed box, what is read, and friction found again."""
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.terminal import Output
+from twin.calibrate.config import CalibrateConfig
+from twin.calibrate.physics import push_fit
+from twin.calibrate.physics.cases import UnusableCaseError
+from twin.calibrate.physics.push_fit import (
+    calibrate_pushes,
+    describe_pushes,
+    frictions,
+    has_motions,
+    least,
+    load_push,
+    resampled,
+    split,
+)
+from twin.calibrate.physics.pushes import UnusablePushError, hand_path, replay_push
+from twin.physics.config import PhysicsConfig
+from twin.physics.push import PushWorld
+from twin.robot.hand import Hand
+from twin.robot.model import RobotDescriptionError
+
+sys.path.insert(0, str(Path(__file__).parent))
+import pushed_boxes
+
+GRAVITY_M_S2 = 9.81
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A run with the made robot."""
+    folder = RunFolder.create(tmp_path / "run")
+    pushed_boxes.write_robot(folder)
+    return folder
+
+
+def hand_of(run: RunFolder) -> Hand:
+    return Hand(run.path / "robot" / "hand.urdf", ("turn",), "hand")
+
+
+@pytest.mark.parametrize(("speed_m_s", "friction"), [(0.4, 0.2), (0.6, 0.4)])
+def test_a_box_slides_on_as_far_as_coulomb_says(speed_m_s: float, friction: float) -> None:
+    plate = np.array([[x, y, z] for x in (-0.02, 0.0) for y in (-0.1, 0.1) for z in (0.01, 0.05)])
+    size_m = np.array([0.08, 0.08, 0.06])
+    T = np.eye(4)
+    T[:3, 3] = [0.0401, 0.0, 0.03]
+    still, moving = np.zeros(3), np.array([speed_m_s, 0.0, 0.0])
+    config = frictions(friction, 0.5, PhysicsConfig())
+    with PushWorld(
+        config, hulls_m=[plate], size_m=size_m, mass_kg=0.1, T_world_box=T, table_height_m=0.0
+    ) as world:
+        p, q = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        for _ in range(120):
+            world.step(p, q, moving, still)
+            p[0] += speed_m_s / config.rate_hz
+        pushed = world.step(p, q, still, still)
+        for _ in range(240):
+            box = world.step(p, q, still, still)
+    # Pushed by its back face, which stays at the plate.
+    assert pushed[0] == pytest.approx(p[0] + 0.04, abs=0.005)
+    # It leaves with the plate's speed: v^2 / (2 mu g), within 5 % and a step's way.
+    free_m = speed_m_s**2 / (2 * friction * GRAVITY_M_S2)
+    assert box[0] - pushed[0] == pytest.approx(free_m, abs=0.05 * free_m + 0.003)
+    assert box[1:3] == pytest.approx([0.0, 0.03], abs=0.002)
+
+
+def test_hulls_follow_the_angle_of_the_fingers(run: RunFolder) -> None:
+    hand = hand_of(run)
+    palm, finger = hand.hulls_m(0.0)
+    assert np.ptp(palm, axis=0) == pytest.approx([pushed_boxes.PALM_M, 0.2, 0.04])
+    assert finger[:, 2].max() == pytest.approx(0.2)
+    bent_palm, bent = hand.hulls_m(0.7)
+    np.testing.assert_allclose(bent_palm, palm)
+    hinge = np.array([0.0, 0.0, 0.1])
+    expected = (finger - hinge) @ pushed_boxes.turned_about_y(0.7).T + hinge
+    np.testing.assert_allclose(bent, expected, atol=1e-9)
+
+
+def test_a_mesh_that_is_missing_is_named(run: RunFolder) -> None:
+    (run.path / "robot" / "meshes" / "palm.stl").unlink()
+    with pytest.raises(RobotDescriptionError, match=r"palm\.stl"):
+        hand_of(run)
+    with pytest.raises(RobotDescriptionError, match="Import the data set again"):
+        Hand(run.path / "none.urdf", ("turn",), "hand")
+
+
+def test_unknown_joints_and_links_are_listed(run: RunFolder) -> None:
+    urdf = run.path / "robot" / "hand.urdf"
+    with pytest.raises(RobotDescriptionError, match=r"lacks the joints twist.*turn, bend"):
+        Hand(urdf, ("twist",), "hand")
+    with pytest.raises(RobotDescriptionError, match=r"lacks 'paw'.*root, hand, finger"):
+        Hand(urdf, ("turn",), "paw")
+
+
+def load(run: RunFolder, name: str = "push_0001") -> Any:
+    return load_push(run.path.resolve(), name)
+
+
+def test_the_marker_is_where_it_was_at_the_start(run: RunFolder) -> None:
+    pushed_boxes.write_recording(run, "push_0001", 0.3)
+    push = load(run)
+    np.testing.assert_allclose(push.T_hand_tool[:3, 3], pushed_boxes.MARKER_M, atol=1e-9)
+    stamps, Ts = hand_path(push, "executed", 240)
+    t_s, x = pushed_boxes.hand_x_m(0.3)
+    # Smoothing by 20 ms rounds the corners of the way and nothing else.
+    np.testing.assert_allclose(Ts[:, 0, 3], np.interp(stamps * 1e-9, t_s, x), atol=0.003)
+    np.testing.assert_allclose(Ts[:, 1:3, 3], [[0.0, 0.03]] * len(Ts), atol=1e-9)
+    _, planned = hand_path(push, "planned", 240)
+    np.testing.assert_allclose(planned[:, :3, :3], [np.eye(3)] * len(planned), atol=1e-12)
+    np.testing.assert_allclose(planned[:, :3, 3], [[-0.3, 0.0, 0.03]] * len(planned), atol=1e-12)
+
+
+def test_what_cannot_be_replayed_is_refused(run: RunFolder) -> None:
+    pushed_boxes.write_recording(run, "push_0001", 0.3, box=False)
+    with pytest.raises(UnusablePushError, match="no poses of 'cube'"):
+        load(run)
+    pushed_boxes.write_recording(run, "other", 0.3, motion=None)
+    assert load(run, "other") is None
+    assert not has_motions(RunFolder.create(run.path.parent / "empty"))
+    assert has_motions(run)
+
+
+def record_with(run: RunFolder, surface: float, hand: float, count: int = 6) -> None:
+    """Recordings whose boxes end where the twin puts them at these frictions."""
+    for index in range(count):
+        name, speed = f"push_{2 * index + 1:04d}", 0.3 + 0.04 * index
+        pushed_boxes.write_recording(run, name, speed)
+        push = load(run, name)
+        result = replay_push(push, "executed", frictions(surface, hand, PhysicsConfig()))
+        pushed_boxes.write_recording(run, name, speed, box_end_x_m=result.Ts_world_box[-1, 0, 3])
+    load_push.cache_clear()
+
+
+@pytest.fixture
+def small_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three frictions of the table, two of the hand, one angle."""
+    monkeypatch.setattr(push_fit, "FINGERS_RAD", np.array([0.0]))
+    monkeypatch.setattr(push_fit, "SURFACE", np.array([0.15, 0.3, 0.6]))
+    monkeypatch.setattr(push_fit, "HAND", np.array([0.2, 0.6]))
+
+
+@pytest.mark.usefixtures("small_grid")
+def test_friction_of_made_recordings_is_found_again(run: RunFolder) -> None:
+    record_with(run, 0.3, 0.6)
+    output = Output(quiet=True)
+    record, calibration_id = calibrate_pushes(run, CalibrateConfig(physics=True, workers=1), output)
+    found = record["parameters"]["surface_pair_friction"]
+    assert (found["value"], found["low"], found["high"]) == (0.3, 0.3, 0.3)
+    assert found["identified"]
+    held = record["held_out"]
+    assert record["fitted_to"] == ["push_0001", "push_0005", "push_0009"]
+    assert held["episodes"] == ["push_0003", "push_0007", "push_0011"]
+    assert held["calibrated"]["end_point_error_median_m"] < 1e-3
+    assert held["nominal"]["end_point_error_median_m"] > 5e-3
+    assert record["promoted"]
+    own = PhysicsConfig().object_friction
+    assert record["identified"]["surface_friction"]["value"] == pytest.approx(0.3 / own)
+    text = describe_pushes(record, calibration_id)
+    assert re.search(r"held out, calibrated: end points off by 0\.\d mm \(median of 3", text)
+
+
+@pytest.mark.usefixtures("small_grid")
+def test_too_few_pushes_are_refused(run: RunFolder) -> None:
+    for index in range(4):
+        pushed_boxes.write_recording(run, f"push_{index}", 0.3)
+    with pytest.raises(UnusableCaseError, match=r"4 pushes .* at least 6"):
+        calibrate_pushes(run, CalibrateConfig(physics=True, workers=1), Output(quiet=True))
+
+
+def test_every_other_run_is_held_out() -> None:
+    assert split(["r_31", "r_01", "r_07", "r_05"]) == (["r_01", "r_07"], ["r_05", "r_31"])
+
+
+def test_the_least_error_is_found_again_on_resamples() -> None:
+    rng = np.random.default_rng(3)
+    grid = 0.01 + 0.001 * rng.random((6, 2, 4, 3))
+    grid[:, 1, 2, 0] = 0.002
+    assert least(grid, range(6)) == (1, 2, 0)
+    assert (resampled(grid, 0) == (1, 2, 0)).all()
+    grid[:3, 0, 0, 0] = (
+        0.0  # best for three runs, bad for the others: best where only these are drawn
+    )
+    share = (resampled(grid, 0) == (0, 0, 0)).all(axis=1).mean()
+    assert share == pytest.approx(2**-6, abs=0.012)
+
+
+def test_a_recording_of_another_kind_has_no_motion(run: RunFolder) -> None:
+    path = pushed_boxes.write_recording(run, "push_0001", 0.3, motion=None)
+    assert load(run) is None
+    assert Episode.open(path).info.kind == "imported"

@@ -1,0 +1,368 @@
+"""Friction of imported pushes, identified on every other run and scored on those between.
+
+What is fitted is searched for on a grid, all of it: the angle of the fingers, which nobody
+recorded, and the two frictions. Of the runs of a task in the order of their numbers the first,
+third, fifth ... identify, the others are held out. docs/real_number.md gives the reasons.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import provenance
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
+from bridge.terminal import Output
+from twin.calibrate.config import CalibrateConfig
+from twin.calibrate.physics.cases import UnusableCaseError
+from twin.calibrate.physics.parameters import FINGER_FRICTION, SURFACE_FRICTION
+from twin.calibrate.physics.pushes import Push, motion_of, read_push, replay_push
+from twin.physics.config import PhysicsConfig
+from twin.physics.engine import ENGINE_VERSION
+from twin.robot.hand import Hand
+from twin.scene.store.calibration import write_physics
+
+METHOD = "pushes"
+"""Marks the physics part of a calibration that was made here."""
+FINGERS_RAD = np.linspace(0.0, 0.25, 6)
+SURFACE = np.geomspace(0.05, 1.6, 9)
+"""Effective friction of box on table."""
+HAND = np.geomspace(0.1, 1.6, 7)
+"""Effective friction of hand on box."""
+RESAMPLES = 2000
+FEWEST = 3
+"""Identifying runs from which an interval can be given."""
+LOG_95 = 2 * 1.96
+
+
+@lru_cache(maxsize=4)
+def _hand(urdf: Path, joints: tuple[str, ...], hand_link: str) -> Hand:
+    return Hand(urdf, joints, hand_link)
+
+
+@lru_cache(maxsize=32)
+def load_push(run_path: Path, episode_id: str) -> Push | None:
+    """Read an imported recording once per process; None for any other episode.
+
+    Args:
+        run_path: Of the run folder.
+        episode_id: Of the recording.
+
+    Raises:
+        GstError: When it, its record or its robot cannot be used.
+    """
+    run = RunFolder.open(run_path)
+    episode = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
+    motion = motion_of(episode)
+    if motion is None:
+        return None
+    hand = _hand(run.path / motion.robot, motion.joints, motion.hand_link)
+    return read_push(run, episode, motion, hand)
+
+
+def has_motions(run: RunFolder) -> bool:
+    """Whether a run holds imported recordings that can be replayed without a plan."""
+    for path in run.episodes():
+        try:
+            if motion_of(Episode.open(path)) is not None:
+                return True
+        except GstError:
+            continue
+    return False
+
+
+def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConfig:
+    """Set effective frictions; the engine multiplies both partners'.
+
+    Args:
+        surface: Of box on table.
+        hand: Of hand on box.
+        config: Everything else, the object's own coefficient among it.
+    """
+    own = config.object_friction
+    return replace(config, surface_friction=surface / own, finger_friction=hand / own)
+
+
+def end_point_error_m(
+    push: Push, config: PhysicsConfig, finger_rad: float
+) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Distance of recorded and replayed end of the box, and the replayed end [m].
+
+    Args:
+        push: With a box.
+        config: Rates and frictions.
+        finger_rad: Angle of the fingers.
+    """
+    result = replay_push(push, "executed", config, finger_rad)
+    if result.Ts_world_box is None or push.box_track is None:
+        message = f"{push.episode} has no box."
+        raise UnusableCaseError(message)
+    end_m = result.Ts_world_box[-1, :3, 3]
+    return float(np.linalg.norm(end_m - push.box_track.p_m[-1])), end_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridRow:
+    """Simulations of one recording that differ in the friction of the hand."""
+
+    run_path: Path
+    episode: str
+    finger_rad: float
+    surface: float
+    hand: tuple[float, ...]
+
+    def cost(self) -> float:
+        """All take about as long."""
+        return 1.0
+
+
+def errors_of(item: GridRow) -> list[float]:
+    """End point errors [m], one for each friction of the hand.
+
+    Raises:
+        UnusableCaseError: When the recording has no box.
+    """
+    push = load_push(item.run_path, item.episode)
+    if push is None:
+        message = f"{item.episode} is not an imported push."
+        raise UnusableCaseError(message)
+    nominal = PhysicsConfig()
+    return [
+        end_point_error_m(push, frictions(item.surface, hand, nominal), item.finger_rad)[0]
+        for hand in item.hand
+    ]
+
+
+def split(episodes: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Identifying runs (first, third, fifth ... in name order) and held-out ones (the others)."""
+    ordered = sorted(episodes)
+    return ordered[::2], ordered[1::2]
+
+
+Grid = Float[np.ndarray, "num_runs num_fingers num_surface num_hand"]
+
+
+def least(grid: Grid, runs: Sequence[int]) -> tuple[int, int, int]:
+    """Indices of the point with the least mean squared error over some runs.
+
+    Args:
+        grid: End point errors [m].
+        runs: Which runs count; one may count twice.
+    """
+    cost = (grid[list(runs)] ** 2).mean(axis=0)
+    a, b, c = np.unravel_index(int(cost.argmin()), cost.shape)
+    return int(a), int(b), int(c)
+
+
+def resampled(grid: Grid, seed: int) -> np.ndarray:
+    """Points found again on resamples of the runs: ``RESAMPLES`` rows of three indices.
+
+    Args:
+        grid: End point errors [m].
+        seed: Of the resampling.
+    """
+    rng = np.random.default_rng(seed)
+    draws = rng.integers(0, len(grid), size=(RESAMPLES, len(grid)))
+    return np.array([least(grid, draw.tolist()) for draw in draws])
+
+
+def calibrate_pushes(
+    run: RunFolder, config: CalibrateConfig, output: Output
+) -> tuple[Mapping[str, Any], str]:
+    """Identify friction on half of a run's pushes, score it on the others, write the calibration.
+
+    Args:
+        run: With imported recordings.
+        config: Workers and seed.
+        output: Shows progress.
+
+    Returns:
+        The physics record, and the id of the calibration that holds now.
+
+    Raises:
+        UnusableCaseError: When there are too few pushes, or one cannot be simulated.
+    """
+    pushes, skipped = _pushes(run)
+    fitted, held_out = split(list(pushes))
+    if len(fitted) < FEWEST or not held_out:
+        message = f"{len(pushes)} pushes in {run.path}; at least {2 * FEWEST} are needed."
+        raise UnusableCaseError(message)
+    output.say(f"{len(pushes)} pushes: {len(fitted)} identify, {len(held_out)} are held out")
+    workers = config.workers or default_size()
+    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
+    with runner:
+        grid = _simulate(run, fitted, runner, output)
+    best = least(grid, range(len(fitted)))
+    straight = least(grid[:, :1], range(len(fitted)))
+    again = resampled(grid, config.seed)
+    scores = {
+        "nominal": _score(pushes, held_out, PhysicsConfig(), 0.0),
+        "calibrated": _score(pushes, held_out, *_point(best)),
+        "fingers_at_zero": _score(pushes, held_out, *_point(straight)),
+    }
+    record = _record(best, again, scores)
+    record |= {
+        "fitted_to": fitted,
+        "held_out": {"episodes": held_out, **scores},
+        "fitted": _score(pushes, fitted, *_point(best)),
+        "fingers_at_zero": _values(straight),
+        "sources": {name: {"kind": "push", "sha256": pushes[name].sha256} for name in pushes},
+        "skipped": skipped,
+        "num_evaluations": int(grid.size),
+    }
+    record["id"] = provenance.hash_settings(record)
+    return record, str(write_physics(run, record)["calibration_id"])
+
+
+def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
+    found: dict[str, Push] = {}
+    skipped: dict[str, str] = {}
+    for path in run.episodes():
+        try:
+            push = load_push(run.path.resolve(), path.stem)
+        except GstError as error:
+            skipped[path.stem] = str(error)
+            continue
+        if push is not None and push.T_world_box is not None:
+            found[path.stem] = push
+    tasks = sorted({push.task for push in found.values()})
+    if len(tasks) > 1:
+        message = (
+            f"pushes of several tasks in {run.path}: {', '.join(tasks)}; calibrate them apart."
+        )
+        raise UnusableCaseError(message)
+    return found, skipped
+
+
+def _simulate(run: RunFolder, fitted: Sequence[str], runner: Runner, output: Output) -> Grid:
+    items = [
+        GridRow(
+            run_path=run.path.resolve(),
+            episode=name,
+            finger_rad=float(finger),
+            surface=float(surface),
+            hand=tuple(HAND.tolist()),
+        )
+        for name in fitted
+        for finger in FINGERS_RAD
+        for surface in SURFACE
+    ]
+    errors: dict[GridRow, list[float]] = {}
+    with output.progress("physics", len(items)) as advance:
+        for done, (item, answer) in enumerate(runner.run(errors_of, items, GridRow.cost), start=1):
+            if isinstance(answer, Failed):
+                raise UnusableCaseError(answer.message)
+            errors[item] = answer
+            advance(done, item.episode)
+    shape = (len(fitted), len(FINGERS_RAD), len(SURFACE), len(HAND))
+    return np.array([errors[item] for item in items]).reshape(shape)
+
+
+def _values(point: tuple[int, int, int]) -> dict[str, float]:
+    return {
+        "finger_rad": float(FINGERS_RAD[point[0]]),
+        SURFACE_FRICTION: float(SURFACE[point[1]]),
+        FINGER_FRICTION: float(HAND[point[2]]),
+    }
+
+
+def _point(point: tuple[int, int, int]) -> tuple[PhysicsConfig, float]:
+    values = _values(point)
+    config = frictions(values[SURFACE_FRICTION], values[FINGER_FRICTION], PhysicsConfig())
+    return config, values["finger_rad"]
+
+
+def _score(
+    pushes: Mapping[str, Push], names: Sequence[str], config: PhysicsConfig, finger_rad: float
+) -> dict[str, Any]:
+    errors = {name: end_point_error_m(pushes[name], config, finger_rad)[0] for name in names}
+    values = list(errors.values())
+    return {
+        "n": len(values),
+        "end_point_error_median_m": float(np.median(values)),
+        "least_m": min(values),
+        "most_m": max(values),
+        "by_episode_m": errors,
+    }
+
+
+def _record(
+    best: tuple[int, int, int], again: np.ndarray, scores: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    nominal, found = (
+        scores[name]["end_point_error_median_m"] for name in ("nominal", "calibrated")
+    )
+    promoted = bool(found < nominal)
+    own = PhysicsConfig().object_friction
+    parameters, identified = {}, {}
+    rows = (
+        ("finger_rad", FINGERS_RAD, "rad", "angle of the fingers", 0.0, None),
+        (SURFACE_FRICTION, SURFACE, "1", "friction of box on table", own * own, "surface_friction"),
+        (FINGER_FRICTION, HAND, "1", "friction of hand on box", own, "finger_friction"),
+    )
+    for index, (name, values, unit, about, usual, field) in enumerate(rows):
+        low, high = np.quantile(values[again[:, index]], [0.025, 0.975], method="nearest")
+        whole = bool(low == values[0] and high == values[-1])
+        parameters[name] = {
+            "about": about,
+            "unit": unit,
+            "nominal": usual,
+            "value": float(values[best[index]]),
+            "low": float(low),
+            "high": float(high),
+            "identified": not whole,
+            "why": "every value tried fits as well" if whole else "resampled identifying runs",
+        }
+        if field is not None and promoted:
+            spread = max(float(np.log(high / low)), float(np.log(values[1] / values[0]))) / LOG_95
+            identified[field] = {
+                "value": float(values[best[index]]) / own,
+                "low": float(low) / own,
+                "high": float(high) / own,
+                "sigma_log": spread,
+            }
+    words = "nearer" if promoted else "no nearer"
+    return {
+        "method": METHOD,
+        "promoted": promoted,
+        "why": f"held-out end points are {words} than at nominal friction",
+        "engine": ENGINE_VERSION,
+        "identified": identified,
+        "parameters": parameters,
+    }
+
+
+def describe_pushes(record: Mapping[str, Any], calibration_id: str) -> str:
+    """Say in a line per parameter what was found, and how far off held-out boxes end.
+
+    Args:
+        record: As ``calibrate_pushes`` makes it.
+        calibration_id: Of the calibration that holds now.
+    """
+    lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
+    for name, item in record["parameters"].items():
+        word = "identified" if item["identified"] else "not identified"
+        lines.append(
+            f"  {name:<22} {item['value']:>8.4g} [{item['low']:.4g}, {item['high']:.4g}] "
+            f"{item['unit']:<3} {word}: {item['why']}"
+        )
+    held = record["held_out"]
+    rows = [("identifying runs, calibrated", record["fitted"])]
+    rows += [
+        (f"held out, {name.replace('_', ' ')}", held[name])
+        for name in ("nominal", "calibrated", "fingers_at_zero")
+    ]
+    for label, item in rows:
+        lines.append(
+            f"  {label}: end points off by {item['end_point_error_median_m'] * 1e3:.1f} mm "
+            f"(median of {item['n']}; {item['least_m'] * 1e3:.1f} to {item['most_m'] * 1e3:.1f})"
+        )
+    lines += [f"  {name}: {why}" for name, why in record["skipped"].items()]
+    return "\n".join(lines)

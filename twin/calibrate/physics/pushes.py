@@ -1,0 +1,283 @@
+"""Imported pushes: what was recorded of one, and where its box goes in the twin.
+
+A push has a measured tool and a box on a table, and neither joints nor a plan (the record
+``scripted_motion`` of its episode). ``executed`` lets the hand follow the measured tool,
+``planned`` the joint schedule that the arm was given.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import gaussian_filter1d
+
+from bridge.clock import NS_PER_S
+from bridge.episode import schema
+from bridge.episode.reader import Episode, record_of
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import object_pose_topics, pose_track
+from bridge.episode.topics import TCP_POSE
+from bridge.geometry import se3
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.scripted_motion import RECORD_NAME, ScriptedMotion
+from twin.errors import TwinError
+from twin.physics.config import PhysicsConfig
+from twin.physics.push import PushWorld
+from twin.robot.hand import Hand
+
+Trajectory = Literal["planned", "executed"]
+REST_S = (0.2, 1.0)
+"""From when to when everything is at rest at the start of a recording; the first samples of a
+motion capture jump by up to 10 mm."""
+SMOOTH_S = 0.02
+"""Standard deviation of the centred Gaussian that measured tool poses are smoothed by: positions
+jump by up to 2 mm from one sample to the next, which would be knocks of 0.2 m/s."""
+LONGEST_GAP_S = 0.1
+"""A recording whose tool is lost for longer is not replayed."""
+NEAR_M = 0.03
+"""Physics runs while a hull of the hand may be nearer to the box than this, and for ``SETTLE_S``
+afterwards."""
+SETTLE_S = 1.0
+LOOK_EVERY = 12
+"""Steps between two looks whether the hand is near; it moves by some 10 mm meanwhile."""
+STATE_EVERY = 4
+"""Steps between two states that are kept: 60 Hz at 240 steps a second."""
+
+
+class UnusablePushError(TwinError):
+    """An imported recording that cannot be replayed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push:
+    """One recorded run with its robot, ready to be replayed."""
+
+    episode: str
+    sha256: str
+    task: str
+    motion: ScriptedMotion
+    hand: Hand
+    tool: PoseTrajectory
+    """As recorded."""
+    T_hand_tool: Float[np.ndarray, "4 4"]
+    """Estimated at the start, where all joints are zero."""
+    T_world_box: Float[np.ndarray, "4 4"] | None
+    """Where the box starts, upright; None: there is none, the tool alone moves."""
+    box: str = ""
+    """Its object id."""
+    box_track: PoseTrajectory | None = None
+    """As recorded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushResult:
+    """States over time, world frame, on the clock of the recording."""
+
+    stamps_ns: Int[np.ndarray, " num_states"]
+    Ts_world_tool: Float[np.ndarray, "num_states 4 4"]
+    Ts_world_box: Float[np.ndarray, "num_states 4 4"] | None
+
+
+def motion_of(episode: Episode) -> ScriptedMotion | None:
+    """Read what an imported recording's arm was told; None for any other episode.
+
+    Raises:
+        InvalidRecordError: When the record is damaged.
+    """
+    record = record_of(episode.files[0], RECORD_NAME)
+    if episode.info.kind != "imported" or not record:
+        return None
+    return ScriptedMotion.from_record(record)
+
+
+def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Hand) -> Push:
+    """Read one recording.
+
+    Args:
+        run: Run folder, for messages.
+        episode: The recording.
+        motion: Its record.
+        hand: The robot that the record names.
+
+    Raises:
+        UnusablePushError: When the tool is missing or lost for long, or a box was not recorded.
+    """
+    name = episode.info.id
+    topics = [
+        topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
+    ]
+    if not topics:
+        message = f"{name} in {run.path}: no tool poses (a topic ending with {TCP_POSE})."
+        raise UnusablePushError(message)
+    tool = pose_track(episode, topics[0])
+    gap_s = float(np.diff(tool.stamps_ns).max(initial=0)) / NS_PER_S
+    if gap_s > LONGEST_GAP_S:
+        message = f"{name} in {run.path}: the tool is lost for {gap_s:.2f} s."
+        raise UnusablePushError(message)
+    if len(motion.boxes) > 1:
+        message = f"{name} in {run.path}: {len(motion.boxes)} boxes; one can be replayed."
+        raise UnusablePushError(message)
+    T_world_hand = _world_hand(motion, hand, np.zeros(len(motion.joints)))
+    push = Push(
+        episode=name,
+        sha256=episode.sha256(),
+        task=episode.info.task,
+        motion=motion,
+        hand=hand,
+        tool=tool,
+        T_hand_tool=se3.invert(T_world_hand) @ rest_pose(tool),
+        T_world_box=None,
+    )
+    return push if not motion.boxes else _with_box(push, episode, next(iter(motion.boxes)))
+
+
+def _with_box(push: Push, episode: Episode, box: str) -> Push:
+    topic = object_pose_topics(episode).get(box)
+    if topic is None:
+        message = f"{push.episode}: no poses of {box!r} were recorded."
+        raise UnusablePushError(message)
+    track = pose_track(episode, topic)
+    T = rest_pose(track)
+    heading = np.arctan2(T[1, 0], T[0, 0])
+    T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, heading]))
+    return Push(**{**vars(push), "T_world_box": T, "box": box, "box_track": track})
+
+
+def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
+    """Median position and mean rotation while everything is at rest at the start.
+
+    Raises:
+        UnusablePushError: When nothing was recorded then.
+    """
+    t_s = (track.stamps_ns - track.stamps_ns[0]) / NS_PER_S
+    there = (t_s >= REST_S[0]) & (t_s <= REST_S[1])
+    if not there.any():
+        message = f"no pose from {REST_S[0]} s to {REST_S[1]} s after the start of a recording."
+        raise UnusablePushError(message)
+    Ts = track.transforms()[there]
+    T = np.eye(4)
+    T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
+    T[:3, :3] = se3.nearest_rotation(Ts[:, :3, :3].mean(axis=0))
+    return T
+
+
+def replay_push(
+    push: Push,
+    trajectory: Trajectory,
+    config: PhysicsConfig,
+    finger_rad: float = 0.0,
+) -> PushResult:
+    """Let the hand follow a trajectory and the box go where it is pushed.
+
+    Args:
+        push: What was recorded.
+        trajectory: ``executed``: the measured tool; ``planned``: the joint schedule.
+        config: Rates and frictions.
+        finger_rad: Angle of all fingers, which nobody recorded.
+    """
+    stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz)
+    Ts_world_box = None
+    if push.T_world_box is not None:
+        Ts_world_box = _push_box(push, Ts_world_hand, config, push.hand.hulls_m(finger_rad))
+    kept = np.unique(np.append(np.arange(0, len(stamps_ns), STATE_EVERY), len(stamps_ns) - 1))
+    return PushResult(
+        stamps_ns=stamps_ns[kept],
+        Ts_world_tool=Ts_world_hand[kept] @ push.T_hand_tool,
+        Ts_world_box=None if Ts_world_box is None else Ts_world_box[kept],
+    )
+
+
+def hand_path(
+    push: Push, trajectory: Trajectory, rate_hz: int
+) -> tuple[Int[np.ndarray, " num_steps"], Float[np.ndarray, "num_steps 4 4"]]:
+    """Where the hand link is at every physics step, world frame.
+
+    Args:
+        push: What was recorded.
+        trajectory: ``executed`` or ``planned``.
+        rate_hz: Steps per second.
+    """
+    first_ns = int(push.tool.stamps_ns[0])
+    if trajectory == "planned":
+        times_s, joints_rad = push.motion.joint_path_rad()
+        at_s = np.arange(round(times_s[-1] * rate_hz) + 1) / rate_hz
+        path = np.stack([np.interp(at_s, times_s, column) for column in joints_rad.T], axis=1)
+        Ts = np.stack([_world_hand(push.motion, push.hand, row) for row in path])
+        return first_ns + np.rint(at_s * NS_PER_S).astype(np.int64), Ts
+    last_ns = int(push.tool.stamps_ns[-1])
+    count = round((last_ns - first_ns) / NS_PER_S * rate_hz)
+    stamps_ns = first_ns + np.rint(np.arange(count + 1) * NS_PER_S / rate_hz).astype(np.int64)
+    track = push.tool.at(stamps_ns)
+    sigma = SMOOTH_S * rate_hz
+    q = track.q_wxyz * np.where((track.q_wxyz @ track.q_wxyz[0]) < 0, -1.0, 1.0)[:, None]
+    signs = np.cumprod(np.append(1.0, np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)))
+    q = gaussian_filter1d(q * signs[:, None], sigma, axis=0, mode="nearest")
+    p = gaussian_filter1d(track.p_m, sigma, axis=0, mode="nearest")
+    Ts_world_tool = se3.transform_from(q / np.linalg.norm(q, axis=1, keepdims=True), p)
+    return stamps_ns, np.asarray(Ts_world_tool @ se3.invert(push.T_hand_tool))
+
+
+def _world_hand(
+    motion: ScriptedMotion, hand: Hand, joints_rad: Float[np.ndarray, " num_joints"]
+) -> Float[np.ndarray, "4 4"]:
+    T = hand.T_base_hand(joints_rad)
+    T[:3, 3] += motion.base_m
+    return T
+
+
+def _push_box(
+    push: Push,
+    Ts_world_hand: Float[np.ndarray, "num_steps 4 4"],
+    config: PhysicsConfig,
+    hulls_m: list[Float[np.ndarray, "num_points 3"]],
+) -> Float[np.ndarray, "num_steps 4 4"]:
+    box = push.motion.boxes[push.box]
+    T_start = push.T_world_box
+    if T_start is None:  # for the type checker: there is a box
+        message = f"{push.episode}: no box."
+        raise UnusablePushError(message)
+    size_m = np.array(box.size_m)
+    velocity = np.diff(Ts_world_hand[:, :3, 3], axis=0) * config.rate_hz
+    R = Ts_world_hand[:, :3, :3]
+    turning = se3.vector_from_rotation(R[1:] @ np.swapaxes(R[:-1], 1, 2)) * config.rate_hz
+    q_hand, p_hand = se3.split(Ts_world_hand)
+    pose = np.concatenate([T_start[:3, 3], se3.split(T_start)[0]])
+    states = [pose]
+    left = 0
+    with PushWorld(
+        config,
+        hulls_m=hulls_m,
+        size_m=size_m,
+        mass_kg=box.mass_kg,
+        T_world_box=T_start,
+        table_height_m=float(T_start[2, 3] - size_m[2] / 2),
+    ) as world:
+        corners = np.concatenate(hulls_m)
+        first_ids = np.cumsum([0, *(len(points) for points in hulls_m[:-1])])
+        for step in range(len(velocity)):
+            left = max(left - 1, 0)
+            if step % LOOK_EVERY == 0 and _near(
+                corners, first_ids, Ts_world_hand[step], pose, size_m
+            ):
+                left = round(SETTLE_S * config.rate_hz)
+            if left:
+                pose = world.step(p_hand[step], q_hand[step], velocity[step], turning[step])
+            states.append(pose)
+    all_states = np.stack(states)
+    return se3.transform_from(all_states[:, 3:], all_states[:, :3])
+
+
+def _near(
+    corners_m: Float[np.ndarray, "num_points 3"],
+    first_ids: Int[np.ndarray, " num_hulls"],
+    T_world_hand: Float[np.ndarray, "4 4"],
+    pose: Float[np.ndarray, "7"],
+    size_m: Float[np.ndarray, "3"],
+) -> bool:
+    """Whether a hull may be within ``NEAR_M`` of the box: its bounds along the box's axes are."""
+    T_box_hand = se3.invert(se3.transform_from(pose[3:], pose[:3])) @ T_world_hand
+    there = corners_m @ T_box_hand[:3, :3].T + T_box_hand[:3, 3]
+    reach = size_m / 2 + NEAR_M
+    low, high = np.minimum.reduceat(there, first_ids), np.maximum.reduceat(there, first_ids)
+    return bool(((low < reach) & (high > -reach)).all(axis=1).any())

@@ -1,0 +1,189 @@
+"""Replays of imported recordings that have poses and a script, and neither joints nor a plan.
+
+``planned`` follows the joint schedule the arm was given, ``executed`` the measured tool. There is
+no plan and so no verdict: what comes out is an episode that ``evaluate`` lays over the recording.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import schema
+from bridge.episode.cdr.batch import pose_messages
+from bridge.episode.metadata import Derived
+from bridge.episode.provenance import hash_settings
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import GstError
+from twin.calibrate.physics.push_fit import METHOD, load_push
+from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
+from twin.physics.config import PhysicsConfig
+from twin.physics.engine import ENGINE_VERSION
+from twin.replay.config import ReplayConfig
+from twin.replay.rebuilt_scene import calibrated
+from twin.scene.store.calibration import Calibration, read_calibration
+
+ENGINE = "twin-pybullet"
+"""Beside simulators of others, which may have used PyBullet too."""
+MOTION_REPLAY_VERSION = 1
+FRAME = "world"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionReplay:
+    """One recording along one trajectory."""
+
+    run_path: Path
+    episode_id: str
+    trajectory: Trajectory
+    physics: PhysicsConfig
+    finger_rad: float
+    fitted_to: tuple[str, ...]
+    """Recordings from which friction was identified."""
+    calibration_id: str | None
+    force: bool = False
+
+    def settings(self) -> dict[str, Any]:
+        """What decides the result; part of the episode's provenance."""
+        return {
+            "version": MOTION_REPLAY_VERSION,
+            "engine_version": ENGINE_VERSION,
+            "physics": asdict(self.physics),
+            "finger_rad": self.finger_rad,
+            "fitted_to": list(self.fitted_to),
+        }
+
+    def cost(self) -> float:
+        """All take about as long."""
+        return 1.0
+
+    def path(self, sha256: str) -> Path:
+        """Of the derived episode.
+
+        Args:
+            sha256: Of the recording.
+        """
+        key = hash_settings({**self.settings(), "source": sha256, "id": self.calibration_id})
+        name = f"{self.episode_id}.replay.{self.trajectory}.dynamic.{ENGINE}.{key}.mcap"
+        return RunFolder(self.run_path).derived_dir / name
+
+
+def motion_replays(
+    run: RunFolder, names: list[str], config: ReplayConfig, *, force: bool
+) -> tuple[list[MotionReplay], dict[str, str]]:
+    """List what can be replayed of imported recordings, and why others cannot.
+
+    Args:
+        run: With or without a calibration.
+        names: Episodes that are asked for.
+        config: Physics; what was calibrated replaces nominal values.
+        force: Redo what is there.
+    """
+    calibration = read_calibration(run)
+    fit = _fit_of(calibration)
+    with_boxes = calibrated(config, calibration).physics
+    items: list[MotionReplay] = []
+    skipped: dict[str, str] = {}
+    for name in names:
+        try:
+            motion = motion_of(Episode.open(run.episodes_dir / f"{name}.mcap"))
+        except GstError as error:
+            skipped[name] = str(error)
+            continue
+        if motion is None:
+            continue
+        trajectories: tuple[Trajectory, ...] = ("planned", "executed")
+        used = fit if motion.boxes else {}  # a tool alone meets no friction
+        angle = used.get("parameters", {}).get("finger_rad", {}).get("value", 0.0)
+        items += [
+            MotionReplay(
+                run_path=run.path.resolve(),
+                episode_id=name,
+                trajectory=trajectory,
+                physics=with_boxes if motion.boxes else config.physics,
+                finger_rad=float(angle),
+                fitted_to=tuple(used.get("fitted_to", ())),
+                calibration_id=calibration.calibration_id if calibration and used else None,
+                force=force,
+            )
+            for trajectory in (trajectories if motion.boxes else trajectories[:1])
+        ]
+    return items, skipped
+
+
+def _fit_of(calibration: Calibration | None) -> Mapping[str, Any]:
+    """The physics part of a calibration, where pushes made it and held-out ones confirmed it."""
+    record = None if calibration is None else calibration.record.get("physics")
+    if not isinstance(record, Mapping) or record.get("method") != METHOD:
+        return {}
+    return record if record.get("promoted") else {}
+
+
+def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
+    """Replay, write the episode, and return its row.
+
+    Raises:
+        GstError: When the recording or its robot cannot be used.
+    """
+    push = load_push(item.run_path, item.episode_id)
+    if push is None:  # the list was made of others
+        message = f"{item.episode_id} is not an imported recording with a script."
+        raise GstError(message)
+    path = item.path(push.sha256)
+    kept = path.is_file() and not item.force
+    if kept:
+        path.touch()  # the newest replay of a trajectory is the one that counts
+    else:
+        result = replay_push(push, item.trajectory, item.physics, item.finger_rad)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        _write(path, item, push, result)
+    return {
+        "episode": item.episode_id,
+        "trajectory": item.trajectory,
+        "path": str(path),
+        "skipped": kept,
+    }
+
+
+def _write(path: Path, item: MotionReplay, push: Push, result: PushResult) -> None:
+    episode = Episode.open(RunFolder(item.run_path).episodes_dir / f"{item.episode_id}.mcap")
+    cell = episode.info.cell or "cell"
+    derived = Derived(
+        kind="replay",
+        source_episode=item.episode_id,
+        source_sha256=push.sha256,
+        trajectory=item.trajectory,
+        mode="dynamic",
+        engine=ENGINE,
+        calibration_id=item.calibration_id,
+        settings=item.settings(),
+    )
+    tracks = {cell_topic(cell, TCP_POSE): result.Ts_world_tool}
+    if result.Ts_world_box is not None:
+        tracks[object_topic(cell, push.box, "pose")] = result.Ts_world_box
+    with EpisodeWriter(path) as writer:
+        writer.describe(episode.info, derived=derived)
+        for topic, Ts in tracks.items():
+            rows = pose_messages(result.stamps_ns, FRAME, Ts)
+            for stamp_ns, data in zip(result.stamps_ns.tolist(), rows, strict=True):
+                writer.write(topic, data, type_name=schema.POSE_STAMPED, log_time_ns=stamp_ns)
+
+
+def describe_motions(rows: list[dict[str, Any]]) -> list[str]:
+    """Say how many replays there are of imported recordings."""
+    counts: dict[str, int] = {}
+    for row in rows:
+        counts[row["trajectory"]] = counts.get(row["trajectory"], 0) + 1
+    lines = [
+        f"imported recordings, {trajectory} ({words}): {counts[trajectory]} replays"
+        for trajectory, words in (
+            ("planned", "joint schedule"),
+            ("executed", "measured tool"),
+        )
+        if trajectory in counts
+    ]
+    return [*lines, "Compare: robot-gst evaluate RUN"] if lines else []

@@ -1,0 +1,140 @@
+"""A described arm up to its hand: kinematics from zero joints, and the hulls that push things.
+
+For arms that are known from a URDF alone: joints may turn without end, and all fingers are at one
+angle, which nothing drives.
+"""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from twin.robot.collision import convex_hull
+from twin.robot.model import RobotDescriptionError, parse_description
+
+_PACKAGE = "package://"
+_WHOLE_TURN_RAD = "6.283185307179586"
+
+
+class Hand:
+    """One arm with what hangs on its hand link."""
+
+    def __init__(self, urdf: Path, joints: tuple[str, ...], hand_link: str) -> None:
+        """Read a description; meshes are looked for beside it.
+
+        Args:
+            urdf: The file.
+            joints: The arm's, base to hand.
+            hand_link: Link that carries the tool.
+
+        Raises:
+            RobotDescriptionError: When it cannot be read, or joints, link or meshes are missing.
+        """
+        if not urdf.is_file():
+            raise RobotDescriptionError(
+                found=f"is not at {urdf}", hint="Import the data set again, with its robot folder."
+            )
+        root = parse_description(urdf.read_text())
+        _with_local_meshes(root, urdf.parent)
+        text = ET.tostring(root, encoding="unicode")
+        try:
+            self._model = pin.buildModelFromXML(text)
+            geometry = pin.buildGeomFromUrdfString(self._model, text, pin.GeometryType.COLLISION)
+        except (ValueError, RuntimeError) as error:
+            raise RobotDescriptionError(
+                found=f"is refused by pinocchio ({str(error)[:200]})", hint="Check it."
+            ) from error
+        self._data = self._model.createData()
+        known = list(self._model.names)[1:]
+        missing = [name for name in joints if name not in known]
+        if missing:
+            raise RobotDescriptionError(
+                found=f"lacks the joints {', '.join(missing)}", hint=f"It has: {', '.join(known)}."
+            )
+        if not self._model.existFrame(hand_link):
+            names = ", ".join(link.get("name", "") for link in root.findall("link"))
+            raise RobotDescriptionError(found=f"lacks {hand_link!r}", hint=f"It has: {names}.")
+        self._ids = [self._model.joints[self._model.getJointId(name)].idx_q for name in joints]
+        self._frame = self._model.getFrameId(hand_link)
+        links = _behind(root, hand_link)
+        self._pieces = [
+            (item.parentJoint, item.placement, np.array(convex_hull(_corners(item)).points()))
+            for item in geometry.geometryObjects
+            if self._model.frames[item.parentFrame].name in links
+        ]
+        arm = {self._model.getJointId(name) for name in joints}
+        self._finger_ids = [
+            self._model.joints[index].idx_q
+            for index in sorted({joint for joint, _, _ in self._pieces} - arm)
+        ]
+
+    def T_base_hand(self, joints_rad: Float[np.ndarray, " num_joints"]) -> Float[np.ndarray, "4 4"]:
+        """Forward kinematics of the hand link."""
+        q = pin.neutral(self._model)
+        q[self._ids] = joints_rad
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return np.array(self._data.oMf[self._frame].homogeneous)
+
+    def hulls_m(self, finger_rad: float = 0.0) -> list[Float[np.ndarray, "num_points 3"]]:
+        """Convex pieces of the hand link and of all links behind it: corners in its frame [m].
+
+        Args:
+            finger_rad: Value of every joint behind the hand.
+        """
+        q = pin.neutral(self._model)
+        q[self._finger_ids] = finger_rad
+        pin.framesForwardKinematics(self._model, self._data, q)
+        T_hand_base = self._data.oMf[self._frame].inverse()
+        hulls = []
+        for joint, placement, corners in self._pieces:
+            T = (T_hand_base * self._data.oMi[joint] * placement).homogeneous
+            hulls.append(corners @ T[:3, :3].T + T[:3, 3])
+        return hulls
+
+
+def _corners(item: pin.GeometryObject) -> Float[np.ndarray, "num_points 3"]:
+    try:
+        return np.array(item.geometry.vertices())
+    except AttributeError:
+        raise RobotDescriptionError(
+            found=f"has a collision shape at {item.name} that is not a mesh",
+            hint="Links that push boxes need collision meshes.",
+        ) from None
+
+
+def _with_local_meshes(root: ET.Element, folder: Path) -> None:
+    for joint in root.findall("joint"):  # one number for each joint
+        limit = joint.find("limit")
+        if joint.get("type") == "continuous" and limit is not None:
+            joint.set("type", "revolute")
+            limit.set("lower", f"-{_WHOLE_TURN_RAD}")
+            limit.set("upper", _WHOLE_TURN_RAD)
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+        for mesh in link.iter("mesh"):
+            name = mesh.get("filename", "")
+            local = name.removeprefix(_PACKAGE).partition("/")[2] if _PACKAGE in name else name
+            path = folder / local
+            if not path.is_file():
+                raise RobotDescriptionError(
+                    found=f"names the mesh {name!r}, which is not at {path}",
+                    hint="Put it there, or import the data set again with its robot folder.",
+                )
+            mesh.set("filename", str(path))
+
+
+def _behind(root: ET.Element, link: str) -> set[str]:
+    """A link and all that hangs on it."""
+    found, todo = set(), [link]
+    while todo:
+        parent = todo.pop()
+        found.add(parent)
+        for joint in root.findall("joint"):
+            ends = (joint.find("parent"), joint.find("child"))
+            names = [end.get("link", "") if end is not None else "" for end in ends]
+            if names[0] == parent and names[1] not in found:
+                todo.append(names[1])
+    return found
