@@ -43,5 +43,5 @@ class Qos:
 
 Qos.CAMERA = Qos(name="camera", block=False, priority="data_low", shared_memory=True)
 Qos.CONTROL = Qos(name="control", block=False, priority="real_time")
-Qos.RELIABLE = Qos(name="reliable", block=True, priority="data")
+Qos.RELIABLE = Qos(name="reliable", block=True, priority="data", shared_memory=True)
 Qos.PREVIEW = Qos(name="preview", block=False, priority="background", is_remote=True)
