@@ -127,7 +127,8 @@ def main() -> None:
             ),
         ],
         note=f"{SECONDS:g} s of {JOINTS_HZ} Hz joints and 2 VGA RGB-D cameras at {CAMERA_HZ} Hz "
-        f"({source_name()}) through {SHARED_MB} MB of shared memory, player and recorder on the same cores"
+        f"({source_name()}) through {SHARED_MB} MB of shared memory, player and recorder on the "
+        "same cores"
         + (", at real-time priority" if os.sched_getscheduler(0) != os.SCHED_OTHER else ""),
         messages=len(first),
         recorder_cpu_s=cpu_s,
