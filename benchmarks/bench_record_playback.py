@@ -20,6 +20,7 @@ SECONDS = float(os.environ.get("PLAYBACK_SECONDS", "20"))
 START_NS = 1_700_000_000_000_000_000
 JOINTS_HZ, CAMERA_HZ, CAMERAS = 500, 30, ("a", "b")
 FRAMES = 10
+SHARED_MB = 64
 
 
 def write_cell(path: Path) -> None:
@@ -82,6 +83,7 @@ def play(folder: Path, path: Path) -> tuple[Path, dict[str, float], float]:
     try:
         player = Child(
             *("robot_gst.py", "publish", "episode", str(path), "--episode", "again"),
+            *("--shared-memory-mb", str(SHARED_MB)),
             *("--connect", recorder.endpoint, "--json", "--quiet"),
             log=folder / "player.log",
         )
@@ -125,7 +127,9 @@ def main() -> None:
             ),
         ],
         note=f"{SECONDS:g} s of {JOINTS_HZ} Hz joints and 2 VGA RGB-D cameras at {CAMERA_HZ} Hz "
-        f"({source_name()}) over loopback TCP, player and recorder on the same cores",
+        f"({source_name()}) through {SHARED_MB} MB of shared memory, player and recorder on the "
+        "same cores"
+        + (", at real-time priority" if os.sched_getscheduler(0) != os.SCHED_OTHER else ""),
         messages=len(first),
         recorder_cpu_s=cpu_s,
         late_ms=late_ms,

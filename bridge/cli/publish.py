@@ -152,7 +152,9 @@ def publish_episode(
         f"{source.episode.duration_s:.1f} s"
     )
     info = {**asdict(about), "tags": [*about.tags, f"playback:{about.id}"]}
-    wire = WireConfig(connect=connect, config=zenoh_config)
+    wire = WireConfig(
+        connect=connect, config=zenoh_config, shared_memory_mb=config.shared_memory_mb
+    )
     with stopping(duration_s) as stop, open_session(wire) as session:
         client = RecorderClient(session, recorder)
         with _recorded(client, episode, info) as answer, _space_bar(source.pace, output.say):

@@ -329,9 +329,8 @@ class DepthImage:
                 depth_mm=depth.from_metres(depth_m),
             )
         if header.encoding not in DEPTH_ENCODINGS:
-            raise codec.MalformedMessageError(
-                type_name=schema.IMAGE, found=f"encoding {header.encoding!r}, expected '16UC1'"
-            )
+            found = f"encoding {header.encoding!r}, expected '16UC1' or '{FLOAT_DEPTH}'"
+            raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
         rows = np.ascontiguousarray(pixel_rows(data, header, 2))
         return DepthImage(
             stamp_ns=header.stamp_ns,

@@ -27,12 +27,15 @@ class PlaybackConfig:
     """OLD:=NEW sends a topic, or all below a name (/lab:=/lab2), under another one."""
     paused: bool = False
     """Wait for the space bar, or for ctl resume, before the first message."""
+    shared_memory_mb: int = 0
+    """Send images to a recorder on this machine through so much shared memory [MB]."""
     name: str = "playback"
     """Of this playback, for robot-gst ctl pause and resume with --recorder NAME."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense, and names that are not of the form OLD:=NEW."""
         refuse_outside(self, {"rate": (0.001, 1000.0), "start_s": (0.0, float("inf"))})
+        refuse_outside(self, {"shared_memory_mb": (0, 100_000)})
         for pair in self.remap:
             old, arrow, new = pair.partition(ARROW)
             if not (arrow and old and new.startswith("/") and len(new) > 1):

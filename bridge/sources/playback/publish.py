@@ -28,6 +28,7 @@ from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename
 from bridge.terminal import Output
 from bridge.wire.errors import BadTopicError
 from bridge.wire.keys import key_from_topic
+from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
 SLICE_S = 0.05
@@ -324,7 +325,10 @@ class EpisodeSource:
                     self._define(session, record, channel.message_encoding)
                 if key not in made:
                     made[key] = session.publisher(
-                        self.names[channel.topic], key[1], message_encoding=key[2]
+                        self.names[channel.topic],
+                        key[1],
+                        qos=Qos.PLAYBACK,
+                        message_encoding=key[2],
                     )
                 found[id(file), channel.id] = made[key]
         return found

@@ -148,7 +148,16 @@ def test_an_episode_played_and_recorded_again_is_the_same(
     assert recorder.stderr is not None
     assert "listens on" in recorder.stderr.readline()
     player = spawn(
-        "publish", "episode", str(path), "--episode", "again", "--connect", endpoint, "--json"
+        "publish",
+        "episode",
+        str(path),
+        "--episode",
+        "again",
+        "--connect",
+        endpoint,
+        "--json",
+        "--shared-memory-mb",
+        "2",
     )
     out, said = player.communicate(timeout=WAIT_S)
     assert player.returncode == 0, said
