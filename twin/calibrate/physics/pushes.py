@@ -85,10 +85,10 @@ def motion_of(episode: Episode) -> ScriptedMotion | None:
     Raises:
         InvalidRecordError: When the record is damaged.
     """
-    record = record_of(episode.files[0], RECORD_NAME)
-    if episode.info.kind != "imported" or not record:
+    if episode.info.kind != "imported":
         return None
-    return ScriptedMotion.from_record(record)
+    record = record_of(episode.files[0], RECORD_NAME)
+    return ScriptedMotion.from_record(record) if record else None
 
 
 def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Hand) -> Push:
