@@ -152,19 +152,24 @@ def main() -> None:
     report_targets(
         "replay_real_push",
         [
-            Target("cube, median end point, held out", medians[EXECUTED], 6.0, "mm"),
             Target(
-                "the same, against the best simulator",
-                medians[EXECUTED],
-                best[0],
-                "mm",
+                what="cube, median end point, held out",
+                measured=medians[EXECUTED],
+                limit=6.0,
+                unit="mm",
+            ),
+            Target(
+                what="the same, against the best simulator",
+                measured=medians[EXECUTED],
+                limit=best[0],
+                unit="mm",
                 reference=best[1],
             ),
             Target(
-                "tool of Experiment 1, schedule",
-                tools[PLANNED_TOOL],
-                tool[0] + 1.0,
-                "mm",
+                what="tool of Experiment 1, schedule",
+                measured=tools[PLANNED_TOOL],
+                limit=tool[0] + 1.0,
+                unit="mm",
                 reference=f"{tool[1]} {tool[0]:.2f} mm",
             ),
         ],
