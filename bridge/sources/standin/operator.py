@@ -106,7 +106,8 @@ def _stage_result(
         goal = task.goal_of(stage["carry"])
         targets = task.containers if goal is None else (goal[1],)
         return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in targets)
-    return done[stage["release"]] if stage.get("release") else verdict
+    placed = stage.get("release") or stage.get("push")
+    return done[placed] if placed else verdict
 
 
 def _above(
