@@ -356,7 +356,9 @@ class Operator:
             outcome = void_trial(cell.task, decision.remark)
         else:
             executed = decision.plan is not None
-            outcome = label_trial(cell.task, cell.truth, executed=executed, remark=decision.remark)
+            outcome = label_trial(
+                cell.world.task, cell.truth, executed=executed, remark=decision.remark
+            )
         text = f"{outcome.result}: {outcome.detail}"
         cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
         cell.cameras_running = False
