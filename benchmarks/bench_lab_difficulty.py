@@ -1,7 +1,7 @@
 """How hard the laboratory's tasks are for the scripted planner alone, on development seeds.
 
-The cell's own physics carries out one plan per start, without cameras, zenoh and twin. Perception is
-replaced by what localisation was measured to be off, 1.8 mm and 0.2 degrees in the median, with
+The cell's own physics carries out one plan per start, without cameras, zenoh and twin. Perception
+is replaced by what localisation was measured to be off, 1.8 mm and 0.2 degrees in the median, with
 heights as it states them: everything stands on the table z = 0. A control runs the same starts in a
 laboratory that is as published: what fails only in the hidden one fails because of the world.
 

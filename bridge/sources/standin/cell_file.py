@@ -323,6 +323,7 @@ def nominal_hidden(cell: CellFile) -> HiddenParameters:
     return HiddenParameters(
         joint_offset_rad=np.zeros(len(ARM_JOINTS)),
         camera_errors={camera_id: np.eye(4) for camera_id in cell.cameras},
+        deviations=None,
         **uniform,
     )
 

@@ -203,6 +203,7 @@ def _predicted(
 PLANNER_NAME = "standin_scripted"
 POLICY_NAME = "scripted"
 GROUNDING = "stand-in: true poses with seeded noise"
+GROUNDING_GATE = "gst localisation v1 of the gate"
 PLANNER_STREAM = 202
 HOVER_M = 0.13
 """Height of the tool above the object's centre before the descent."""
@@ -307,6 +308,7 @@ def plan_pick_and_place(
     start_id: str,
     parent_id: str | None = None,
     round_: int = 0,
+    grounding: str = GROUNDING,
 ) -> Plan:
     """Plan one attempt: each object in turn is put into its slot or pushed to its mark; then home.
 
@@ -322,6 +324,7 @@ def plan_pick_and_place(
         start_id: Of the trial.
         parent_id: The plan that was refused before.
         round_: How many were refused before.
+        grounding: Where ``seen`` is from, in words.
 
     Raises:
         UnreachablePoseError: When the arm cannot follow.
@@ -368,7 +371,7 @@ def plan_pick_and_place(
         frame=BASE_FRAME,
         task=task.name,
         instruction=task.instruction,
-        grounding_source=GROUNDING,
+        grounding_source=grounding,
         entities={key: se3.pose_record(T) for key, T in seen.items()},
         keypoints_m=tuple(_point(seen[key][:3, 3]) for key in keypoints),
         joint_names=ARM_JOINTS,

@@ -25,10 +25,25 @@ from bridge.task.task_file import Task, load_task
 SEED = 9_000_000
 LABS = range(SEED, SEED + 4)
 COMPILED = (
-    "body_pos body_quat body_mass body_inertia body_ipos geom_pos geom_quat geom_size geom_friction "
-    "geom_solref geom_solimp jnt_range dof_armature dof_damping dof_frictionloss actuator_gainprm "
-    "actuator_biasprm actuator_forcerange"
-).split()
+    "body_pos",
+    "body_quat",
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "geom_pos",
+    "geom_quat",
+    "geom_size",
+    "geom_friction",
+    "geom_solref",
+    "geom_solimp",
+    "jnt_range",
+    "dof_armature",
+    "dof_damping",
+    "dof_frictionloss",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+)
 FROZEN = {
     # Made with the code before there was a laboratory.
     ("standin", "cube_into_box", 9_000_000): "901ed8c432f8ea85",
@@ -280,7 +295,7 @@ def test_cameras_see_the_true_laboratory(
     deviations = drawn.deviations
     changes = {
         "lens": replace(
-            deviations, lenses={k: (1.0, 0.0, 0.0, 0.0, 0.0) for k in deviations.lenses}
+            deviations, lenses=dict.fromkeys(deviations.lenses, (1.0, 0.0, 0.0, 0.0, 0.0))
         ),
         "table": replace(deviations, table_height_m=deviations.table_height_m + 0.01),
         "size": replace(
