@@ -23,6 +23,8 @@ DEVIATION_STREAM = 404
 """Keeps these draws apart from every other draw of the same seed."""
 LONGER_LINKS = ("forearm_link", "wrist_1_link", "wrist_3_link", "tool0")
 """Links whose distance from their parent is not what the URDF says."""
+TILTED_ABOUT_M = (0.48, 0.0, 0.0)
+"""The middle of where things are done: a tilt lifts one end of it and lowers the other."""
 LIP_HEIGHT_M = 0.005
 RANGES = (
     "object_size_scale",
@@ -97,7 +99,7 @@ class Deviations:
     objects: dict[str, ObjectDeviation]
     table_height_m: float
     table_tilt_rad: tuple[float, float]
-    """About the x and y axes of the base, through the base's origin."""
+    """About the x and y axes of the base, through ``TILTED_ABOUT_M``."""
     link_length_m: dict[str, float]
     """By how much a link is farther from its parent than published."""
     joint_zero_rad: tuple[float, ...]
@@ -121,7 +123,8 @@ class Deviations:
         """Moves what is declared on the published table, the plane z = 0, onto the true one."""
         T = np.eye(4)
         T[:3, :3] = se3.rotation_from_vector(np.array([*self.table_tilt_rad, 0.0]))
-        T[2, 3] = self.table_height_m
+        pivot = np.array(TILTED_ABOUT_M)
+        T[:3, 3] = pivot - T[:3, :3] @ pivot + np.array([0.0, 0.0, self.table_height_m])
         return T
 
     def lens(self, camera_id: str, camera: Camera) -> Lens:

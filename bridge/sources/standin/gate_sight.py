@@ -72,6 +72,6 @@ def _pose(record: dict[str, Any]) -> tuple[str, Float[np.ndarray, "4 4"]]:
     known = check_record(record, name="localisation")
     T = se3.pose_from_record(known["T_base_object"])
     if not all(math.isfinite(value) for value in T.ravel().tolist()):
-        message = f"the pose of {known['object']} is no number"
+        message = f"the pose of {known['object']} is not finite"
         raise ValueError(message)
     return str(known["object"]), T

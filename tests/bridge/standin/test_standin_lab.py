@@ -17,7 +17,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
-from bridge.sources.standin.deviations import RANGES, Lens
+from bridge.sources.standin.deviations import RANGES, TILTED_ABOUT_M, Lens
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.world import World, build_model, robot_links, true_links
 from bridge.task.task_file import Task, load_task
@@ -227,7 +227,8 @@ def test_things_rest_on_the_true_table(lab: CellFile, stack: Task) -> None:
     hidden = replace(hidden_of(lab, stack, SEED + 1), object_friction=0.6)
     world = World(stack, hidden)
     T_base_table = hidden.deviations.T_base_table
-    assert T_base_table[2, 3] == hidden.deviations.table_height_m
+    middle = se3.apply(T_base_table, np.array(TILTED_ABOUT_M))
+    assert middle == pytest.approx([*TILTED_ABOUT_M[:2], hidden.deviations.table_height_m])
     poses = hidden.deviations.put_down(world.task, stack.draw_start(np.random.default_rng(SEED)))
     world.reset(np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0]), poses)
     for _ in range(150):
