@@ -1,7 +1,7 @@
 """Draw the tasks of the laboratory: the start, on the way, and the end, in one laboratory.
 
 Example: .venv/bin/python docs/images/laboratory.py docs/images/laboratory.jpg --seed 1000001
-Each row is one task, carried out by the scripted plan from where the objects really are, seen by the
+Each row is one task, carried out by the scripted plan from where the objects are, seen by the
 side camera.
 """
 
