@@ -21,7 +21,7 @@ GRIPPER, TABLE = "gripper", "table"
 BODIES = (GRIPPER, TABLE)
 """What may touch an object, besides other objects."""
 CAVITIES = ("open_box", "basket")
-VERBS = ("grasp", "carry", "release")
+VERBS = ("grasp", "carry", "release", "push")
 MOST_LISTED = 40
 """Problems in one message."""
 REFERENCES = ("object", "container", "support")
@@ -212,6 +212,9 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
             yield from _is_no_object(f"{place}.{verb}", name, table)
             if name in table["objects"] and name not in table["manipulated"]:
                 yield f"{place}.{verb}: {name} is not in manipulated"
+        yield from _push(place, stage, table)
+        if "clearance_m" in stage and "carry" not in stage:
+            yield f"{place}.clearance_m: belongs to carry"
         for number, pair in enumerate(stage.get("allowed_contacts", [])):
             where = f"{place}.allowed_contacts[{number}]"
             for body in pair:
@@ -220,6 +223,22 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
                     yield f"{where}: there is no body {body!r}. Bodies: {_names(bodies)}.{near}"
             if pair[0] == pair[1]:
                 yield f"{where}: {pair[0]} cannot touch itself"
+
+
+def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    """A push goes towards a mark, which a predicate names; its speed is nobody else's."""
+    pushed = stage.get("push")
+    if pushed is None:
+        if "speed_m_s" in stage:
+            yield f"{place}.speed_m_s: belongs to push"
+        return
+    if any(verb in stage for verb in VERBS if verb != "push"):
+        yield f"{place}.push: a stage that pushes neither grasps, carries nor releases"
+    if not any(spec.get("object") == pushed and "target_m" in spec for spec in table["success"]):
+        yield (
+            f"{place}.push: no success predicate says where {pushed} is to be moved. Add one of "
+            "kind moved with target_m."
+        )
 
 
 def _predicates(table: Mapping[str, Any]) -> Iterator[str]:

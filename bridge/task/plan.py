@@ -36,6 +36,8 @@ class Stage:
     path: tuple[dict[str, Any], ...] = ()
     grasp: str | None = None
     release: str | None = None
+    push: str | None = None
+    """Object that the closed fingers push."""
     allowed_contacts: tuple[tuple[str, str], ...] = ()
     terminal: tuple[dict[str, Any], ...] = ()
     predicted_objects: dict[str, dict[str, list[float]]] = field(default_factory=dict)
@@ -68,6 +70,9 @@ class Plan:
     def to_json(self) -> bytes:
         """Serialise, refusing what the schema refuses."""
         record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(self)}))
+        for stage in record["stages"]:
+            if stage["push"] is None:  # plans that push nothing are written as they always were
+                del stage["push"]
         check_record(record, name="plan")
         return json.dumps(record, separators=(",", ":")).encode()
 

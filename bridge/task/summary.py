@@ -56,7 +56,12 @@ def _mm(length_m: float) -> str:
 
 def _handled(stage: Mapping[str, Any]) -> str:
     done = [f"{verb}s {stage[verb]}" for verb in VERBS if verb in stage]
-    return " and ".join(done).replace("carrys", "carries") or "handles nothing"
+    said = " and ".join(done).replace("carrys", "carries").replace("pushs", "pushes")
+    if "speed_m_s" in stage:
+        said += f" at {stage['speed_m_s']:g} m/s"
+    if "clearance_m" in stage:
+        said += f" {_mm(stage['clearance_m'])} mm over the top of where it goes"
+    return said or "handles nothing"
 
 
 def _pairs(stage: Mapping[str, Any]) -> str:

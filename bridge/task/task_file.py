@@ -146,6 +146,17 @@ class Task:
                 return spec["kind"], spec["container" if spec["kind"] == "inside" else "support"]
         return None
 
+    def mark_of(self, object_id: str) -> tuple[float, float] | None:
+        """Where an object is to be pushed on the table, seen from above [m]; None: nowhere said.
+
+        The first success predicate ``moved`` with a target counts.
+        """
+        for spec in self.success:
+            if spec.get("object") == object_id and "target_m" in spec:
+                x, y, *_ = spec["target_m"]
+                return float(x), float(y)
+        return None
+
     @property
     def soft_objects(self) -> tuple[str, ...]:
         """Objects that deform."""

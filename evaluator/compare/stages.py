@@ -108,7 +108,9 @@ def _objects(
     """
     known = known_task(row.task) if row.path is None else recorded_task(Episode.open(row.path))
     releasing = (
-        {str(stage["id"]) for stage in known.stages if stage.get("release")} if known else ()
+        {str(stage["id"]) for stage in known.stages if stage.get("release") or stage.get("push")}
+        if known
+        else ()
     )
     places = [place for place, name in enumerate(names, start=1) if name in releasing]
     if len(places) < 2:

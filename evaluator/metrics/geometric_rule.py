@@ -7,7 +7,11 @@ down before its first result, with no number that was fitted to outcomes:
    around the tool centre point, and that is within the object's outer box.
 2. The closing fingers centre the object; from then on it moves with the tool, whatever it weighs.
 3. When the fingers open it drops straight down, unturned, onto what lies under its centre.
-4. The task's predicates on poses, evaluated where it comes to lie, are the answer.
+4. In a stage that pushes, closed fingers are a disc of ``PAD_REACH_M`` around the tool centre
+   point. The pushed object is carried along in front of it, unturned, in the direction of the
+   fingers' step and as far as they do not enter its outer box, and stands where they turn back.
+   Fingers that come down on it, or pass over it, push nothing.
+5. The task's predicates on poses, evaluated where it comes to lie, are the answer.
 """
 
 from collections.abc import Mapping
@@ -58,10 +62,18 @@ def judge_by_geometry(
     held: tuple[str, Float[np.ndarray, "4 4"]] | None = None
     closed = False
     Ts_base_tcp = se3.transform_from(plan.quaternions_wxyz(), plan.positions_m())
+    before = Ts_base_tcp[0]
     for waypoint, T_base_tcp in zip(plan.tau, Ts_base_tcp, strict=True):
+        pushed = _pushed(plan, waypoint.t_ns)
         if held is not None:
             poses[held[0]] = T_base_tcp @ held[1]
-        if waypoint.g and not closed:
+        if pushed in poses and waypoint.g:
+            step = T_base_tcp[:3, 3] - before[:3, 3]
+            poses[pushed] = _carried_along(task.objects[pushed], poses[pushed], T_base_tcp, step)
+        before = T_base_tcp
+        if pushed:
+            pass  # fingers that close here grasp nothing
+        elif waypoint.g and not closed:
             name = _nearest(poses, task, T_base_tcp)
             T_tcp_object = se3.invert(T_base_tcp) @ poses[name]
             problem = _grasp_problem(task.objects[name], T_tcp_object, open_m)
@@ -75,6 +87,45 @@ def judge_by_geometry(
         if not closed:
             open_m = waypoint.width_m
     return _final_answer(task, poses)
+
+
+def _pushed(plan: Plan, t_ns: int) -> str:
+    """The object that the stage at a time pushes; empty where it pushes none."""
+    stages = (stage for stage in plan.stages if stage.t_start_ns <= t_ns <= stage.t_end_ns)
+    return next((stage.push for stage in stages if stage.push), "")
+
+
+def _carried_along(
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    step_m: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "4 4"]:
+    """Where one step of the closed fingers leaves the object in front of them."""
+    length_m = float(np.linalg.norm(step_m[:2]))
+    if length_m <= abs(float(step_m[2])):  # up, down or a wait
+        return T_base_object
+    along = np.array([*step_m[:2], 0.0]) / length_m
+    half = np.array(model.size_m) / 2
+    T = T_base_object.copy()
+
+    def clear_m(shift_m: float) -> float:
+        """From the disc to the outer box, seen from above, were the object moved on."""
+        T[:3, 3] = T_base_object[:3, 3] + shift_m * along
+        p = se3.apply(se3.invert(T), T_base_tcp[:3, 3]) - _middle(model)
+        if abs(p[2]) > half[2] + PAD_REACH_M:
+            return np.inf
+        return float(np.linalg.norm(np.maximum(np.abs(p[:2]) - half[:2], 0.0))) - PAD_REACH_M
+
+    low_m, high_m = 0.0, float(2 * np.linalg.norm(half)) + 2 * PAD_REACH_M
+    ahead = float((T_base_object[:3, 3] - T_base_tcp[:3, 3]) @ along) > 0
+    if clear_m(0.0) >= 0 or not ahead:
+        return T_base_object
+    for _ in range(40):
+        middle_m = (low_m + high_m) / 2
+        low_m, high_m = (low_m, middle_m) if clear_m(middle_m) >= 0 else (middle_m, high_m)
+    T[:3, 3] = T_base_object[:3, 3] + high_m * along
+    return T
 
 
 def _middle(model: ObjectModel) -> Float[np.ndarray, "3"]:

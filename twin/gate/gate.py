@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -172,6 +172,21 @@ Replay = Callable[[Plan, Mapping[str, Any], str, Joints, float], Verdict]
 on the monotonic clock [s]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """Where the gate sees a task's objects."""
+
+    found: bool | None
+    """Whether all were found; None: nobody could look."""
+    reason: str | None
+    objects: Mapping[str, Any] = field(default_factory=dict)
+    """As localised, by name; those that were not found too."""
+
+    def records(self) -> list[dict[str, Any]]:
+        """One gst localisation v1 record per object."""
+        return [item.to_record() for item in self.objects.values()]
+
+
 class Gate:
     """Judges plans one at a time; every answer comes within the wall-clock limit."""
 
@@ -220,6 +235,44 @@ class Gate:
         finally:
             with self._counting:
                 self._inside -= 1
+
+    def localise(self, task_name: str) -> Located:
+        """Say where the objects are now, seen and found as for a verdict; for the planner.
+
+        Bounded like a verdict. What hinders a verdict hinders this: the answer is then undecided.
+
+        Args:
+            task_name: Of the task whose objects are asked for; "" for the gate's own.
+        """
+        ends_s = time.monotonic() + self._config.deadline_s
+        if not self._turn.acquire(timeout=self._config.deadline_s):
+            return Located(found=None, reason="a plan was being judged up to --deadline")
+        silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
+        try:
+            self._refuse_to_look(task_name, silent_ns)
+            frames = self._wait_for_frames()
+            found = self._localise(frames, self._task, ends_s)
+            missing = {name: item.reason for name, item in found.items() if not item.found}
+            return Located(
+                found=not missing, reason=with_reasons(missing) if missing else None, objects=found
+            )
+        except GstError as error:
+            return Located(found=None, reason=str(error))
+        finally:
+            self._contact_ns = self._now_ns() - silent_ns
+            self._turn.release()
+
+    def _refuse_to_look(self, task_name: str, silent_ns: int) -> None:
+        if task_name not in ("", self._task.name):
+            raise UndecidedError(
+                f"task {task_name!r} is asked for; this gate judges {self._task.name!r}. "
+                "Start it with --task."
+            )
+        running = self._perception.executing()
+        if running is not None:
+            raise UndecidedError(f"{running} is being executed; objects are localised at rest")
+        if silent_ns > self._config.max_silence_s * 1e9:
+            raise UndecidedError(f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s")
 
     def _in_time(self, plan: Plan, arrived_ns: int, ends_s: float) -> Verdict:
         limit = f"the wall-clock limit of {self._config.deadline_s:g} s (--deadline)"

@@ -1,5 +1,6 @@
 """The gate on the wire: what it listens to, what it answers, and the verdict in the log."""
 
+import json
 import re
 import threading
 import time
@@ -14,6 +15,8 @@ from bridge.episode.topics import (
     EVENT,
     GATE,
     JOINT_STATES,
+    LOCALISATION,
+    LOCALISE,
     ROBOT_DESCRIPTION,
     TF,
     TF_STATIC,
@@ -101,6 +104,47 @@ def serve_gate(
     session.serve(cell_topic(config.cell, GATE)[1:], answer, side_by_side=config.waiting + 2)
 
 
+def serve_localisation(
+    session: Any, gate: Gate, perception: Perception, config: GateConfig, output: Output
+) -> None:
+    """Answer on ``<cell>/gate/localise`` where the objects are, and publish each record.
+
+    A planner that plans from these records shares the gate's perception, with its errors.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        gate: Looks for the objects.
+        perception: Says what time it is in the cell.
+        config: Names the cell.
+        output: Told each answer in a line.
+    """
+    publisher = session.publisher(cell_topic(config.cell, LOCALISATION), schema.LOCALISATION)
+
+    def answer(payload: bytes) -> bytes:
+        request = _request(payload)
+        located = gate.localise(str(request.get("task", "")))
+        records, stamp_ns = located.records(), perception.newest_ns() or session.now_ns()
+        for record in records:
+            publisher.put(json.dumps(record).encode(), source_ns=stamp_ns)
+        words = {True: "all found", False: "not all found", None: "nobody could look"}
+        output.say(printable(f"localise: {words[located.found]}. {located.reason or ''}".rstrip()))
+        reply = {"found": located.found, "reason": located.reason, "objects": records}
+        return json.dumps({"schema_version": 1, "stamp_ns": stamp_ns, **reply}).encode()
+
+    session.serve(cell_topic(config.cell, LOCALISE)[1:], answer)
+
+
+def _request(payload: bytes) -> dict[str, Any]:
+    """Read ``{"task": NAME}``; nothing at all asks for the gate's own task."""
+    try:
+        request = json.loads(payload or b"{}")
+    except (ValueError, RecursionError):
+        request = None
+    if not isinstance(request, dict):
+        raise GateError('what is asked of /gate/localise is JSON: {"task": "its name"}')
+    return request
+
+
 def watch_cell(
     session: Any,
     cell: str,
@@ -175,6 +219,7 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         watch_cell(session, config.cell, perception.take)
         gate = make_gate(task, config, perception, session.now_ns, twin)
         serve_gate(session, gate, perception, config, output)
+        serve_localisation(session, gate, perception, config, output)
         output.say(
             f"gate ready: {task.name} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{perception.cameras_from()}. Stop with Ctrl-C."

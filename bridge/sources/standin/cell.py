@@ -20,8 +20,9 @@ from bridge.sources.standin.surfaces import (
     lab_surfaces,
     object_surfaces,
     robot_surfaces,
+    true_robot_surfaces,
 )
-from bridge.sources.standin.world import World
+from bridge.sources.standin.world import World, standing_clutter
 from bridge.task.predicate import Rollout
 from bridge.task.task_file import Task
 
@@ -115,6 +116,11 @@ class StandinCell:
         self._cameras = {
             key: mount.camera.scaled(config.scale) for key, mount in cell.cameras.items()
         }
+        self._lenses = self._cameras  # what takes the pictures; published is what it should be
+        if hidden.deviations is not None:
+            self._lenses = {
+                key: hidden.deviations.lens(key, camera) for key, camera in self._cameras.items()
+            }
         self._seed = seed
         self._backdrops: dict[str, Layer] = {}
         self._rng = np.random.default_rng([SENSOR_STREAM, seed])
@@ -129,11 +135,20 @@ class StandinCell:
     @cached_property
     def _renderer(self) -> Renderer:
         """Made with the first picture; a cell that takes none saves a second."""
-        lab = [*lab_surfaces(self._seed), *clutter_surfaces(self.file.clutter)]
-        return Renderer([*robot_surfaces(), *object_surfaces(self.task), *lab])
+        hidden = self.hidden
+        deviations = hidden.deviations
+        clutter = clutter_surfaces(standing_clutter(self.file.clutter, hidden))
+        lab = [*lab_surfaces(self._seed, deviations), *clutter]
+        robot = robot_surfaces() if deviations is None else true_robot_surfaces(deviations)
+        return Renderer([*robot, *object_surfaces(self.world.task, deviations), *lab])
 
     def reset(self, Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
-        """Bring the arm home with an open gripper and put the objects down."""
+        """Bring the arm home with an open gripper and put the objects down where declared.
+
+        In a cell that hides its table and its containers' poses they lie elsewhere.
+        """
+        if self.hidden.deviations is not None:
+            Ts_base_object = self.hidden.deviations.put_down(self.world.task, Ts_base_object)
         self._target_rad = self.home_rad
         self._width_m = self._width_target_m = MAX_WIDTH_M
         self.world.reset(self.home_rad - self.hidden.joint_offset_rad, Ts_base_object)
@@ -213,7 +228,8 @@ class StandinCell:
 
     def _encoders_rad(self) -> Float[np.ndarray, "6"]:
         noise = self._rng.normal(0.0, self.file.sensors.encoder_noise_rad, 6)
-        return np.asarray(self.world.joints_rad + self.hidden.joint_offset_rad + noise)
+        motors_rad = self.world.joints_rad + self.world.slack_rad
+        return np.asarray(motors_rad + self.hidden.joint_offset_rad + noise)
 
     def _publish_robot(self) -> None:
         encoders = self._encoders_rad()
@@ -259,7 +275,7 @@ class StandinCell:
         """Take and publish one frame of every camera, now."""
         bodies = {**self.world.Ts_base_link(), **self.world.Ts_base_object()}
         skins = self.world.skins_m()
-        for camera_id, camera in self._cameras.items():
+        for camera_id, camera in self._lenses.items():
             T_base_camera = self.true_camera(camera_id)
             backdrop = None
             if not self.file.cameras[camera_id].moving:

@@ -11,10 +11,12 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS
+from bridge.sources.standin.deviations import RANGES, Deviations, draw_deviations
 from bridge.task.meshes.toys import DESIGNS
-from bridge.task.task_file import read_tables
+from bridge.task.task_file import Task, read_tables
 
 SCHEMA_VERSION = 1
+PERCEPTIONS = ("noise", "gate")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +66,9 @@ class PlannerNoise:
     reset_m: float
     """The operator's, when objects are put back to the declared start."""
     reset_rad: float
+    perception: str = "noise"
+    """Where the planner has the objects' poses from: ``noise``, the true ones with seeded errors,
+    or ``gate``, what the gate localises in the cell's own images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +100,10 @@ class CellFile:
     """What else stands on the table."""
     planner_of: dict[str, PlannerNoise] = field(default_factory=dict)
     """Tasks the planner is differently wrong at."""
+    deviations: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Ranges of what else differs from what is published; empty: nothing does."""
+    ranges_of: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    """Per task: ranges, of ``uniform`` or ``deviations``, that are its own."""
 
     def noise_for(self, task_name: str) -> PlannerNoise:
         """Return how wrong the scripted planner is at a task."""
@@ -161,13 +170,30 @@ def _cell_from(table: dict[str, Any]) -> CellFile:
         development_seeds=_pair(table["seeds"]["development"]),
         clutter=tuple(_clutter_from(item) for item in table.get("clutter", [])),
         planner_of=planner_of,
+        deviations=_deviations(table["hidden"].get("deviations", {})),
+        ranges_of={
+            task: {key: (low, high) for key, (low, high) in ranges.items()}
+            for task, ranges in table["hidden"].get("tasks", {}).items()
+        },
     )
+
+
+def _deviations(table: dict[str, list[float]]) -> dict[str, tuple[float, float]]:
+    """Read the ranges; a cell has all of them or none."""
+    if table and set(table) != set(RANGES):
+        wrong = sorted(set(table) ^ set(RANGES))
+        message = f"hidden.deviations: {', '.join(wrong)}: missing or unknown"
+        raise ValueError(message)
+    return {key: (low, high) for key, (low, high) in table.items()}
 
 
 def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoise]]:
     """Read the common table, and for each task named in it what differs there."""
     common = {key: value for key, value in table.items() if not isinstance(value, dict)}
     noise = PlannerNoise(**common)
+    if noise.perception not in PERCEPTIONS:
+        message = f"planner.perception {noise.perception!r}; known: {', '.join(PERCEPTIONS)}"
+        raise ValueError(message)
     differing = {key: value for key, value in table.items() if isinstance(value, dict)}
     return noise, {key: replace(noise, **value) for key, value in differing.items()}
 
@@ -241,12 +267,16 @@ class HiddenParameters:
     """Per camera ``T_nominal_true``: the true camera seen from where it is believed to be."""
     stiffness_scale: float | None = None
     """Times the nominal stiffness of soft objects; None in a cell that has none."""
+    deviations: Deviations | None = None
+    """What else is not as published; None in a cell that hides nothing else."""
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers for the truth topic."""
         record = asdict(self)
         if self.stiffness_scale is None:
             del record["stiffness_scale"]
+        if self.deviations is None:
+            del record["deviations"]
         record["joint_offset_rad"] = self.joint_offset_rad.tolist()
         record["camera_errors"] = {
             key: T.round(9).tolist() for key, T in self.camera_errors.items()
@@ -254,22 +284,37 @@ class HiddenParameters:
         return record
 
 
-def draw_hidden(cell: CellFile, seed: int) -> HiddenParameters:
+def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenParameters:
     """Draw one laboratory; the same cell file and seed give the same one.
 
     Args:
         cell: Ranges and standard deviations to draw from.
         seed: Number of the laboratory.
+        task: Whose objects are in it; a cell may have other ranges for a task. Not needed for a
+            cell without deviations.
     """
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
-    uniform = {key: float(rng.uniform(*cell.uniform[key])) for key in sorted(cell.uniform)}
+    own = {} if task is None else cell.ranges_of.get(task.name, {})
+    ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}
+    uniform = {key: float(rng.uniform(*ranges[key])) for key in sorted(ranges)}
     errors = {}
     for camera_id in sorted(cell.cameras):
         shift = rng.normal(0.0, cell.normal[f"{camera_id}_camera_m"], 3)
         turn = rng.normal(0.0, cell.normal[f"{camera_id}_camera_rad"], 3)
         errors[camera_id] = small_transform(shift, turn)
     offset = rng.normal(0.0, cell.normal["joint_offset_rad"], len(ARM_JOINTS))
-    return HiddenParameters(joint_offset_rad=offset, camera_errors=errors, **uniform)
+    deviations = None
+    if cell.deviations:
+        deviations = draw_deviations(
+            cell.deviations | {key: own[key] for key in own if key in cell.deviations},
+            seed,
+            cameras=sorted(cell.cameras),
+            objects={} if task is None else task.objects,
+        )
+        offset = offset + np.array(deviations.joint_zero_rad)
+    return HiddenParameters(
+        joint_offset_rad=offset, camera_errors=errors, deviations=deviations, **uniform
+    )
 
 
 def nominal_hidden(cell: CellFile) -> HiddenParameters:
@@ -278,6 +323,7 @@ def nominal_hidden(cell: CellFile) -> HiddenParameters:
     return HiddenParameters(
         joint_offset_rad=np.zeros(len(ARM_JOINTS)),
         camera_errors={camera_id: np.eye(4) for camera_id in cell.cameras},
+        deviations=None,
         **uniform,
     )
 

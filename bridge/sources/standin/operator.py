@@ -13,13 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.topics import GATE, cell_topic
+from bridge.episode.topics import GATE, LOCALISE, cell_topic
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
 from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
+from bridge.sources.standin.gate_sight import GateSight, NotSeenError
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.planner import (
+    GROUNDING,
+    GROUNDING_GATE,
     POLICY_NAME,
     draw_errors,
     perceive,
@@ -106,7 +109,8 @@ def _stage_result(
         goal = task.goal_of(stage["carry"])
         targets = task.containers if goal is None else (goal[1],)
         return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in targets)
-    return done[stage["release"]] if stage.get("release") else verdict
+    placed = stage.get("release") or stage.get("push")
+    return done[placed] if placed else verdict
 
 
 def _above(
@@ -355,7 +359,9 @@ class Operator:
             outcome = void_trial(cell.task, decision.remark)
         else:
             executed = decision.plan is not None
-            outcome = label_trial(cell.task, cell.truth, executed=executed, remark=decision.remark)
+            outcome = label_trial(
+                cell.world.task, cell.truth, executed=executed, remark=decision.remark
+            )
         text = f"{outcome.result}: {outcome.detail}"
         cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
         cell.cameras_running = False
@@ -384,11 +390,18 @@ class Operator:
         self._begin(info)
         cell.cameras_running = True
         cell.wait(LOOK_S)
-        cell.streams.plan(plan, cell.now_ns)
-        execute_plan(cell, plan)
+        said = f"recorded from seed {config.seed}"
+        try:
+            if self._sees_by_gate:  # the start was chosen by where things were declared
+                plan = self._plan_probe(number, kind, self._look().needed())
+            cell.streams.plan(plan, cell.now_ns)
+            execute_plan(cell, plan)
+        except (NotSeenError, NoSpaceForProbeError) as error:
+            said = f"not carried out: {error}"
+            cell.streams.event("note", cell.now_ns, text=said)
         cell.cameras_running = False
         self._end(None)
-        self._output.detail(f"{info.id} {kind}: recorded from seed {config.seed}")
+        self._output.detail(f"{info.id} {kind}: {said}")
 
     def _probe_start(
         self, number: int, kind: str
@@ -401,27 +414,53 @@ class Operator:
             poses = cell.task.draw_start(rng)
             seed = config.seed * SEEDS_PER_SESSION + number
             with contextlib.suppress(NoSpaceForProbeError):
-                return poses, plan_probe(
-                    kind,
-                    cell.task,
-                    perceive(poses, noise, start_seed=seed),
-                    kinematics=cell.kinematics,
-                    joints_start_rad=cell.home_rad,
-                    max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
-                    plan_id=f"probe_{number:04d}.{kind}",
-                    start_id=f"{cell.task.name}/probe/{config.seed}/{number}",
-                    turn=1 if (number - 1) // len(PROBES) % 2 else -1,
-                )
+                seen = perceive(poses, noise, start_seed=seed)
+                return poses, self._plan_probe(number, kind, seen)
         raise NoSpaceForProbeError(kind)
+
+    def _plan_probe(
+        self, number: int, kind: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
+    ) -> Plan:
+        cell = self._cell
+        return plan_probe(
+            kind,
+            cell.task,
+            seen,
+            kinematics=cell.kinematics,
+            joints_start_rad=cell.home_rad,
+            max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
+            plan_id=f"probe_{number:04d}.{kind}",
+            start_id=f"{cell.task.name}/probe/{self._config.seed}/{number}",
+            turn=1 if (number - 1) // len(PROBES) % 2 else -1,
+        )
+
+    @property
+    def _sees_by_gate(self) -> bool:
+        return self._cell.file.noise_for(self._cell.task.name).perception == "gate"
+
+    def _look(self) -> GateSight:
+        """Ask the gate where the objects are; what it says is all that is known of them."""
+        key = cell_topic(self._config.gate_cell or self._config.cell, LOCALISE)[1:]
+        payload = json.dumps({"task": self._cell.task.name}).encode()
+        try:
+            answer = self._session.query(key, payload, timeout_s=self._config.gate_timeout_s)
+            return GateSight.from_json(answer, self._cell.task)
+        except BridgeError as error:
+            return GateSight(found=None, reason=str(error))
 
     def _decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
         """Plan, and with replanning ask the gate until it accepts or the rounds are used up."""
+        sight = self._look() if self._sees_by_gate else None
+        if sight is not None and not sight.found:
+            why = f"nothing executed, {sight.problem}"
+            self._cell.streams.event("note", self._cell.now_ns, text=why)
+            return Decision(plan=None, void=sight.found is None, remark=why)
         rounds = self._config.rounds if info.condition == "with_replanning" else 1
         parent: Plan | None = None
         refused, why = 0, ""
         for round_ in range(rounds):
             try:
-                plan = self._candidate(info, start_seed, round_, parent)
+                plan = self._candidate(info, start_seed, round_, parent, sight)
             except UnreachablePoseError as error:
                 why = f"the planner found no plan: {error}"
                 self._cell.streams.event("note", self._cell.now_ns, text=why)
@@ -464,13 +503,22 @@ class Operator:
         )
 
     def _candidate(
-        self, info: EpisodeInfo, start_seed: int, round_: int, parent: Plan | None
+        self,
+        info: EpisodeInfo,
+        start_seed: int,
+        round_: int,
+        parent: Plan | None,
+        sight: GateSight | None,
     ) -> Plan:
         cell = self._cell
         noise = cell.file.noise_for(cell.task.name)
+        if sight is None:
+            seen = perceive(cell.world.Ts_base_object(), noise, start_seed=start_seed)
+        else:
+            seen = sight.needed()
         return plan_pick_and_place(
             cell.task,
-            perceive(cell.world.Ts_base_object(), noise, start_seed=start_seed),
+            seen,
             draw_errors(noise, len(cell.task.manipulated), start_seed=start_seed, round_=round_),
             kinematics=cell.kinematics,
             joints_start_rad=cell.home_rad,
@@ -480,6 +528,7 @@ class Operator:
             start_id=info.start_id or "",
             parent_id=None if parent is None else parent.id,
             round_=round_,
+            grounding=GROUNDING if sight is None else GROUNDING_GATE,
         )
 
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:

@@ -17,15 +17,19 @@ from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.sources.standin.cell_file import PlannerNoise
 from bridge.sources.standin.kinematics import (
+    WAYPOINT_S,
     Kinematics,
     Leg,
+    TimeLaw,
     Track,
     UnreachablePoseError,
     follow_legs,
+    minimum_jerk,
     tool_down,
     wrap_rad,
     yaw_of,
 )
+from bridge.task.check import VERBS
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import ObjectModel, Task
 
@@ -124,7 +128,7 @@ def planned_stages(
     legs_of: Mapping[str, Sequence[Leg]],
     bounds: Mapping[str, tuple[int, int]],
     seen: Mapping[str, Float[np.ndarray, "4 4"]],
-    places: Mapping[str, Destination],
+    places: Mapping[str, Destination | None],
 ) -> tuple[Stage, ...]:
     """What a plan says of each stage of its task: when it is, and where it leaves its object.
 
@@ -133,7 +137,7 @@ def planned_stages(
         legs_of: How each object is moved.
         bounds: When each stage begins and ends, from the start of the plan [ns].
         seen: Poses ``T_base_object`` as perceived.
-        places: Where each object belongs.
+        places: Where each object belongs; None for one that is pushed to its mark.
 
     Raises:
         UsageError: When a stage handles no object.
@@ -151,6 +155,7 @@ def planned_stages(
                 text=table["text"],
                 grasp=table.get("grasp"),
                 release=table.get("release"),
+                push=table.get("push"),
                 allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", [])),
                 terminal=tuple(dict(item) for item in task.success) if last else (),
                 predicted_objects={object_id: se3.pose_record(predicted)},
@@ -163,27 +168,31 @@ def planned_stages(
 
 def _object_of(task: Task, stage: Mapping[str, Any]) -> str:
     """The object a stage handles."""
-    for verb in ("grasp", "carry", "release"):
+    for verb in VERBS:
         if stage.get(verb) in task.manipulated:
             return str(stage[verb])
     message = (
-        f"stage {stage['id']} of task {task.name} grasps, carries and releases nothing: the "
-        "scripted planner cannot plan it. See docs/tasks.md."
+        f"stage {stage['id']} of task {task.name} grasps, carries, releases and pushes nothing: "
+        "the scripted planner cannot plan it. See docs/tasks.md."
     )
     raise UsageError(message)
 
 
 def _predicted(
     model: ObjectModel,
-    destination: Destination,
+    destination: Destination | None,
     legs: Sequence[Leg],
     T_base_object: Float[np.ndarray, "4 4"],
     table: Mapping[str, Any],
 ) -> Float[np.ndarray, "4 4"]:
-    """Where a stage leaves its object: lifted, over where it belongs, or lying there."""
+    """Where a stage leaves its object: lifted, over where it belongs, lying there, or pushed."""
     place = {leg.name: leg.T_base_tcp[:3, 3] for leg in legs}
     T = T_base_object.copy()
-    if table.get("release"):
+    if destination is None:
+        along = place["push"] - place["down"]
+        touch = _reach_m(model, T, along) * along / np.linalg.norm(along)
+        T[:2, 3] = (place["push"] + touch)[:2]
+    elif table.get("release"):
         T[:2, 3] = place["open"][:2]
         T[2, 3] = destination.resting_m(model)
     else:
@@ -194,6 +203,7 @@ def _predicted(
 PLANNER_NAME = "standin_scripted"
 POLICY_NAME = "scripted"
 GROUNDING = "stand-in: true poses with seeded noise"
+GROUNDING_GATE = "gst localisation v1 of the gate"
 PLANNER_STREAM = 202
 HOVER_M = 0.13
 """Height of the tool above the object's centre before the descent."""
@@ -298,8 +308,9 @@ def plan_pick_and_place(
     start_id: str,
     parent_id: str | None = None,
     round_: int = 0,
+    grounding: str = GROUNDING,
 ) -> Plan:
-    """Plan one attempt: each object in turn is grasped, carried to its slot and let go; then home.
+    """Plan one attempt: each object in turn is put into its slot or pushed to its mark; then home.
 
     Args:
         task: Objects and stages.
@@ -313,6 +324,7 @@ def plan_pick_and_place(
         start_id: Of the trial.
         parent_id: The plan that was refused before.
         round_: How many were refused before.
+        grounding: Where ``seen`` is from, in words.
 
     Raises:
         UnreachablePoseError: When the arm cannot follow.
@@ -320,14 +332,21 @@ def plan_pick_and_place(
     count = len(task.manipulated)
     errors = [error] * count if isinstance(error, GraspError) else list(error)
     T_home = kinematics.T_base_tcp(joints_start_rad)
-    places = {key: destination_of(task, key, seen) for key in task.manipulated}
-    slots = _slots(places)
+    places: dict[str, Destination | None] = {
+        key: None if pushing_stage(task, key) else destination_of(task, key, seen)
+        for key in task.manipulated
+    }
+    slots = _slots({key: place for key, place in places.items() if place is not None})
     track = Track.at_rest(T_home, joints_start_rad)
     legs_of: dict[str, list[Leg]] = {}
     then = dict(seen)
     for index, key in enumerate(task.manipulated):
-        places[key] = destination_of(task, key, then)  # which may have been moved before
-        ways = _ways(task, key, seen[key], places[key], errors[index], slots[key])
+        if places[key] is None:
+            ways = _pushes(task, key, seen[key], errors[index])
+        else:
+            place = destination_of(task, key, then)  # which may have been moved before
+            places[key] = place
+            ways = _ways(task, key, seen[key], place, errors[index], slots[key])
         # From object to object the wrist can wind up until each way goes past a joint's limit.
         unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
         track, legs_of[key] = _first_reachable(
@@ -335,7 +354,8 @@ def plan_pick_and_place(
         )
         released = {"release": key}
         then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
-    keypoints = dict.fromkeys((*task.manipulated, *(place.id for place in places.values())))
+    targets = (place.id for place in places.values() if place is not None)
+    keypoints = dict.fromkeys((*task.manipulated, *targets))
     last = legs_of[task.manipulated[-1]][-1].stage
     home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
     track = follow_legs(track, [home], kinematics, max_joint_speed_rad_s)
@@ -351,7 +371,7 @@ def plan_pick_and_place(
         frame=BASE_FRAME,
         task=task.name,
         instruction=task.instruction,
-        grounding_source=GROUNDING,
+        grounding_source=grounding,
         entities={key: se3.pose_record(T) for key, T in seen.items()},
         keypoints_m=tuple(_point(seen[key][:3, 3]) for key in keypoints),
         joint_names=ARM_JOINTS,
@@ -446,15 +466,16 @@ def _legs(
     R = tool_down(p, yaw)[:3, :3]
     p = p + R[:, 0] * error.along_m + R[:, 1] * error.across_m
     p[2] = max(p[2], LOWEST_TOOL_M)
+    below_tool = p[2] - (T_base_object[2, 3] - model.size_m[2] / 2)
+    carry_m, release_m = _heights_m(task, object_id, destination, below_tool)
     above, carried = p.copy(), p.copy()
     above[2] = p[2] + HOVER_M
-    carried[2] = CARRY_M
+    carried[2] = carry_m
     over = destination.T_base[:3, 3] + np.array([*error.release_m, 0.0])
     over[:2] += destination.T_base[:2, :2] @ slot_m
-    over[2] = CARRY_M
+    over[2] = carry_m
     low = over.copy()
-    below_tool = p[2] - (T_base_object[2, 3] - model.size_m[2] / 2)
-    low[2] = destination.top_m + below_tool + destination.clearance_m
+    low[2] = release_m
     ids = stage_ids(task, object_id)
     moves = (
         ("pregrasp", ids.pick, above, 1.5, 0),
@@ -472,6 +493,130 @@ def _legs(
         Leg(name=name, stage=stage, T_base_tcp=tool_down(to, yaw), duration_s=seconds, g=g)
         for name, stage, to, seconds, g in moves
     ]
+
+
+def _heights_m(
+    task: Task, object_id: str, destination: Destination, below_tool_m: float
+) -> tuple[float, float]:
+    """Heights of the tool while it carries an object, and when it lets it go.
+
+    A stage that carries may say how close over the destination's top the object passes.
+    """
+    base_m = destination.top_m + below_tool_m
+    near_m = next(
+        (
+            s["clearance_m"]
+            for s in task.stages
+            if s.get("carry") == object_id and "clearance_m" in s
+        ),
+        None,
+    )
+    if near_m is None:
+        return CARRY_M, base_m + destination.clearance_m
+    return base_m + near_m, base_m + min(near_m, destination.clearance_m)
+
+
+FINGERS_HALF_M = 0.010
+"""Half the extent of the closed fingers along tool x, the direction in which they push."""
+PUSH_TOOL_M = 0.018
+"""Height of the tool while it pushes: the tips are 8 mm above the table."""
+PUSH_GAP_M = 0.030
+"""Between fingers and object when the tool comes down behind it."""
+PUSH_SPEED_M_S = 0.10
+PUSH_RAMP_S = 0.10
+"""From rest to the speed of a push, and back."""
+PUSH_STEP_S = 0.02
+
+
+def pushing_stage(task: Task, object_id: str) -> Mapping[str, Any] | None:
+    """The stage that pushes an object; None when it is not pushed.
+
+    Args:
+        task: Whose stages are searched.
+        object_id: One of its manipulated objects.
+    """
+    return next((stage for stage in task.stages if stage.get("push") == object_id), None)
+
+
+def constant_speed(ramp: float) -> TimeLaw:
+    """Evenly faster, then even, then evenly slower: at rest at both ends.
+
+    Args:
+        ramp: Share of the time for speeding up, and again for slowing down; up to a half.
+    """
+    top = 1 / (1 - ramp)
+
+    def law(s: Float[np.ndarray, " num_times"]) -> Float[np.ndarray, " num_times"]:
+        rising, falling = top * s**2 / (2 * ramp), 1 - top * (1 - s) ** 2 / (2 * ramp)
+        even = top * (s - ramp / 2)
+        return np.select([s < ramp, s > 1 - ramp], [rising, falling], even)
+
+    return law
+
+
+def _pushes(
+    task: Task, object_id: str, T_base_object: Float[np.ndarray, "4 4"], error: GraspError
+) -> list[list[Leg]]:
+    """Down behind the object with closed fingers, straight on to its mark, back and up.
+
+    For each of the two turns of the wrist whose fingers are as wide in front, least turned first.
+    """
+    stage, mark = pushing_stage(task, object_id), task.mark_of(object_id)
+    if stage is None or mark is None:
+        message = f"nothing in task {task.name} says where {object_id} is to be pushed."
+        raise UsageError(message)
+    to = np.array([*mark, 0.0]) + np.array([*error.release_m, 0.0])
+    start = np.array([*T_base_object[:2, 3], 0.0])
+    length_m = float(np.linalg.norm(to - start))
+    if length_m < PUSH_GAP_M:
+        message = f"{object_id} lies {length_m * 1e3:.0f} mm from its mark: too near to be pushed."
+        raise UsageError(message)
+    along = (to - start) / length_m
+    aside = np.array([-along[1], along[0], 0.0]) * error.along_m
+    reach = _reach_m(task.objects[object_id], T_base_object, along) * along
+    low = np.array([0.0, 0.0, PUSH_TOOL_M])
+    behind = start - reach - PUSH_GAP_M * along + aside + low
+    ahead = to - reach + aside + low
+    back, up = ahead - PUSH_GAP_M * along, np.array([0.0, 0.0, HOVER_M])
+    speed = float(stage.get("speed_m_s", PUSH_SPEED_M_S))
+    push_s = float(np.linalg.norm(ahead - behind)) / speed + PUSH_RAMP_S
+    even, smooth = constant_speed(PUSH_RAMP_S / push_s), minimum_jerk
+    moves = (
+        ("above", behind + up, 1.5, smooth, WAYPOINT_S),
+        ("down", behind, 0.9, smooth, WAYPOINT_S),
+        ("push", ahead, push_s, even, PUSH_STEP_S),
+        ("wait", ahead, 0.3, smooth, WAYPOINT_S),
+        ("back", back, 0.6, smooth, WAYPOINT_S),
+        ("up", back + up, 0.8, smooth, WAYPOINT_S),
+    )
+    yaw = float(np.arctan2(along[1], along[0]))
+    return [
+        [
+            Leg(
+                name=name,
+                stage=stage["id"],
+                T_base_tcp=tool_down(p_m, turned + error.yaw_rad),
+                duration_s=seconds,
+                g=1,
+                law=law,
+                step_s=step_s,
+            )
+            for name, p_m, seconds, law, step_s in moves
+        ]
+        for turned in sorted((yaw, wrap_rad(yaw + np.pi)), key=abs)
+    ]
+
+
+def _reach_m(
+    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"], along: Float[np.ndarray, "3"]
+) -> float:
+    """From the middle of the closed fingers to that of the object they touch from behind [m].
+
+    Where a ray from the middle leaves the object's outer box, against the push.
+    """
+    local = np.abs((T_base_object[:3, :3].T @ along)[:2]) / np.linalg.norm(along)
+    half = np.array(model.size_m[:2]) / 2
+    return float(np.min(half / np.maximum(local, 1e-9))) + FINGERS_HALF_M
 
 
 def _point(p: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

@@ -30,6 +30,7 @@ from bridge.sources.standin.kinematics import (
     wrap_rad,
     yaw_of,
 )
+from bridge.sources.standin.planner import FINGERS_HALF_M
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
 
@@ -38,8 +39,6 @@ PLANNER_NAME = "standin_probes"
 TOOL_M = 0.018
 """Height of the tool while it pushes: the tips are 8 mm above the table."""
 HOVER_M = 0.16
-FINGERS_HALF_M = 0.010
-"""Half the extent of the closed fingers along tool x, the direction in which they push."""
 GAP_M = 0.025
 """Between fingers and object when the tool comes down."""
 PUSH_M = 0.045

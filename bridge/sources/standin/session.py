@@ -48,7 +48,7 @@ def run_session(
     cell = StandinCell(
         file,
         task,
-        draw_hidden(file, config.seed),
+        draw_hidden(file, config.seed, task),
         Streams(session, config.cell),
         config=CellConfig(
             rate_hz=config.rate_hz, scale=config.image_scale, real_time=config.real_time

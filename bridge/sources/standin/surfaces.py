@@ -18,7 +18,8 @@ from scipy.ndimage import gaussian_filter, zoom
 from bridge.geometry import se3
 from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
-from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, robot_links
+from bridge.sources.standin.deviations import Deviations, parts_of
+from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, true_links
 from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
 from bridge.task.meshes.toys import Paint
 from bridge.task.task_file import ObjectModel, Task
@@ -224,15 +225,20 @@ def make_surface(
 
 @cache
 def robot_surfaces() -> tuple[Surface, ...]:
-    """The arm in light grey with blue caps at its joints' housings, the gripper dark."""
+    """The arm as published, in light grey with blue caps at its joints' housings."""
+    return tuple(true_robot_surfaces(None))
+
+
+def true_robot_surfaces(deviations: Deviations | None) -> list[Surface]:
+    """The arm as it is; its gripper is dark."""
     surfaces = []
-    for link in robot_links():
+    for link in true_links(deviations):
         for shape in link.shapes:
             color = _LINK_COLORS.get(link.name, (0.72, 0.73, 0.75))
             if link.name in FINGER_LINKS:
                 color = (0.20, 0.20, 0.22)
             surfaces.append(_shape_surface(link.name, shape, color))
-    return tuple(surfaces)
+    return surfaces
 
 
 _LINK_COLORS = {
@@ -253,16 +259,22 @@ def _shape_surface(body: str, shape: LinkShape, color: tuple[float, float, float
     return make_surface(body, vertices, np.asarray(mesh.triangles).astype(np.int64), color)
 
 
-def object_surfaces(task: Task) -> list[Surface]:
-    """The task's objects in their declared colours."""
+def object_surfaces(task: Task, deviations: Deviations | None = None) -> list[Surface]:
+    """The task's objects in their declared colours.
+
+    Args:
+        task: With the objects' true sizes.
+        deviations: Steps and lips of their shapes; None where they are as declared.
+    """
     surfaces = []
+    own = {} if deviations is None else deviations.objects
     for object_id, model in task.objects.items():
         if model.mesh is not None:
             surfaces.append(_painted_surface(model))
             continue
         red, green, blue = (channel / 255 for channel in model.color_srgb)
-        for centre, size in model.panels():
-            surfaces.append(box_surface(object_id, centre, size, (red, green, blue)))
+        for part in parts_of(model, own.get(object_id)):
+            surfaces.append(box_surface(object_id, part.centre_m, part.size_m, (red, green, blue)))
     return surfaces
 
 
@@ -335,14 +347,22 @@ def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
     )
 
 
-def lab_surfaces(seed: int) -> list[Surface]:
-    """Table top with its texture, floor and four walls."""
+def lab_surfaces(seed: int, deviations: Deviations | None = None) -> list[Surface]:
+    """Table top with its texture, floor and four walls.
+
+    Args:
+        seed: Of the laboratory.
+        deviations: Where the table really stands; None for where it is published.
+    """
     x, y, z = TABLE_SIZE_M
     texture = table_texture((x, y), TABLE_CENTRE_M, seed)
     top = box_surface(
         "", np.array([*TABLE_CENTRE_M, -z / 2]), np.array(TABLE_SIZE_M), (0.7, 0.56, 0.4)
     )
-    return [_textured(top, texture, (0, 1), (0.0, 0.0)), *_walls(seed)]
+    table = _textured(top, texture, (0, 1), (0.0, 0.0))
+    if deviations is not None:
+        table = _placed(table, deviations.T_base_table)
+    return [table, *_walls(seed)]
 
 
 def _walls(seed: int) -> list[Surface]:

@@ -3,7 +3,7 @@
 import xml.etree.ElementTree as ET
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -22,9 +22,9 @@ from bridge.robots.default import (
 )
 from bridge.robots.robot import resolve_mesh
 from bridge.sources.standin.cell_file import Clutter, HiddenParameters
+from bridge.sources.standin.deviations import Deviations, parts_of
 from bridge.sources.standin.soft import SoftBody, soft_body, soft_model_xml
-from bridge.task.meshes.toys import BoxPart, basket_parts
-from bridge.task.task_file import BASKET, ObjectModel, Task
+from bridge.task.task_file import ObjectModel, Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +143,37 @@ def _multiply(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> Float[np.
     return np.concatenate([[w], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
 
 
+def true_links(deviations: Deviations | None) -> list[LinkModel]:
+    """Return every link as it is, not as the URDF describes it; both agree without deviations."""
+    links = robot_links()
+    if deviations is None:
+        return links
+    return [_true_link(link, deviations) for link in links]
+
+
+def _true_link(link: LinkModel, deviations: Deviations) -> LinkModel:
+    longer_m = deviations.link_length_m.get(link.name, 0.0)
+    T = link.T_parent_link.copy()
+    if longer_m:
+        T[:3, 3] *= 1 + longer_m / np.linalg.norm(T[:3, 3])
+    shapes = link.shapes
+    if link.name in FINGER_LINKS:
+        shapes = tuple(_true_pad(shape, deviations) for shape in shapes)
+    return replace(link, T_parent_link=T, shapes=shapes)
+
+
+def _true_pad(shape: LinkShape, deviations: Deviations) -> LinkShape:
+    """A finger that is thicker outwards and longer at its tip, and sits to one side."""
+    if shape.box_m is None:
+        return shape
+    x, y, z = shape.box_m
+    thicker, longer = deviations.finger_thickness_m, deviations.finger_length_m
+    T = shape.T_link_shape.copy()
+    T[1, 3] += np.sign(T[1, 3]) * thicker / 2 + deviations.finger_shift_m
+    T[2, 3] += longer / 2
+    return replace(shape, T_link_shape=T, box_m=(x, y + thicker, z + longer))
+
+
 STEP_S = 0.002
 SOFT_STEP_S = 0.004
 """With soft objects: their integrator is implicit in position, and each step costs more."""
@@ -175,7 +206,7 @@ def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter]
     """Compile the laboratory with its true parameters into an ``mjModel``.
 
     Args:
-        task: Its objects are put into the laboratory.
+        task: Its objects, with their true sizes, are put into the laboratory.
         hidden: True masses, frictions and offsets.
         clutter: What stands about and is no object of the task.
     """
@@ -191,7 +222,7 @@ def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter]
     spec.option.impratio = 10.0  # friction held stiffly: no creep of a grasped object
     spec.compiler.degree = False
     _add_robot(spec, hidden)
-    _add_table(spec)
+    _add_table(spec, hidden)
     for index, item in enumerate(clutter):
         _add_clutter(spec, item, index)
     for model in task.objects.values():
@@ -204,12 +235,12 @@ def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter]
 
 def _add_robot(spec: Any, hidden: HiddenParameters) -> None:
     bodies: dict[str | None, Any] = {None: spec.worldbody}
-    for link in robot_links():
+    for link in true_links(hidden.deviations):
         q, p = se3.split(link.T_parent_link)
         body = bodies[link.parent].add_body(name=link.name, pos=p, quat=q, gravcomp=1.0)
         bodies[link.name] = body
         _set_inertia(body, link)
-        _add_joint(body, link)
+        _add_joint(body, link, hidden.deviations)
         for index, shape in enumerate(link.shapes):
             _add_shape(spec, body, shape, name=f"{link.name}_{index}", hidden=hidden)
         if link.name == TCP_FRAME:
@@ -231,14 +262,18 @@ def _set_inertia(body: Any, link: LinkModel) -> None:
         body.mass, body.inertia = 1e-3, [1e-6] * 3
 
 
-def _add_joint(body: Any, link: LinkModel) -> None:
+def _add_joint(body: Any, link: LinkModel, deviations: Deviations | None) -> None:
     if link.joint_type == "revolute":
+        drag_Nm = 0.0
+        if deviations is not None and link.joint in ARM_JOINTS:
+            drag_Nm = deviations.joint_drag_Nm[ARM_JOINTS.index(link.joint)]
         body.add_joint(
             name=link.joint,
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=link.axis,
             range=link.limits,
             armature=ARM_ARMATURE,
+            frictionloss=drag_Nm,
         )
     elif link.joint_type == "prismatic":
         body.add_joint(
@@ -260,6 +295,8 @@ def _add_shape(
         # Priority: the pads decide the friction of their contacts. Condim 4 resists twisting.
         settings |= {"priority": 2, "condim": 4, "friction": [mu, 0.01, 0.0001]}
         settings |= {"solref": PAD_SOLREF, "solimp": PAD_SOLIMP}
+        if hidden.deviations is not None:
+            settings["solref"] = (hidden.deviations.pad_time_s, 1.0)
     if shape.mesh is not None:
         spec.add_mesh(name=name, file=shape.mesh)
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **settings)
@@ -268,9 +305,13 @@ def _add_shape(
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, **settings)
 
 
-def _add_table(spec: Any) -> None:
+def _add_table(spec: Any, hidden: HiddenParameters) -> None:
     x, y, z = TABLE_SIZE_M
-    body = spec.worldbody.add_body(name="table", pos=[*TABLE_CENTRE_M, -z / 2])
+    q, p = np.array([1.0, 0.0, 0.0, 0.0]), np.array([*TABLE_CENTRE_M, -z / 2])
+    if hidden.deviations is not None:
+        T_base_table = hidden.deviations.T_base_table
+        q, p = se3.split(T_base_table)[0], se3.apply(T_base_table, p)
+    body = spec.worldbody.add_body(name="table", pos=p, quat=q)
     body.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -281,7 +322,8 @@ def _add_table(spec: Any) -> None:
 
 def _add_object(spec: Any, model: ObjectModel, hidden: HiddenParameters) -> None:
     body = spec.worldbody.add_body(name=model.id, mocap=model.fixed, pos=[0, 0, 0.5])
-    parts = solid_parts(model)
+    known = None if hidden.deviations is None else hidden.deviations.objects.get(model.id)
+    parts = parts_of(model, known)
     volume = sum(float(np.prod(part.size_m)) for part in parts)
     for index, part in enumerate(parts):
         mass = model.mass_kg * hidden.mass_scale * float(np.prod(part.size_m)) / volume
@@ -297,18 +339,14 @@ def _add_object(spec: Any, model: ObjectModel, hidden: HiddenParameters) -> None
             friction=[hidden.object_friction, 0.005, 0.0001],
             **_WORLD_BITS,
         )
+    if known is not None and not model.fixed:
+        size = np.array(model.size_m)
+        mass_kg = model.mass_kg * hidden.mass_scale
+        body.explicitinertial = True
+        body.mass, body.ipos = mass_kg, np.array(known.centre_of_mass) * size / 2
+        body.inertia = mass_kg / 12 * (np.sum(size**2) - size**2)
     if not model.fixed:
         body.add_freejoint(name=model.id)
-
-
-def solid_parts(model: ObjectModel) -> list[BoxPart]:
-    """The boxes a rigid object collides with."""
-    if model.mesh == BASKET:
-        return basket_parts(model.inner_m, model.wall_m)
-    straight = np.array([1.0, 0.0, 0.0, 0.0])
-    return [
-        BoxPart(centre_m=centre, size_m=size, q_wxyz=straight) for centre, size in model.panels()
-    ]
 
 
 def _add_clutter(spec: Any, item: Clutter, index: int) -> None:
@@ -322,6 +360,19 @@ def _add_clutter(spec: Any, item: Clutter, index: int) -> None:
         size=_half(np.array(item.size_m)),
         **_WORLD_BITS,
     )
+
+
+def standing_clutter(clutter: Sequence[Clutter], hidden: HiddenParameters) -> tuple[Clutter, ...]:
+    """What stands about, where it stands on the true table.
+
+    Args:
+        clutter: As published, on the plane z = 0.
+        hidden: Knows the table.
+    """
+    if hidden.deviations is None:
+        return tuple(clutter)
+    T = hidden.deviations.T_base_table
+    return tuple(replace(item, T_base_clutter=T @ item.T_base_clutter) for item in clutter)
 
 
 def _half(size: Float[np.ndarray, "3"]) -> list[float]:
@@ -354,7 +405,13 @@ class World:
     def __init__(
         self, task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter] = ()
     ) -> None:
-        """Build the model and stand still with the gripper open."""
+        """Build the model and stand still with the gripper open.
+
+        ``task`` is then the one with the objects' true sizes.
+        """
+        if hidden.deviations is not None:
+            task = hidden.deviations.true_task(task)
+            clutter = standing_clutter(clutter, hidden)
         self.task = task
         self.step_s = step_s_of(task)
         self._hidden = hidden
@@ -365,10 +422,11 @@ class World:
         self._arm_dofs = [int(self._model.joint(name).dofadr[0]) for name in ARM_JOINTS]
         self._links = [link.name for link in robot_links() if link.shapes]
         self._finger_geoms = {int(self._model.geom(f"{name}_0").id) for name in FINGER_LINKS}
+        own = {} if hidden.deviations is None else hidden.deviations.objects
         self._object_geoms = {
             object_id: {
                 int(self._model.geom(f"{object_id}_{index}").id)
-                for index in range(len(solid_parts(model)))
+                for index in range(len(parts_of(model, own.get(object_id))))
             }
             for object_id, model in task.objects.items()
             if model.soft is None
@@ -381,6 +439,11 @@ class World:
         self._flexes = {mujoco.mj_name2id(self._model, flex_type, key): key for key in self._soft}
         delay = max(round(hidden.latency_s / self.step_s), 0)
         self._pending: deque[np.ndarray] = deque(maxlen=delay + 1)
+        self._play_rad = np.zeros(len(ARM_JOINTS))
+        if hidden.deviations is not None:
+            self._play_rad = np.array(hidden.deviations.joint_backlash_rad)
+        self.slack_rad = np.zeros(len(ARM_JOINTS))
+        """How far the arm's motors are ahead of their links within the play of the joints."""
 
     def _joint_address(self, name: str) -> int:
         return int(self._model.joint(name).qposadr[0])
@@ -430,6 +493,11 @@ class World:
             joints_rad: Targets of the arm.
             width_m: Target of the gripper, the distance between the pads.
         """
+        if self._play_rad.any():  # a link follows where its motor reaches the end of the play
+            last_rad = self._pending[-1][:-1] if self._pending else joints_rad
+            half_rad = self._play_rad / 2
+            link_rad = np.clip(last_rad, joints_rad - half_rad, joints_rad + half_rad)
+            self.slack_rad, joints_rad = joints_rad - link_rad, link_rad
         target = np.concatenate([joints_rad, [width_m / 2]])
         self._pending.append(target)
 

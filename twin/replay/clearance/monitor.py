@@ -446,8 +446,8 @@ def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
 def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
     """Pairs that may touch: those of the active stage, and what earlier stages let go of.
 
-    Where a stage released an object, it may go on lying on what that stage allowed it to touch; the
-    gripper's own leave ends with the stage.
+    Where a stage released an object, or pushed it and left, it may go on lying on what that stage
+    allowed it to touch; the gripper's own leave ends with the stage.
 
     Args:
         stages: Of a plan, in the order in which they begin.
@@ -456,7 +456,7 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
     active = active_stage(stages, t_ns)
     if active is None:
         return frozenset()
-    left = [stage for stage in stages[: stages.index(active)] if stage.release]
+    left = [stage for stage in stages[: stages.index(active)] if stage.release or stage.push]
     stays = {frozenset(pair) for stage in left for pair in stage.allowed_contacts}
     return frozenset(pair for pair in stays if GRIPPER not in pair) | frozenset(
         frozenset(pair) for pair in active.allowed_contacts

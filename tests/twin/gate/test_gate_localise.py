@@ -1,0 +1,198 @@
+"""The gate says where the objects are: three values, bounded, and the same eyes as its verdicts."""
+
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gate_fakes import TASK, FakePerception, gate_with, raising
+from loopback import free_endpoint
+from own_process import ROOT
+
+from bridge.episode import schema
+from bridge.episode.run_folder import RunFolder
+from bridge.sources.standin.cell import CellConfig, StandinCell
+from bridge.sources.standin.cell_file import draw_hidden, load_cell
+from bridge.sources.standin.gate_sight import GateSight
+from bridge.sources.standin.streams import Streams
+from bridge.task.record import parse_record
+from bridge.task.task_file import load_task
+from bridge.terminal import Output
+from bridge.wire.config import WireConfig
+from bridge.wire.errors import RemoteError
+from bridge.wire.session import open_session
+from twin.errors import TwinError
+from twin.gate.config import GateConfig
+from twin.gate.gate import Gate
+from twin.gate.service import GateError, serve_localisation
+from twin.scene.localise.result import LocalisedObject, missing
+
+SEED = 9_000_001
+
+
+def localised(**lost: str) -> dict[str, LocalisedObject]:
+    """Every object of the fakes' task at the origin, but for those that are lost."""
+    return {
+        name: missing(model, 1, lost[name], {})
+        if name in lost
+        else LocalisedObject(
+            object_id=name,
+            found=True,
+            T_base_object=np.eye(4),
+            covariance=None,
+            confidence=1.0,
+            method="test",
+            reason=None,
+            stamp_ns=1,
+        )
+        for name, model in TASK.objects.items()
+    }
+
+
+def sees(**lost: str) -> Gate:
+    return gate_with(localise=lambda *_: localised(**lost))
+
+
+def test_what_was_found_is_true_false_or_undecided() -> None:
+    everything = sees().localise("cube_into_box")
+    assert (everything.found, everything.reason) == (True, None)
+    assert {item["object"] for item in everything.records()} == set(TASK.objects)
+    lost = sees(cube="hidden by the arm").localise("")
+    assert lost.found is False
+    assert "cube" in (lost.reason or "")
+    assert "hidden by the arm" in (lost.reason or "")
+    assert len(lost.records()) == len(TASK.objects)
+
+
+@pytest.mark.parametrize(
+    ("gate", "task", "words"),
+    [
+        (sees(), "sloth_into_basket", "this gate judges 'cube_into_box'"),
+        (gate_with(FakePerception(running="plan_7")), "", "plan_7 is being executed"),
+        (gate_with(FakePerception(seen=[])), "", "no usable frames"),
+        (gate_with(now_ns=lambda: 10**12), "", "nothing has arrived from the cell for 1000 s"),
+        (gate_with(localise=raising(TwinError("it hung"))), "", "it hung"),
+    ],
+)
+def test_nobody_could_look(gate: Gate, task: str, words: str) -> None:
+    located = gate.localise(task)
+    assert located.found is None
+    assert words in (located.reason or "")
+    assert located.records() == []
+
+
+def test_a_look_waits_no_longer_than_the_deadline_for_a_plan_that_is_judged() -> None:
+    judging, done = threading.Event(), threading.Event()
+
+    def slowly(*_: Any) -> dict[str, LocalisedObject]:
+        judging.set()
+        assert done.wait(20.0)
+        return localised()
+
+    gate = gate_with(localise=slowly, deadline_s=0.2)
+    first = threading.Thread(target=gate.localise, args=("",))
+    first.start()
+    assert judging.wait(20.0)
+    assert "up to --deadline" in (gate.localise("").reason or "")
+    done.set()
+    first.join()
+    assert gate.localise("").found is True
+
+
+class Wire:
+    """Keeps the handler, and what is published."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        self.published: list[tuple[str, str, dict[str, Any], int]] = []
+        self.services: dict[str, Any] = {}
+
+    def publisher(self, topic: str, type_name: str) -> Any:
+        wire = self
+
+        class Publisher:
+            def put(self, data: bytes, *, source_ns: int) -> None:
+                record = parse_record(data, name="localisation")
+                wire.published.append((topic, type_name, dict(record), source_ns))
+
+        return Publisher()
+
+    def serve(self, key: str, handler: Any) -> None:
+        self.services[key] = handler
+
+
+def test_the_answer_is_what_is_published_and_what_a_planner_reads() -> None:
+    wire = Wire()
+    serve_localisation(wire, sees(), FakePerception(), GateConfig(cell="lab"), Output(quiet=True))
+    answer = wire.services["lab/gate/localise"](b'{"task": "cube_into_box"}')
+    records = json.loads(answer)["objects"]
+    assert [row[:2] for row in wire.published] == [("/lab/localisation", schema.LOCALISATION)] * 2
+    assert [row[2] for row in wire.published] == records
+    assert {row[3] for row in wire.published} == {42}
+    assert GateSight.from_json(answer, TASK).found is True
+
+
+@pytest.mark.parametrize("payload", [b"[1]", b"no json", b"\xff", b"[" * 100_000])
+def test_another_question_is_refused(payload: bytes) -> None:
+    wire = Wire()
+    serve_localisation(wire, sees(), FakePerception(), GateConfig(), Output(quiet=True))
+    with pytest.raises(GateError, match="is JSON"):
+        wire.services["standin/gate/localise"](payload)
+    assert wire.published == []
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
+def test_a_real_gate_process_sees_the_laboratory_over_zenoh(tmp_path: Path) -> None:
+    """The planner gets what is published: near the truth, and not the truth."""
+    endpoint, task = free_endpoint(), load_task("push_cube_to_mark")
+    run = RunFolder.create(tmp_path / "run")
+    command = ["gate", str(run.path), "--cell", "lab", "--task", task.name, "--connect", endpoint]
+    heard: list[dict[str, Any]] = []
+    arrived = threading.Event()
+
+    def hear(sample: Any) -> None:
+        heard.append(dict(parse_record(sample.data, name="localisation")))
+        arrived.set()
+
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        session.subscribe("lab/localisation", hear)
+        with subprocess.Popen(
+            [sys.executable, "robot_gst.py", *command], cwd=ROOT, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                assert process.stderr is not None
+                assert any("gate ready" in line for line in process.stderr)
+                threading.Thread(target=process.stderr.read, daemon=True).start()
+                file = load_cell("lab")
+                cell = StandinCell(
+                    file,
+                    task,
+                    draw_hidden(file, SEED, task),
+                    Streams(session, "lab"),
+                    config=CellConfig(rate_hz=5.0),
+                    seed=SEED,
+                    start_ns=10**18,
+                )
+                cell.announce()
+                cell.reset(task.draw_start(np.random.default_rng(SEED)))
+                cell.cameras_running = True
+                cell.wait(1.0)
+                asked = json.dumps({"task": task.name}).encode()
+                answer = session.query("lab/gate/localise", asked, timeout_s=120.0)
+                with pytest.raises(RemoteError, match="is JSON"):
+                    session.query("lab/gate/localise", b"?", timeout_s=30.0)
+                assert arrived.wait(20.0)
+            finally:
+                process.terminate()
+    sight = GateSight.from_json(answer, task)
+    assert sight.found is True, sight.reason
+    assert heard == json.loads(answer)["objects"]
+    off_m = np.linalg.norm(
+        sight.needed()["cube"][:2, 3] - cell.world.Ts_base_object()["cube"][:2, 3]
+    )
+    assert 1e-5 < off_m < 0.03
