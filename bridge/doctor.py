@@ -28,7 +28,7 @@ EXTRAS = {
     ),
     "replay": Extra(
         "rebuild, render, replay, gate, calibrate",
-        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "cmaes"),
+        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "cmaes", "python-fcl"),
     ),
     "report": Extra(
         "evaluate: tables, figures, report",
@@ -42,7 +42,7 @@ EXTRAS = {
     "realsense": Extra("RealSense cameras", ("pyrealsense2",), is_optional=True),
     "ur": Extra("the UR arm's model", ("example-robot-data",), is_optional=True),
     "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
-    "twin": Extra("what needs torch in the twin", ("python-fcl", "torch"), is_optional=True),
+    "twin": Extra("what needs torch in the twin", ("torch",), is_optional=True),
     "foundation": Extra(
         "SAM 3, DINOv3, CLIP from folders of weights",
         ("transformers", "safetensors"),

@@ -31,6 +31,7 @@ from bridge.episode.contract import (
     unknown_tails,
     unseen_losses,
 )
+from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
 from bridge.episode.topics import type_of_topic
@@ -86,6 +87,8 @@ class CheckReport:
     declared_losses: int = 0
     undeclared_losses: int = 0
     """Numbers missing on topics of a recording whose drop log does not list them."""
+    cut_short: str = ""
+    """What ended the recording where a disk did; nobody knows what it would still have held."""
     recovered: dict[str, Any] | None = None
     """What recovery said: the recorder died, and the end of the recording is unknown."""
     breaches: list[str] = field(default_factory=list)
@@ -101,6 +104,7 @@ class CheckReport:
         if self.faults:
             return 1
         lost = self.declared_losses or self.undeclared_losses or self.recovered is not None
+        lost = lost or self.cut_short
         return 3 if lost or self.breaches or self.unknown_tails else 0
 
     @property
@@ -111,6 +115,8 @@ class CheckReport:
                 return "contract broken"
             if self.undeclared_losses:
                 return "drops not logged"
+            if self.cut_short and not self.declared_losses:
+                return "cut short"
             if self.unknown_tails and not self.declared_losses:
                 return "tail unknown"
         return {0: "clean", 1: "broken", 3: "drops logged"}[self.exit_code]
@@ -139,6 +145,7 @@ class CheckReport:
             "messages": self.messages,
             "declared_losses": self.declared_losses,
             "undeclared_losses": self.undeclared_losses,
+            "cut_short": self.cut_short,
             "recovered": self.recovered,
             "breaches": self.breaches,
             "unknown_tails": self.unknown_tails,
@@ -275,6 +282,10 @@ def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
         if not episode.path.with_name(before).exists():
             faults.add(f"part {before} of this split episode is missing")
     for file in episode.files:
+        stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
+        if stopped_by.startswith(BY_DISK):
+            report.cut_short = stopped_by
+            report.notes.append(f"the recording was ended by the {stopped_by}")
         recovered = record_of(file, "recovered")
         if recovered:
             report.recovered = recovered

@@ -59,6 +59,10 @@ class Outcome:
     schema_version: int = SCHEMA_VERSION
 
 
+BY_DISK = "disk: "
+"""How ``stopped_by`` in the record ``recorder`` begins where a disk refused what came."""
+IN_RESERVE = "disk reserve: "
+"""The same where a recording was ended while the disk still took everything."""
 SAME_ENGINE_KEY = "same_engine_as_cell"
 """Among the settings of a replay whose engine moved the cell itself: shown, never counted."""
 SECOND_ENGINE_KEY = "second_engine"

@@ -465,7 +465,12 @@ class Lifecycle:
         return {"ok": True, "episode": take.info.id}
 
     def fail(
-        self, cause: str, now_ns: int, rest: Callable[[], Iterable[Item | Dropped]]
+        self,
+        cause: str,
+        now_ns: int,
+        rest: Callable[[], Iterable[Item | Dropped]],
+        *,
+        in_reserve: bool = False,
     ) -> DiskError:
         """End a recording the disk has refused, and finish its file if there is any way.
 
@@ -473,10 +478,12 @@ class Lifecycle:
             cause: What the disk said.
             now_ns: When.
             rest: Gives the messages received before, which can no longer be written.
+            in_reserve: The disk still takes what there is; it is ended before it is full.
         """
         take = self.take
         path = take.part_path if take else self._run.episodes_dir
         error = DiskError(path=path, cause=cause, is_finished=False)
+        reason = f"{metadata.IN_RESERVE if in_reserve else metadata.BY_DISK}{cause}"
         if take is None:
             self.error = error
             return error
@@ -484,7 +491,12 @@ class Lifecycle:
             take.refuse(rest())
         self._reserve.release()
         try:
-            take.close(end_ns=now_ns, reason=f"disk: {cause}", outcome=None, health=self._health())
+            take.close(
+                end_ns=now_ns,
+                reason=reason,
+                outcome=None,
+                health=self._health(),
+            )
             error = DiskError(path=take.path, cause=cause, is_finished=True)
             self.last_episode = take.info.id
         except OSError:

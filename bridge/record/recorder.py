@@ -468,7 +468,7 @@ class Recorder:
         """Finish the open episode behind everything received so far, and stop."""
 
         def act(command: Command) -> None:
-            self._life.fail(cause, command.received_ns, list)
+            self._life.fail(cause, command.received_ns, list, in_reserve=True)
             self.failed.set()
 
         self._status.failing = cause

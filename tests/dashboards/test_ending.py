@@ -64,7 +64,7 @@ def test_a_demo_terminated_while_it_replays_leaves_no_replay_behind(
         "open(sys.argv[1], 'w').write(str(os.getpid())); "
         "os.kill(os.getppid(), signal.SIGTERM); time.sleep(60)"
     )
-    monkeypatch.setattr(demo, "_record", lambda *_: None)
+    monkeypatch.setattr(demo, "_record", lambda *_: demo.Recorded())
     monkeypatch.setattr(demo, "_command", lambda _: [sys.executable, "-c", code, str(pid_file)])
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
