@@ -103,8 +103,8 @@ class CheckReport:
         """Status of the ``check`` command."""
         if self.faults:
             return 1
-        lost = self.declared_losses or self.undeclared_losses or self.recovered is not None
-        lost = lost or self.cut_short
+        lost = bool(self.declared_losses or self.undeclared_losses or self.cut_short)
+        lost = lost or self.recovered is not None
         return 3 if lost or self.breaches or self.unknown_tails else 0
 
     @property
