@@ -124,8 +124,8 @@ class MujocoArm:
         fingers = [model.joint(finger.joint) for finger in self._drives]
         self._arm = np.array([int(joint.qposadr[0]) for joint in joints])
         self._arm_dofs = np.array([int(joint.dofadr[0]) for joint in joints])
-        self._fingers = np.array([int(joint.qposadr[0]) for joint in fingers])
-        self._finger_dofs = np.array([int(joint.dofadr[0]) for joint in fingers])
+        self._fingers = np.array([int(joint.qposadr[0]) for joint in fingers], dtype=int)
+        self._finger_dofs = np.array([int(joint.dofadr[0]) for joint in fingers], dtype=int)
         self._wanted, self._torques = np.zeros(model.nv), np.zeros(model.nv)
 
     def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:

@@ -12,6 +12,7 @@ from cells import ENGINES, HOME, URDF, at, cell, poses
 
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.geometry import se3
+from bridge.robots.robot import read_robot
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig, require_engine
 from twin.physics.engines import (
@@ -23,6 +24,9 @@ from twin.physics.engines import (
     open_world,
 )
 from twin.replay.config import ReplayConfig
+from twin.replay.dynamics import _mesh_hulls
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot, with_absolute_meshes
 
 CUBE = np.array([0.04, 0.04, 0.04])
 each_engine = pytest.mark.parametrize("engine", ENGINES)
@@ -219,6 +223,31 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(engine: str) -
         world.add_free("cube", CUBE, 0.05, at(0.5, 0.0, 0.05))
         with pytest.raises(PhysicsError, match=r"no object 'duck'.*There are: cube"):
             world.object_pose("duck")
+
+
+@pytest.mark.parametrize(
+    ("name", "joint"), [("panda", "panda_finger_joint2"), ("z1", "jointGripper")]
+)
+def test_mujoco_refuses_fingers_that_mimic_or_turn_by_their_joint(name: str, joint: str) -> None:
+    urdf = with_absolute_meshes(read_robot(name).description())
+    with pytest.raises(PhysicsError, match=rf"{joint} turns or follows another joint"):
+        open_world("mujoco", urdf, {}, PhysicsConfig())
+
+
+@pytest.mark.parametrize("name", ["ur10_parallel_gripper", "kinova_j2s6s200"])
+def test_mujoco_moves_other_arms_also_without_fingers(name: str) -> None:
+    record = read_robot(name)
+    hulls = hulls_of(load_robot(record.description()))
+    count = len(record.joints)
+    home = np.full(count, 0.3) if record.home_rad is None else np.array(record.home_rad)
+    with open_world("mujoco", hulls.robot.urdf, _mesh_hulls(hulls), PhysicsConfig()) as world:
+        world.reset_robot(home - 0.05, record.gripper.max_width_m)
+        for step in range(240):
+            share = min(1.0, step / 120)
+            world.robot.command(home + (share - 1.0) * 0.05, np.zeros(count), 0.0)
+            world.step()
+        joints, _ = world.robot.posture()
+    np.testing.assert_allclose(joints, home, atol=2e-3)
 
 
 def test_what_is_added_later_leaves_the_rest_where_it_is() -> None:
