@@ -232,6 +232,7 @@ def test_the_gate_says_at_its_start_where_it_has_its_cameras_from(
     monkeypatch.setattr(service, "TwinProcess", lambda *_: nullcontext())
     monkeypatch.setattr(service, "make_gate", lambda *_: None)
     monkeypatch.setattr(service, "serve_gate", lambda *_: None)
+    monkeypatch.setattr(service, "serve_localisation", lambda *_: None)
     if link is None:
         RunFolder.create(tmp_path / "run")
     else:
