@@ -27,7 +27,7 @@ from queue import SimpleQueue
 ROOT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("mutants.toml")
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
-COPIED = (*PACKAGES, "tests", "datasets", "pyproject.toml", "robot_gst.py")
+COPIED = (*PACKAGES, "tests", "benchmarks", "datasets", "pyproject.toml", "robot_gst.py")
 LIMIT_S = 300.0
 """A run that takes longer is an error: it says neither caught nor survived."""
 PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--hypothesis-seed=0")
