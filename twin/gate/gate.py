@@ -250,9 +250,8 @@ class Gate:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             self._refuse_to_look(task_name, silent_ns)
-            frames = self._wait_for_frames()
-            found = self._localise(frames, self._task, ends_s)
-            missing = {name: item.reason for name, item in found.items() if not item.found}
+            found = self._look(self._wait_for_frames(), ends_s)
+            missing = _missing(found)
             return Located(
                 found=not missing, reason=with_reasons(missing) if missing else None, objects=found
             )
@@ -271,6 +270,9 @@ class Gate:
         running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} is being executed; objects are localised at rest")
+        self._refuse_silence(silent_ns)
+
+    def _refuse_silence(self, silent_ns: int) -> None:
         if silent_ns > self._config.max_silence_s * 1e9:
             raise UndecidedError(f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s")
 
@@ -306,10 +308,7 @@ class Gate:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
             urdf = self._check(plan)
-            if silent_ns > self._config.max_silence_s * 1e9:
-                raise UndecidedError(
-                    f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s"
-                )
+            self._refuse_silence(silent_ns)
             start_rad = self._where_the_arm_is(arrived_ns, robot_of(urdf))
             verdict = self._judged(plan, urdf, start_rad, ends_s)
             # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
@@ -396,13 +395,16 @@ class Gate:
             raise UndecidedError(f"{running} is being executed; objects are judged at rest")
         return urdf
 
-    def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
+    def _look(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
         """Localise; the same frames are not searched twice: planners ask again from one start."""
         looked_at = [(getattr(frame, "camera_id", ""), int(frame.stamp_ns)) for frame in frames]
         if self._seen is None or self._seen[0] != looked_at:
             self._seen = looked_at, self._localise(frames, self._task, ends_s)
-        found = self._seen[1]
-        missing = {name: item.reason for name, item in found.items() if not item.found}
+        return self._seen[1]
+
+    def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
+        found = self._look(frames, ends_s)
+        missing = _missing(found)
         if missing:
             raise UndecidedError(f"not every object was found: {with_reasons(missing)}")
         return found
@@ -483,6 +485,11 @@ class Gate:
                 f"the arm moved while the plan was being judged: {robot.joints[joint]} by "
                 f"{off_rad[joint]:.3f} rad"
             )
+
+
+def _missing(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Why objects were not found, by name."""
+    return {name: item.reason for name, item in found.items() if not item.found}
 
 
 def _newest(frames: Any) -> int:
