@@ -4,6 +4,8 @@ import importlib
 import os
 from types import ModuleType
 
+from twin.physics.config import PhysicsConfig
+
 
 def _import_quietly() -> ModuleType:
     saved = os.dup(2)
@@ -30,6 +32,22 @@ def take_client() -> int:
         return int(pybullet.connect(pybullet.DIRECT))
     client = _IDLE.pop()
     pybullet.resetSimulation(physicsClientId=client)
+    return client
+
+
+def open_client(config: PhysicsConfig) -> int:
+    """Take a client and give it the settings of every world: rate, solver, gravity."""
+    client = take_client()
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=1.0 / config.rate_hz,
+        numSolverIterations=config.solver_iterations,
+        solverResidualThreshold=config.solver_residual,
+        numSubSteps=0,
+        deterministicOverlappingPairs=1,
+        enableFileCaching=0,
+        physicsClientId=client,
+    )
+    pybullet.setGravity(0, 0, -config.gravity_m_s2, physicsClientId=client)
     return client
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import give_client_back, pybullet, take_client
+from twin.physics.engine import give_client_back, open_client, pybullet
 from twin.physics.world import FrictionAnchors
 
 _HAND_MASS_KG = 1e4
@@ -44,17 +44,7 @@ class PushWorld:
             table_height_m: Of the table's top [m].
         """
         self._config = config
-        self._client = take_client()
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=1.0 / config.rate_hz,
-            numSolverIterations=config.solver_iterations,
-            solverResidualThreshold=config.solver_residual,
-            numSubSteps=0,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=self._client,
-        )
-        pybullet.setGravity(0, 0, -config.gravity_m_s2, physicsClientId=self._client)
+        self._client = open_client(config)
         T_table = np.eye(4)
         T_table[2, 3] = table_height_m - _TABLE_M[2] / 2
         table = self._body(self._box(np.array(_TABLE_M)), 0.0, T_table, config.surface_friction)

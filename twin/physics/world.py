@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
-from twin.physics.engine import give_client_back, pybullet, take_client
+from twin.physics.engine import give_client_back, open_client, pybullet
 from twin.physics.soft_world import SoftWorld
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
@@ -98,17 +98,7 @@ class World:
             PhysicsError: When PyBullet does not load the description or joints are missing.
         """
         self.config = config
-        self._client = take_client()
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=1.0 / config.rate_hz,
-            numSolverIterations=config.solver_iterations,
-            solverResidualThreshold=config.solver_residual,
-            numSubSteps=0,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=self._client,
-        )
-        pybullet.setGravity(0, 0, -config.gravity_m_s2, physicsClientId=self._client)
+        self._client = open_client(config)
         self.free_ids: dict[str, int] = {}
         self._anchors = FrictionAnchors(self._client)
         try:
