@@ -6,6 +6,7 @@ rule, and whatever else a row carries, such as the cell's own engine with nomina
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -29,9 +30,9 @@ from evaluator.measurements import (
     BASELINE_PPV,
 )
 from evaluator.metrics.geometric_rule import judge_by_geometry
-from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.result import Cell, Measurement, Table
 from evaluator.run_reader.object_states import AFTER
-from evaluator.statistics.differences import tango_difference
+from evaluator.statistics.differences import tango_points
 from evaluator.statistics.gate import Confusion
 
 TWIN = "twin"
@@ -198,16 +199,10 @@ def _gain(
     by: str, words: str, name: str, task: str, rows: Sequence[TrialRow], answer_of: Answer
 ) -> Measurement:
     better, worse, n = _discordant(rows, answer_of, _forecast(name))
-
-    def points() -> tuple[float, Interval]:
-        fraction = tango_difference(better, worse, n)
-        interval = replace(fraction, low=100 * fraction.low, high=100 * fraction.high)
-        return 100 * (better - worse) / n, interval
-
     quantity = BASELINE_GAIN if task == ALL_TASKS else BASELINE_GAIN_OF_TASK
     return measured(
         quantity.of(by=by, baseline=name, task=task, words=words),
-        points,
+        partial(tango_points, better, worse, n),
         n=n,
         counted="trial",
         episodes=names_of(rows),

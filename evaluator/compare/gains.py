@@ -1,7 +1,7 @@
 """The gain with replanning: percentage points and relative, its tests, and what they could show."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,7 +32,7 @@ from evaluator.statistics.differences import (
     guaranteed_difference,
     mcnemar,
     newcombe_difference,
-    tango_difference,
+    tango_points,
 )
 from evaluator.statistics.intervals import relative_gain
 from evaluator.statistics.power import (
@@ -177,14 +177,9 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
 def _paired_points(
     side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
 ) -> Measurement:
-    def points() -> tuple[float, Interval | None]:
-        fraction = tango_difference(improved, worsened, len(known))
-        interval = replace(fraction, low=100 * fraction.low, high=100 * fraction.high)
-        return 100 * (improved - worsened) / len(known), interval
-
     return measured(
         PAIRED_GAIN.of(side=side, words=words),
-        points,
+        partial(tango_points, improved, worsened, len(known)),
         n=len(known),
         counted="pair",
         episodes=[r.episode for pair in known for r in (pair.before, pair.after)],

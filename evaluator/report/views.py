@@ -135,11 +135,16 @@ def _success(frame: "pd.DataFrame") -> "pd.DataFrame":
     return shown
 
 
+def _points(value: float, row: Record) -> Figures:
+    """Write percentage points with the interval that stands in the row."""
+    ends = f"{row['low']:+.1f}, {row['high']:+.1f}" if _known(row["low"]) else ""
+    return Figures(f"{value:+.1f} pp", ends)
+
+
 def _gain(row: Record) -> Shown:
     if not _known(row["gain (pp)"]):
         return f"undefined: {row['why undefined']}"
-    ends = f"{row['low']:+.1f}, {row['high']:+.1f}" if _known(row["low"]) else ""
-    return Figures(f"{row['gain (pp)']:+.1f} pp", ends)
+    return _points(row["gain (pp)"], row)
 
 
 def _relative(row: Record) -> Shown:
@@ -219,8 +224,7 @@ def _baselines(frame: "pd.DataFrame") -> "pd.DataFrame":
     def difference(row: Record) -> Shown:
         if not _known(row["twin more right (pp)"]):
             return None
-        ends = f"{row['low']:+.1f}, {row['high']:+.1f}" if _known(row["low"]) else ""
-        return Figures(f"{row['twin more right (pp)']:+.1f} pp", ends)
+        return _points(row["twin more right (pp)"], row)
 
     shown = frame[["asked of", "task", "forecast by"]].copy()
     shown["right"] = share("right", "trials")

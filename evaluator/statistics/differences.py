@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -102,6 +102,22 @@ def tango_difference(improved: int, worsened: int, n: int, *, level: float = LEV
     low = -1.0 if worsened == n else -_upper_end(worsened, improved, n, z, -estimate)
     high = 1.0 if improved == n else _upper_end(improved, worsened, n, z, estimate)
     return Interval(low=low, high=high, level=level, method="tango")
+
+
+def tango_points(improved: int, worsened: int, n: int) -> tuple[float, Interval]:
+    """Return the paired difference and its ``tango_difference``, both in percentage points.
+
+    Args:
+        improved: Pairs that failed before and succeeded after.
+        worsened: Pairs that succeeded before and failed after.
+        n: All pairs, those without a change included.
+
+    Raises:
+        UndefinedStatisticError: Without pairs.
+    """
+    fraction = tango_difference(improved, worsened, n)
+    interval = replace(fraction, low=100 * fraction.low, high=100 * fraction.high)
+    return 100 * (improved - worsened) / n, interval
 
 
 def _upper_end(improved: int, worsened: int, n: int, z: float, estimate: float) -> float:
