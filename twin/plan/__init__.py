@@ -1,0 +1,1 @@
+"""From words to a verified trajectory: constraints, grasps, releases, paths, and steering."""

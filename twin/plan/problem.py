@@ -1,0 +1,108 @@
+"""What the parts of the planner hand to each other: the scene, states, grasps, releases, paths.
+
+Frames: ``base`` is the robot's base frame, ``tcp`` the tool centre point between the open finger
+pads: its z axis points out of the hand (the approach direction), the fingers close along its y.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bridge.task.task_file import ObjectModel
+from twin.replay.scene import ReplayScene
+from twin.robot.model import RobotModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """The surface of one object, in its own frame."""
+
+    vertices_m: Float[np.ndarray, "num_vertices 3"]
+    triangles: Int[np.ndarray, "num_triangles 3"]
+    """Counter-clockwise seen from outside."""
+    source: str
+    """Where it comes from, in words: the scan, or the task file."""
+    trusted_from_m: float = -np.inf
+    """Below this height in the object frame nobody saw the surface."""
+    error_m: float = 0.0
+    """How far the surface may be off."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """What the planner knows when it plans."""
+
+    scene: ReplayScene
+    """Task, poses with covariances, static distances, containers, where the arm stands."""
+    robot: RobotModel
+    shapes: Mapping[str, Shape]
+    """By object id; every object of the task has one."""
+
+    def model(self, object_id: str) -> ObjectModel:
+        """The task file's nominal shape of an object."""
+        return self.scene.task.objects[object_id]
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """Many hypothetical states at once, NumPy float64 or torch: what constraints are asked about.
+
+    Everything is batched over its first axis, ``num_states``.
+    """
+
+    Ts_base_object: Mapping[str, Any]
+    """Per object ``(num_states, 4, 4)``; those that do not move are broadcast."""
+    T_base_tcp: Any
+    """``(num_states, 4, 4)``."""
+    width_m: Any
+    """``(num_states,)``, between the finger pads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasp:
+    """One way to take hold of an object."""
+
+    object_id: str
+    T_object_tcp: Float[np.ndarray, "4 4"]
+    """Tool at the grasp instant, in the object's frame (errata: Eq. 9)."""
+    width_m: float
+    """Distance between the two surfaces it closes on."""
+    open_m: float
+    """Opening of the hand on its way there."""
+    margin: float
+    """How many standard deviations of the object's pose it bears; greater is better."""
+    joints_rad: Float[np.ndarray, " num_joints"]
+    """Arm at the grasp, from the base's side."""
+    pregrasp_m: float
+    """Length of the straight approach along the tool's z axis."""
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Release:
+    """One final state of a carried object (Eq. 8 and 9)."""
+
+    object_id: str
+    T_base_object: Float[np.ndarray, "4 4"]
+    T_base_tcp: Float[np.ndarray, "4 4"]
+    """Tool at the release: ``T_base_object @ T_object_tcp`` of the grasp."""
+    clearance_m: float
+    """Least signed distance of the object's points to what stands still, allowed pairs left out."""
+    cost: float
+    """J of Eq. 7, and what ranks those with enough clearance."""
+    checked_against: tuple[str, ...] = ()
+    """What distances were asked, with each one's own error, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimedPath:
+    """One collision-free movement with its times."""
+
+    times_s: Float[np.ndarray, " num_points"]
+    joints_rad: Float[np.ndarray, "num_points num_joints"]
+    length_rad: float
+    work: Mapping[str, float] = field(default_factory=dict)
+    """Counted steps: nodes, checks, halvings; never seconds."""
