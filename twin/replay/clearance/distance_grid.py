@@ -4,9 +4,12 @@
 thousand times for each state, so every array is written once and no index is checked twice.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Float32
 
+from twin.replay._clearance import surface_to_boxes, surface_to_grid
 from twin.scene.shape.sdf import SdfGrid
 
 
@@ -77,37 +80,52 @@ def _blend(
     low += high
 
 
-_BATCH = 12_000
-"""Points looked up at once: what fits the cache beside the grid."""
-
-
 def candidate_clearance(
     lookup: GridLookup,
     points_m: Float[np.ndarray, "num_points 3"],
-    Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
-) -> Float32[np.ndarray, " num_candidates"]:
+    Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
+) -> Float[np.ndarray, " num_candidates"]:
     """Smallest signed distance of a body's surface points, for each pose it might be released at.
 
     Args:
-        lookup: The static scene, in the base frame.
+        lookup: The static scene in the base frame, or an object in its own.
         points_m: Points of the body's surface, in its own frame.
-        Ts_base_body: The poses that are proposed.
+        Ts_grid_body: The poses that are proposed, in the frame of the grid.
 
     Returns:
         Distances [m], negative inside; a candidate is free when it is above ``eps_col_m``.
     """
-    count, num = len(Ts_base_body), len(points_m)
-    points = np.ascontiguousarray(points_m.T, dtype=np.float32)
-    # Straight to voxels: place = R p / voxel + (t - origin) / voxel, in one product each.
-    R = (Ts_base_body[:, :3, :3] / lookup.voxel_m).astype(np.float32)
-    t = ((Ts_base_body[:, :3, 3] - lookup.origin_m) / lookup.voxel_m).astype(np.float32)
-    nearest = np.empty(count, dtype=np.float32)
-    batch = max(1, _BATCH // max(num, 1))
-    for start in range(0, count, batch):
-        some = slice(start, start + batch)
-        rows = R[some].transpose(1, 0, 2)  # all x rows, then all y rows, then all z rows
-        size = rows.shape[1]
-        place = (rows.reshape(3 * size, 3) @ points).reshape(3, size, num)
-        place += t[some].T[:, :, None]
-        nearest[some] = lookup.at(place.reshape(3, size * num)).reshape(size, num).min(axis=1)
+    nearest = np.empty(len(Ts_grid_body))
+    grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
+    surface_to_grid(*grid, *_poses(Ts_grid_body), np.ascontiguousarray(points_m), nearest)
     return nearest
+
+
+def candidate_box_clearance(
+    boxes: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]],
+    points_m: Float[np.ndarray, "num_points 3"],
+    Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
+) -> Float[np.ndarray, "num_candidates num_boxes"]:
+    """Smallest signed distance of a body's surface points to each box, for each pose.
+
+    Args:
+        boxes: Pose ``T_base_box`` of the middle, and extents [m].
+        points_m: Points of the body's surface, in its own frame.
+        Ts_base_body: The poses that are proposed.
+
+    Returns:
+        Distances [m], exact outside; inside minus the depth below the nearest face.
+    """
+    nearest = np.empty((len(Ts_base_body), len(boxes)))
+    Ts_base_box = np.array([T for T, _ in boxes]).reshape(-1, 4, 4)
+    halves_m = np.array([extents for _, extents in boxes], dtype=np.float64).reshape(-1, 3) / 2
+    body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
+    surface_to_boxes(*_poses(Ts_base_box), halves_m, *body, nearest)
+    return nearest
+
+
+def _poses(
+    Ts: Float[np.ndarray, "num_poses 4 4"],
+) -> tuple[Float[np.ndarray, "num_poses 3 3"], Float[np.ndarray, "num_poses 3"]]:
+    """Rotations and origins, each in one piece of memory."""
+    return np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])

@@ -1,0 +1,425 @@
+"""Damped Gauss-Newton from many starts at once, and the distinct answers it finds.
+
+Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) on SE(3) and the width, all starts in one
+batch, each with its own damping. Every state on the way that satisfies all constraints is a
+candidate, not only the last one: what is left of them, after those within 1 cm and 10 degrees of
+a cheaper one are dropped, are answers that differ. Work is counted in states, never in seconds.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from bridge.errors import MissingDependencyError, refuse_outside
+from bridge.geometry import se3
+from twin.plan.stage.motion import moved
+from twin.plan.stage.objective import ANGLE_RAD, LENGTH_M, NUM_VARIABLES, StageProblem, Zeta
+
+UNITS = np.array([LENGTH_M] * 3 + [ANGLE_RAD] * 3 + [LENGTH_M])
+"""What a step of one is: 1 cm, 10 degrees, 1 cm."""
+_DIFFERENCE = 1e-4
+"""Step of numeric derivatives, in units: 1 um, 0.001 degrees."""
+_HOPELESS = 1e6
+"""A start that needs more damping than this came as far as it can."""
+
+
+class Backend(Protocol):
+    """Who evaluates a stage problem and differentiates it."""
+
+    def evaluate(
+        self, problem: StageProblem, zeta: Zeta
+    ) -> tuple[Float[np.ndarray, "num_states num_terms"], Float[np.ndarray, "num_states num_rows"]]:
+        """Violations and residuals of NumPy states."""
+
+    def linearise(
+        self, problem: StageProblem, zeta: Zeta
+    ) -> tuple[
+        Float[np.ndarray, "num_states num_terms"],
+        Float[np.ndarray, "num_states num_rows"],
+        Float[np.ndarray, "num_states num_rows 7"],
+    ]:
+        """The same with the residuals' derivatives by a step in units."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolveConfig:
+    """How a stage is solved."""
+
+    num_starts: int = 32
+    """Starts that are followed at once."""
+    iterations: int = 30
+    """Most steps of each start,"""
+    free_iterations: int = 12
+    """of which at most this many go to what the constraints allow."""
+    spread_m: float = 0.06
+    """Starts are drawn this far around the nominal position, along each axis."""
+    spread_rad: float = 0.6
+    """And turned by up to this much."""
+    spread_turn_rad: float = float(np.pi)
+    """Before that, turned about the vertical by up to this much."""
+    damping: float = 1e-2
+    """First damping of Levenberg and Marquardt."""
+    longest_step: float = 4.0
+    """Of a start in one iteration, in units of 1 cm and 10 degrees."""
+    settled: float = 1e-7
+    """A start whose cost falls by a smaller share is done."""
+    same_m: float = 0.01
+    """Answers closer than this are one,"""
+    same_rad: float = ANGLE_RAD
+    """when they are also turned by less than this."""
+    max_candidates: int = 16
+    """Most answers."""
+    backend: Literal["numpy", "torch"] = "numpy"
+    """Who differentiates: NumPy by differences, torch exactly."""
+    device: str = "cpu"
+    """Of torch."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are none."""
+        refuse_outside(
+            self,
+            {
+                "num_starts": (1, 4096),
+                "iterations": (1, 1000),
+                "free_iterations": (0, 1000),
+                "spread_m": (0, 2),
+                "spread_rad": (0, np.pi),
+                "spread_turn_rad": (0, np.pi),
+                "damping": (1e-12, 1e6),
+                "longest_step": (1e-3, 1e3),
+                "settled": (0, 1),
+                "same_m": (0, 1),
+                "same_rad": (0, np.pi),
+                "max_candidates": (1, 4096),
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCandidate:
+    """One answer of a stage."""
+
+    T_base_tcp: Float[np.ndarray, "4 4"]
+    width_m: float
+    cost: float
+    """J."""
+    violations: Mapping[str, float]
+    """f of each term [m or rad]."""
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every constraint is satisfied."""
+        return all(value <= 0 for value in self.violations.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSolution:
+    """What came out of all starts."""
+
+    candidates: tuple[StageCandidate, ...]
+    """Feasible and distinct, the cheapest first; empty when none was found."""
+    nearest: StageCandidate
+    """The cheapest state of all, feasible or not: what it violates says what is in the way."""
+    costs: Float[np.ndarray, " num_starts"]
+    """J where each start ended."""
+    feasible: Bool[np.ndarray, " num_starts"]
+    """Whether each start ended with every constraint satisfied."""
+    work: Mapping[str, int] = field(default_factory=dict)
+    """Counted steps."""
+
+
+@dataclass
+class _Seen:
+    """States and what they cost, as they come."""
+
+    states: list[Zeta] = field(default_factory=list)
+    costs: list[np.ndarray] = field(default_factory=list)
+    violations: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, zeta: Zeta, violations: np.ndarray, costs: np.ndarray) -> None:
+        self.states.append(zeta)
+        self.costs.append(costs)
+        self.violations.append(violations)
+
+    def all(self) -> tuple[Zeta, np.ndarray, np.ndarray]:
+        T = np.concatenate([zeta.T_base_tcp for zeta in self.states])
+        width = np.concatenate([zeta.width_m for zeta in self.states])
+        zeta = Zeta(T_base_tcp=T, width_m=width)
+        return zeta, np.concatenate(self.violations), np.concatenate(self.costs)
+
+
+def draw_starts(problem: StageProblem, config: SolveConfig, seed: int) -> Zeta:
+    """Draw states around the nominal one; the first is the nominal one itself.
+
+    Args:
+        problem: Whose nominal pose and width are taken.
+        config: How many and how far.
+        seed: The same seed gives the same starts.
+    """
+    rng = np.random.default_rng(seed)
+    num = config.num_starts
+    shift = rng.uniform(-config.spread_m, config.spread_m, (num, 3))
+    about = rng.uniform(-config.spread_turn_rad, config.spread_turn_rad, num)
+    axis = rng.normal(size=(num, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    turn = axis * rng.uniform(0.0, config.spread_rad, (num, 1))
+    width = rng.uniform(0.0, problem.max_width_m, num)
+    shift[0], about[0], turn[0], width[0] = 0.0, 0.0, 0.0, problem.nominal_width_m
+    upright = np.zeros((num, 3))
+    upright[:, 2] = about
+    T = np.repeat(problem.nominal_T_base_tcp[None], num, axis=0)
+    T[:, :3, :3] = se3.rotation_from_vector(upright) @ T[:, :3, :3] @ se3.rotation_from_vector(turn)
+    T[:, :3, 3] += shift
+    return Zeta(T_base_tcp=T, width_m=width)
+
+
+def solve(
+    problem: StageProblem,
+    config: SolveConfig | None = None,
+    *,
+    seed: int = 0,
+    starts: Zeta | None = None,
+) -> StageSolution:
+    """Minimise J from all starts and keep the distinct feasible states.
+
+    Args:
+        problem: The stage.
+        config: The defaults when None.
+        seed: Of the starts that are drawn; not used when they are given.
+        starts: Where to begin; None: drawn around the nominal state.
+
+    Raises:
+        ValueError: A start is not finite.
+    """
+    config = SolveConfig() if config is None else config
+    zeta = draw_starts(problem, config, seed) if starts is None else starts
+    if not (np.isfinite(zeta.T_base_tcp).all() and np.isfinite(zeta.width_m).all()):
+        message = "a start of the stage optimisation is not finite."
+        raise ValueError(message)
+    descent = _Descent(problem, config, backend_of(config), zeta)
+    while descent.iterations < config.iterations and descent.step():
+        pass
+    return descent.solution()
+
+
+class _Descent:
+    """All starts on their way down.
+
+    A start first goes the short way to what the constraints allow; only from there does the
+    regulariser draw it. So starts that are far apart arrive far apart, and come together later.
+    """
+
+    def __init__(
+        self, problem: StageProblem, config: SolveConfig, backend: Backend, zeta: Zeta
+    ) -> None:
+        self.iterations = 0
+        self._problem, self._config, self._backend = problem, config, backend
+        num = len(zeta)
+        self._T, self._width = zeta.T_base_tcp.copy(), zeta.width_m.copy()
+        self._violations, self._r, self._J = backend.linearise(problem, zeta)
+        self._damping = np.full(num, config.damping)
+        self._drawn: Bool[np.ndarray, " num_starts"] = (self._violations <= 0).all(axis=1)
+        self._open: Bool[np.ndarray, " num_starts"] = np.isfinite(self._r).all(axis=1)
+        self._num_states = num * (NUM_VARIABLES + 1)
+        self._seen = _Seen()
+        self._seen.add(zeta, self._violations.copy(), np.square(self._r).sum(axis=1))
+
+    def step(self) -> bool:
+        """Try one step of every start that is not done; False when all are."""
+        rows = np.flatnonzero(self._open)
+        if not len(rows):
+            return False
+        self.iterations += 1
+        trial = self._trial(rows)
+        violations, r = self._backend.evaluate(self._problem, trial)
+        self._num_states += len(rows)
+        self._seen.add(trial, violations, np.square(r).sum(axis=1))
+        before, cost = self._cost(rows, self._r[rows]), self._cost(rows, r)
+        better = cost < before  # what is not a number is not better
+        won, lost = rows[better], rows[~better]
+        self._damping[won] = np.maximum(self._damping[won] * 0.3, 1e-9)
+        self._damping[lost] *= 5.0
+        done = better & (before - cost <= self._config.settled * before)
+        done |= self._damping[rows] > _HOPELESS
+        self._T[won], self._width[won] = trial.T_base_tcp[better], trial.width_m[better]
+        self._violations[won], self._r[won] = violations[better], r[better]
+        self._draw(rows, done)
+        again = won[self._open[won]]
+        if len(again):
+            here = Zeta(T_base_tcp=self._T[again], width_m=self._width[again])
+            _, self._r[again], self._J[again] = self._backend.linearise(self._problem, here)
+            self._num_states += len(again) * NUM_VARIABLES
+        return True
+
+    def _draw(self, rows: np.ndarray, done: np.ndarray) -> None:
+        """Let the regulariser draw starts that have arrived, or that came no further."""
+        arrived = (self._violations[rows] <= 0).all(axis=1) | done
+        arrived |= self.iterations >= self._config.free_iterations
+        first = arrived & ~self._drawn[rows]
+        self._drawn[rows[first]] = True
+        self._damping[rows[first]] = self._config.damping
+        self._open[rows[done & ~first]] = False
+
+    def _cost(self, rows: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """J of some starts, without the regulariser where it does not draw yet."""
+        squares = np.square(r)
+        penalties = squares[:, :-NUM_VARIABLES].sum(axis=1)
+        omega = squares[:, -NUM_VARIABLES:].sum(axis=1)
+        return np.asarray(penalties + self._drawn[rows] * omega)
+
+    def _trial(self, rows: np.ndarray) -> Zeta:
+        """Solve the damped normal equations of some starts and go there."""
+        share = np.ones((len(rows), self._r.shape[1]))
+        share[:, -NUM_VARIABLES:] = self._drawn[rows, None]
+        J, r = self._J[rows] * share[:, :, None], self._r[rows] * share
+        H = np.swapaxes(J, 1, 2) @ J
+        damping = self._damping[rows, None]
+        diagonal = np.einsum("nii->ni", H)
+        diagonal += damping * (diagonal + 1e-3)  # the view writes into H
+        g = np.einsum("nij,ni->nj", J, r)
+        step = -np.linalg.solve(H, g[:, :, None])[:, :, 0]
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        step *= np.minimum(1.0, self._config.longest_step / np.maximum(length, 1e-12))
+        step *= UNITS
+        width = np.clip(self._width[rows] + step[:, 6], 0.0, self._problem.max_width_m)
+        return Zeta(T_base_tcp=moved(self._T[rows], step), width_m=width)
+
+    def solution(self) -> StageSolution:
+        """Keep what is feasible and distinct."""
+        zeta, violations, costs = self._seen.all()
+        costs = np.where(np.isfinite(costs), costs, np.inf)
+        order = np.argsort(costs, kind="stable")
+        names = _names(self._problem)
+
+        def candidate(index: int) -> StageCandidate:
+            return StageCandidate(
+                T_base_tcp=zeta.T_base_tcp[index],
+                width_m=float(zeta.width_m[index]),
+                cost=float(costs[index]),
+                violations=dict(zip(names, violations[index].tolist(), strict=True)),
+            )
+
+        feasible = (violations <= 0).all(axis=1)
+        chosen = distinct(zeta.T_base_tcp, order[feasible[order]], self._config)
+        return StageSolution(
+            candidates=tuple(candidate(index) for index in chosen),
+            nearest=candidate(int(order[0])),
+            costs=np.square(self._r).sum(axis=1),
+            feasible=(self._violations <= 0).all(axis=1),
+            work={"iterations": self.iterations, "states": self._num_states},
+        )
+
+
+def _names(problem: StageProblem) -> list[str]:
+    """Names of the terms, numbered where one comes again."""
+    found: list[str] = []
+    for term in problem.terms:
+        same = sum(name.partition(" #")[0] == term.name for name in found)
+        found.append(f"{term.name} #{same + 1}" if same else term.name)
+    return found
+
+
+def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, config: SolveConfig) -> list[int]:
+    """Go through poses in an order and keep those that differ from all that are kept.
+
+    Args:
+        Ts: The poses.
+        order: Indices, the best first; others are left out.
+        config: What counts as the same, and how many are kept.
+    """
+    kept: list[int] = []
+    rest = np.asarray(order, dtype=np.int64)
+    while len(rest) and len(kept) < config.max_candidates:
+        first = int(rest[0])
+        kept.append(first)
+        near = np.linalg.norm(Ts[rest, :3, 3] - Ts[first, :3, 3], axis=1) <= config.same_m
+        angle = se3.rotation_angle_rad(Ts[first, :3, :3].T @ Ts[rest, :3, :3])
+        near &= angle <= config.same_rad
+        near[0] = True
+        rest = rest[~near]
+    return kept
+
+
+def backend_of(config: SolveConfig) -> Backend:
+    """Return who evaluates, by its name; torch is loaded only then."""
+    return NumpyBackend() if config.backend == "numpy" else TorchBackend(config.device)
+
+
+def _greatest(violations: list[np.ndarray]) -> Float[np.ndarray, "num_states num_terms"]:
+    """Of the parts of each term."""
+    return np.stack([parts.max(axis=1) for parts in violations], axis=1)
+
+
+class NumpyBackend:
+    """Forward differences: eight states in place of one, in one batch."""
+
+    def evaluate(self, problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray]:
+        """Violations and residuals."""
+        violations = problem.violations(zeta)
+        return _greatest(violations), np.asarray(problem.residuals(zeta, violations))
+
+    def linearise(
+        self, problem: StageProblem, zeta: Zeta
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Violations, residuals and their derivatives."""
+        num, blocks = len(zeta), NUM_VARIABLES + 1
+        step = np.zeros((blocks, num, NUM_VARIABLES))
+        step[np.arange(1, blocks), :, np.arange(NUM_VARIABLES)] = _DIFFERENCE
+        steps = step.reshape(-1, NUM_VARIABLES) * UNITS
+        T = moved(np.concatenate([zeta.T_base_tcp] * blocks), steps)
+        width = np.concatenate([zeta.width_m] * blocks) + steps[:, 6]
+        violations, r = self.evaluate(problem, Zeta(T_base_tcp=T, width_m=width))
+        r = r.reshape(blocks, num, -1)
+        return violations[:num], r[0].copy(), np.moveaxis(r[1:] - r[0], 0, 2) / _DIFFERENCE
+
+
+class TorchBackend:
+    """Exact derivatives of terms that are written for tensors, on any device of torch."""
+
+    def __init__(self, device: str) -> None:
+        """Load torch.
+
+        Args:
+            device: As torch names it.
+
+        Raises:
+            MissingDependencyError: It is not installed.
+        """
+        try:
+            import torch  # noqa: PLC0415  # only the extra [twin] brings it
+        except ImportError as error:
+            purpose = "exact derivatives of stage constraints"
+            raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
+        self._torch = torch
+        self._options: dict[str, Any] = {"dtype": torch.float64, "device": device}
+
+    def evaluate(self, problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray]:
+        """Violations and residuals."""
+        with self._torch.no_grad():
+            here = self._zeta(zeta)
+            violations = problem.violations(here)
+            r = problem.residuals(here, violations)
+        return _greatest([array.cpu().numpy() for array in violations]), r.cpu().numpy()
+
+    def linearise(
+        self, problem: StageProblem, zeta: Zeta
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Violations, residuals and their derivatives."""
+        torch, at = self._torch, self._zeta(zeta)
+        step = torch.zeros((len(zeta), NUM_VARIABLES), **self._options, requires_grad=True)
+        change = step * torch.as_tensor(UNITS, **self._options)
+        here = Zeta(T_base_tcp=moved(at.T_base_tcp, change), width_m=at.width_m + change[:, 6])
+        violations = problem.violations(here)
+        r = problem.residuals(here, violations)
+        # States do not look at each other: the sum over them has each one's own derivatives.
+        rows = [torch.autograd.grad(column.sum(), step, retain_graph=True)[0] for column in r.T]
+        J = torch.stack(rows, dim=1)
+        found = _greatest([array.detach().cpu().numpy() for array in violations])
+        return found, r.detach().cpu().numpy(), J.cpu().numpy()
+
+    def _zeta(self, zeta: Zeta) -> Zeta:
+        T = self._torch.as_tensor(zeta.T_base_tcp, **self._options)
+        return Zeta(T_base_tcp=T, width_m=self._torch.as_tensor(zeta.width_m, **self._options))
