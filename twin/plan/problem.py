@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
@@ -32,6 +33,23 @@ class Shape:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Keypoint:
+    """A point that constraints name by its number."""
+
+    p_m: Float[np.ndarray, "3"]
+    object_id: str | None = None
+    """In whose frame it is and with what it moves; None: the base frame, and it stands still."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraView:
+    """A camera that stands still."""
+
+    camera: Camera
+    T_base_camera: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Problem:
     """What the planner knows when it plans."""
 
@@ -40,6 +58,10 @@ class Problem:
     robot: RobotModel
     shapes: Mapping[str, Shape]
     """By object id; every object of the task has one."""
+    keypoints: tuple[Keypoint, ...] = ()
+    """What constraints may name as ``kp``."""
+    cameras: Mapping[str, CameraView] = field(default_factory=dict)
+    """By name; what constraints of kind ``visible`` may name."""
 
     def model(self, object_id: str) -> ObjectModel:
         """The task file's nominal shape of an object."""

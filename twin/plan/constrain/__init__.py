@@ -1,0 +1,1 @@
+"""Relations that a plan should keep: closed kinds, evaluated over many states, told in words."""
