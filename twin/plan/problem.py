@@ -15,6 +15,7 @@ from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
+from twin.scene.shape.sdf import SdfGrid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +31,8 @@ class Shape:
     """Below this height in the object frame nobody saw the surface."""
     error_m: float = 0.0
     """How far the surface may be off."""
+    sdf: SdfGrid | None = None
+    """Distances to it in its own frame, where the rebuilt scene has them."""
 
 
 @dataclass(frozen=True, kw_only=True)

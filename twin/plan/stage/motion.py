@@ -4,67 +4,30 @@ A step has seven numbers: three of the position in the base frame [m], three of 
 in the tool's own frame [rad], one of the width [m]. Torch is loaded only where tensors come in.
 """
 
-import sys
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from twin.plan.constrain.arrays import Array, like, namespace, turn
 
 
-def arrays_like(reference: Any, *arrays: Any) -> tuple[Any, ...]:
-    """NumPy arrays as whatever the reference is: unchanged, or tensors on its device."""
-    if isinstance(reference, np.ndarray):
-        return arrays
-    torch = _of(reference)
-    made = (torch.as_tensor(np.array(a), dtype=reference.dtype) for a in arrays)
-    return tuple(a.to(reference.device) for a in made)
-
-
-def concatenated(parts: Sequence[Any]) -> Any:
-    """Put ``(num, n)`` matrices side by side."""
-    return _of(parts[0]).concatenate(list(parts), 1)
-
-
-def positive_part(x: Any) -> Any:
-    """[x]_+."""
-    return np.maximum(x, 0.0) if isinstance(x, np.ndarray) else x.clamp(min=0.0)
-
-
-def worst(values: Any, num_states: int) -> Any:
-    """Largest of each state's steps, which lie one after the other, column by column."""
-    steps = values.reshape(num_states, -1, *values.shape[1:])
-    return _of(values).amax(steps, 1)
-
-
-def _of(array: Any) -> Any:
-    """The library an array belongs to."""
-    return np if isinstance(array, np.ndarray) else sys.modules["torch"]
-
-
-def rotation_vector(R: Any) -> Any:
+def rotation_vector(R: Array) -> Array:
     """Rotation vectors of ``(num, 3, 3)`` rotations [rad]; smooth below half a turn."""
     if isinstance(R, np.ndarray):
         return se3.vector_from_rotation(R)
-    torch = _of(R)
-    skew = torch.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1
-    )
-    square = (skew * skew).sum(dim=1)
+    xp = namespace(R)
+    skew = xp.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
+    square = (skew * skew).sum(1)
     tiny = square < 1e-18
-    sine = torch.where(tiny, torch.ones_like(square), square).sqrt()
-    cosine = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0
-    ratio = torch.where(tiny, torch.full_like(sine, 0.5), torch.atan2(sine, cosine) / sine)
-    return skew * ratio[:, None]
+    sine = xp.sqrt(xp.where(tiny, xp.ones_like(square), square))
+    return skew * xp.where(tiny, 0.5 * xp.ones_like(sine), turn(R) / sine)[:, None]
 
 
-def rotation_of(vector_rad: Any) -> Any:
+def rotation_of(vector_rad: Array) -> Array:
     """Rotations ``(num, 3, 3)`` of rotation vectors, differentiable at zero too."""
     if isinstance(vector_rad, np.ndarray):
         return se3.rotation_from_vector(vector_rad)
-    torch = _of(vector_rad)
+    torch = namespace(vector_rad)
     square = (vector_rad * vector_rad).sum(dim=1)
     tiny = square < 1e-12
     angle = torch.where(tiny, torch.ones_like(square), square).sqrt()
@@ -77,8 +40,8 @@ def rotation_of(vector_rad: Any) -> Any:
 
 
 def interpolated(
-    T_start: Float[np.ndarray, "4 4"], T_end: Any, fractions: Float[np.ndarray, " num_steps"]
-) -> Any:
+    T_start: Float[np.ndarray, "4 4"], T_end: Array, fractions: Float[np.ndarray, " num_steps"]
+) -> Array:
     """Poses on the straight ways from one start to many ends, at constant speed.
 
     Args:
@@ -87,24 +50,26 @@ def interpolated(
         fractions: Shares of the way.
 
     Returns:
-        ``(num * num_steps, 4, 4)``, the steps of one way one after the other.
+        ``(num, num_steps, 4, 4)``.
     """
     num, steps = len(T_end), len(fractions)
-    R_start, p_start, share = arrays_like(T_end, T_start[:3, :3], T_start[:3, 3], fractions)
-    turn = rotation_vector(R_start.T @ T_end[:, :3, :3])
-    turns = (turn[:, None, :] * share[None, :, None]).reshape(num * steps, 3)
+    R_start, p_start = like(T_start[:3, :3], T_end), like(T_start[:3, 3], T_end)
+    share = like(fractions, T_end)
+    whole = rotation_vector(R_start.T @ T_end[:, :3, :3])
+    turns = (whole[:, None, :] * share[None, :, None]).reshape(num * steps, 3)
     p = p_start + share[None, :, None] * (T_end[:, None, :3, 3] - p_start)
-    return pose_of(R_start @ rotation_of(turns), p.reshape(num * steps, 3))
+    T = pose_of(R_start @ rotation_of(turns), p.reshape(num * steps, 3))
+    return T.reshape(num, steps, 4, 4)
 
 
-def pose_of(R: Any, p: Any) -> Any:
+def pose_of(R: Array, p: Array) -> Array:
     """Poses ``(num, 4, 4)`` of rotations and positions."""
-    (last,) = arrays_like(R, np.broadcast_to([[0.0, 0.0, 0.0, 1.0]], (len(R), 1, 4)))
-    library = _of(R)
-    return library.concatenate([library.concatenate([R, p[:, :, None]], 2), last], 1)
+    xp = namespace(R)
+    last = xp.broadcast_to(like([[0.0, 0.0, 0.0, 1.0]], R), (len(R), 1, 4))
+    return xp.concatenate([xp.concatenate([R, p[:, :, None]], 2), last], 1)
 
 
-def moved(T: Any, step: Any) -> Any:
+def moved(T: Array, step: Array) -> Array:
     """Poses after steps of the position in the base frame and the rotation in the tool's.
 
     Args:

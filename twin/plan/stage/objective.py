@@ -12,20 +12,15 @@ Every penalty is the square of a residual, which is what Gauss-Newton needs.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from twin.plan.constrain.arrays import Array, like, namespace
+from twin.plan.constrain.constraint import Constraint, flattened, worst_along
 from twin.plan.problem import State
-from twin.plan.stage.motion import (
-    arrays_like,
-    concatenated,
-    interpolated,
-    positive_part,
-    rotation_vector,
-    worst,
-)
+from twin.plan.stage.motion import interpolated, rotation_vector
 
 Penalty = Literal["squared", "huber"]
 """phi of a violation in units of its scale: its square, or 2 x - 1 beyond one unit."""
@@ -37,29 +32,15 @@ ANGLE_RAD = float(np.deg2rad(10.0))
 NUM_VARIABLES = 7
 
 
-class Measurable(Protocol):
-    """A constraint as ``twin.plan.constrain`` compiles it."""
-
-    @property
-    def kind(self) -> str:
-        """Which kind of constraint it is."""
-
-    @property
-    def scale(self) -> float:
-        """What counts as one: 1 cm or 10 degrees."""
-
-    def parts(self, state: State) -> Any:
-        """Each of its terms, ``(num_states, num_parts)``: above 0 violated [m or rad]."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Term:
     """One constraint in the sum."""
 
     name: str
-    violation: Callable[[State], Any]
-    """f: ``(num_states,)``, or a column for each of its parts ``(num_states, num_parts)``, in
-    metres or radians; satisfied where none is above zero."""
+    violation: Callable[[State], Array]
+    """f of states at the end, or of ways where the term is about one: ``(num_states,)``, or a
+    column for each of its parts ``(num_states, num_parts)``, in metres or radians; satisfied where
+    none is above zero."""
     scale: float = LENGTH_M
     """What counts as one."""
     weight: float = 1.0
@@ -77,11 +58,11 @@ class Term:
             raise ValueError(message)
 
     @staticmethod
-    def of(constraint: Measurable, *, weight: float = 1.0, penalty: Penalty = "squared") -> "Term":
-        """Weigh a compiled constraint.
+    def of(constraint: Constraint, *, weight: float = 1.0, penalty: Penalty = "squared") -> "Term":
+        """Weigh a compiled constraint that must hold where the stage ends.
 
         Args:
-            constraint: With its scale.
+            constraint: With its scale; each of its parts counts.
             weight: w.
             penalty: phi.
         """
@@ -93,21 +74,59 @@ class Term:
             penalty=penalty,
         )
 
+    @staticmethod
+    def along(
+        constraint: Constraint, *, weight: float = 1.0, penalty: Penalty = "squared"
+    ) -> "Term":
+        """Weigh a compiled constraint that must hold all the way.
+
+        Args:
+            constraint: With its scale; its worst violation counts.
+            weight: w.
+            penalty: phi.
+        """
+        return Term(
+            name=f"{constraint.kind} on the way",
+            violation=lambda states: worst_along(constraint, states),
+            scale=constraint.scale,
+            weight=weight,
+            penalty=penalty,
+        )
+
+
+def worst_of(violation: Callable[[State], Array]) -> Callable[[State], Array]:
+    """Make a function of states one of ways: the worst of each way.
+
+    Args:
+        violation: Of ``(num_states, ...)``.
+
+    Returns:
+        Of ``(num_states, num_steps, ...)``.
+    """
+
+    def found(states: State) -> Array:
+        num_states, num_steps = states.T_base_tcp.shape[:2]
+        values = violation(flattened(states))
+        rows = values.reshape(num_states, num_steps, *values.shape[1:])
+        return namespace(rows).amax(rows, 1)
+
+    return found
+
 
 @dataclass(frozen=True, kw_only=True)
 class Zeta:
     """Decision variables of many states at once, NumPy or torch."""
 
-    T_base_tcp: Any
+    T_base_tcp: Array
     """``(num_states, 4, 4)``."""
-    width_m: Any
+    width_m: Array
     """``(num_states,)``."""
 
     def __len__(self) -> int:
         """How many states."""
         return len(self.T_base_tcp)
 
-    def __getitem__(self, rows: Any) -> "Zeta":
+    def __getitem__(self, rows: Array) -> "Zeta":
         """Some of the states."""
         return Zeta(T_base_tcp=self.T_base_tcp[rows], width_m=self.width_m[rows])
 
@@ -156,15 +175,15 @@ class StageProblem:
         """Those at the end, then those along the way."""
         return (*self.subgoal, *self.path)
 
-    def violations(self, zeta: Zeta) -> list[Any]:
+    def violations(self, zeta: Zeta) -> list[Array]:
         """Evaluate f of every term, ``(num_states, num_parts)`` each; on the way the worst one."""
         found = [_columns(term.violation(self._end(zeta))) for term in self.subgoal]
         if self.path:
-            way, num = self._way(zeta), len(zeta)
-            found += [worst(_columns(term.violation(way)), num) for term in self.path]
+            way = self._way(zeta)
+            found += [_columns(term.violation(way)) for term in self.path]
         return found
 
-    def residuals(self, zeta: Zeta, violations: Sequence[Any]) -> Any:
+    def residuals(self, zeta: Zeta, violations: Sequence[Array]) -> Array:
         """Return numbers whose squares add up to J, ``(num_states, num_parts + 7)``.
 
         Args:
@@ -176,59 +195,59 @@ class StageProblem:
             for term, found in zip(self.terms, violations, strict=True)
         ]
         share = float(np.sqrt(self.lambda_reg))
-        return concatenated([*columns, self._deviation(zeta) * share])
+        columns.append(self._deviation(zeta) * share)
+        return namespace(columns[0]).concatenate(columns, 1)
 
     def cost(self, zeta: Zeta) -> Float[np.ndarray, " num_states"]:
         """Evaluate J of NumPy states."""
         residuals = self.residuals(zeta, self.violations(zeta))
         return np.asarray(np.square(residuals).sum(axis=1))
 
-    def _deviation(self, zeta: Zeta) -> Any:
+    def _deviation(self, zeta: Zeta) -> Array:
         """Way from the nominal pose and width, in units."""
-        T, width, nominal = zeta.T_base_tcp, zeta.width_m, self.nominal_T_base_tcp
-        R_nominal, p_nominal = arrays_like(T, nominal[:3, :3].T, nominal[:3, 3])
-        return concatenated(
+        T, width = zeta.T_base_tcp, zeta.width_m
+        R_nominal = like(self.nominal_T_base_tcp[:3, :3], T)
+        return namespace(T).concatenate(
             [
-                (T[:, :3, 3] - p_nominal) / LENGTH_M,
-                rotation_vector(R_nominal @ T[:, :3, :3]) / ANGLE_RAD,
+                (T[:, :3, 3] - like(self.nominal_T_base_tcp[:3, 3], T)) / LENGTH_M,
+                rotation_vector(R_nominal.T @ T[:, :3, :3]) / ANGLE_RAD,
                 (width[:, None] - self.nominal_width_m) / LENGTH_M,
-            ]
+            ],
+            1,
         )
 
     def _end(self, zeta: Zeta) -> State:
         return self._state(zeta.T_base_tcp, zeta.width_m)
 
     def _way(self, zeta: Zeta) -> State:
-        """States along the way, those of one zeta one after the other."""
+        """States along the ways, ``(num_states, num_steps, ...)``."""
         start = self.nominal_T_base_tcp if self.start_T_base_tcp is None else self.start_T_base_tcp
         num = self.num_path_steps
-        fractions = np.arange(1, num + 1) / num
-        T = interpolated(start, zeta.T_base_tcp, fractions)
-        (width,) = arrays_like(T, np.full(len(T), self.start_width_m))
-        return self._state(T, width)
+        T = interpolated(start, zeta.T_base_tcp, np.arange(1, num + 1) / num)
+        return self._state(T, like(np.full(T.shape[:2], self.start_width_m), T))
 
-    def _state(self, T_base_tcp: Any, width_m: Any) -> State:
-        poses: dict[str, Any] = {}
-        for name, T in self.Ts_base_object.items():
-            (fixed,) = arrays_like(T_base_tcp, np.broadcast_to(T, (len(T_base_tcp), 4, 4)))
-            poses[name] = fixed
-        for name, T in self.Ts_tcp_object.items():
-            (held,) = arrays_like(T_base_tcp, T)
-            poses[name] = T_base_tcp @ held
+    def _state(self, T_base_tcp: Array, width_m: Array) -> State:
+        xp = namespace(T_base_tcp)
+        poses = {
+            name: xp.broadcast_to(like(T, T_base_tcp), T_base_tcp.shape)
+            for name, T in self.Ts_base_object.items()
+        }
+        poses |= {name: T_base_tcp @ like(T, T_base_tcp) for name, T in self.Ts_tcp_object.items()}
         return State(Ts_base_object=poses, T_base_tcp=T_base_tcp, width_m=width_m)
 
 
-def _columns(values: Any) -> Any:
+def _columns(values: Array) -> Array:
     """One column for each part."""
     return values[:, None] if len(values.shape) == 1 else values
 
 
-def _residual(term: Term, violation: Any, margin: float) -> Any:
+def _residual(term: Term, violation: Array, margin: float) -> Array:
     """Square root of w phi, smooth above zero."""
-    x = positive_part(violation / term.scale + margin)
+    xp = namespace(violation)
+    x = xp.clip(violation / term.scale + margin, 0.0, None)
     if term.penalty == "huber":
-        beyond = positive_part(x - 1.0)
-        # 2 x - 1 = (1 + beyond)^2 - beyond^2 beyond one unit, x^2 below.
+        beyond = xp.clip(x - 1.0, 0.0, None)
+        # Up to one unit x, whose square is phi; beyond it the root of 2 x - 1.
         x = (x - beyond) * (1.0 + 2.0 * beyond) ** 0.5
     return x * float(np.sqrt(term.weight))
 

@@ -221,7 +221,7 @@ class _Descent:
         self._T, self._width = zeta.T_base_tcp.copy(), zeta.width_m.copy()
         self._violations, self._r, self._J = backend.linearise(problem, zeta)
         self._damping = np.full(num, config.damping)
-        self._drawn: Bool[np.ndarray, " num_starts"] = (self._violations <= 0).all(axis=1)
+        self._drawn: Bool[np.ndarray, " num_starts"] = np.all(self._violations <= 0, axis=1)
         self._open: Bool[np.ndarray, " num_starts"] = np.isfinite(self._r).all(axis=1)
         self._num_states = num * (NUM_VARIABLES + 1)
         self._seen = _Seen()
@@ -302,13 +302,13 @@ class _Descent:
                 violations=dict(zip(names, violations[index].tolist(), strict=True)),
             )
 
-        feasible = (violations <= 0).all(axis=1)
+        feasible = np.all(violations <= 0, axis=1)
         chosen = distinct(zeta.T_base_tcp, order[feasible[order]], self._config)
         return StageSolution(
             candidates=tuple(candidate(index) for index in chosen),
             nearest=candidate(int(order[0])),
             costs=np.square(self._r).sum(axis=1),
-            feasible=(self._violations <= 0).all(axis=1),
+            feasible=np.all(self._violations <= 0, axis=1),
             work={"iterations": self.iterations, "states": self._num_states},
         )
 

@@ -1,0 +1,381 @@
+"""Final states of a carried object: solved for, perturbed, checked, ranked.
+
+Around each way the object may come to rest the stage problem (Eq. 7) is solved: inside of the area
+with a margin for how sure its place is, level, at a small height, the object and the open hand
+clear of everything around. The cheapest answers are the nominal end-effector poses of Eq. 8 and 9,
+around which poses are drawn. All feasible ones are ranked by J; its regulariser is the deviation
+from the resting pose, which is the paper's heuristic of stability.
+
+A pair that the stage allows to touch does not count for the clearance and may come to 0; all
+others keep eps_col.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import refuse_outside
+from bridge.geometry import se3
+from twin.plan.constrain.arrays import Array
+from twin.plan.constrain.constraint import Constraint
+from twin.plan.constrain.kinds import surface_points
+from twin.plan.problem import Grasp, Problem, Release, State
+from twin.plan.release.obstacles import (
+    allowed_with,
+    hand_points,
+    obstacles_of,
+)
+from twin.plan.release.resting import (
+    NoFinalStateError,
+    Target,
+    resting_poses,
+    sideways_sigma_m,
+    target_of,
+)
+from twin.plan.release.sampling import perturbed, sampling_record
+from twin.plan.stage.objective import ANGLE_RAD, StageProblem, Term, Zeta
+from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
+from twin.robot.collision import hulls_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseConfig:
+    """How final states are looked for."""
+
+    tau_p_m: float = 0.02
+    """Bound of the shifts of Eq. 8, along each axis."""
+    tau_r_rad: float = ANGLE_RAD
+    """Bound of the turns of Eq. 9."""
+    num_samples: int = 2048
+    """Poses drawn, over all nominal ones."""
+    num_nominal: int = 4
+    """Nominal poses that are perturbed."""
+    num_starts: int = 16
+    """Starts of the stage optimisation for each way to rest."""
+    num_ways: int = 4
+    """Ways to rest that are tried, those nearest to how the object lies now first."""
+    num_hand_points: int = 200
+    """Of the open hand's surface."""
+    eps_col_m: float = 0.002
+    """Least distance between what may not touch, the paper's epsilon_col."""
+    drop_m: float = 0.004
+    """Wanted between the underside and what the object will lie on."""
+    max_drop_m: float = 0.03
+    """Most of it, over a rim that the object may have to stay above."""
+    max_tilt_rad: float = float(np.deg2rad(12.0))
+    """Most that the object may lean from how it will rest."""
+    max_tool_tilt_rad: float = float(np.deg2rad(60.0))
+    """Most that the tool may lean from straight down where the object is let go."""
+    sigmas: float = 2.0
+    """Standard deviations of localisation that the object stays away from the edge of the area."""
+    open_more_m: float = 0.01
+    """The hand opens at least this much wider than it held."""
+    max_releases: int = 16
+    """Most final states."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are none."""
+        refuse_outside(
+            self,
+            {
+                "tau_p_m": (0, 1),
+                "tau_r_rad": (0, np.pi),
+                "num_samples": (0, 1_000_000),
+                "num_nominal": (1, 64),
+                "num_starts": (1, 4096),
+                "num_ways": (1, 96),
+                "num_hand_points": (8, 10_000),
+                "eps_col_m": (0, 1),
+                "drop_m": (0, 1),
+                "max_drop_m": (0, 1),
+                "max_tilt_rad": (0, np.pi),
+                "max_tool_tilt_rad": (0, np.pi),
+                "sigmas": (0, 10),
+                "open_more_m": (0, 0.1),
+                "max_releases": (1, 4096),
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinalStates:
+    """Where an object may be let go."""
+
+    releases: tuple[Release, ...]
+    """Distinct, the cheapest first."""
+    log: dict[str, Any] = field(default_factory=dict)
+    """How they were found: bounds, distributions, counts, what distances were asked."""
+
+
+def final_states(
+    problem: Problem,
+    grasp: Grasp,
+    *,
+    constraints: Sequence[Constraint] = (),
+    near: Sequence[Float[np.ndarray, "4 4"]] | None = None,
+    allowed_contacts: Sequence[tuple[str, str]] | None = None,
+    config: ReleaseConfig | None = None,
+    seed: int = 0,
+) -> FinalStates:
+    """Find where a held object may be let go.
+
+    Args:
+        problem: The scene.
+        grasp: How the hand holds the object, and how wide.
+        constraints: What must hold there besides (Eq. 7).
+        near: Poses ``T_base_object`` to look around instead of what the success predicates ask
+            for; ``constraints`` then say what is wanted.
+        allowed_contacts: Pairs that may touch; None: those of the stage that releases the object.
+        config: The defaults when None.
+        seed: The same seed gives the same answer.
+
+    Raises:
+        NoFinalStateError: With its cause, and what is in the way.
+    """
+    config = ReleaseConfig() if config is None else config
+    search = _Search(problem, grasp, constraints, allowed_contacts, config)
+    target = target_of(problem, grasp.object_id) if near is None else None
+    if target is not None:
+        search.check_size(target)
+        ways = resting_poses(
+            problem,
+            grasp,
+            target,
+            drop_m=config.drop_m,
+            most_tilted_rad=config.max_tool_tilt_rad,
+        )[: config.num_ways]
+    else:
+        ways = list(near or ())
+    stages = [search.stage(T, target) for T in ways]
+    rng = np.random.default_rng(seed)
+    return search.answer(stages, seed, rng)
+
+
+class _Search:
+    """What all ways to rest have in common."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        grasp: Grasp,
+        constraints: Sequence[Constraint],
+        allowed_contacts: Sequence[tuple[str, str]] | None,
+        config: ReleaseConfig,
+    ) -> None:
+        self._problem, self._grasp, self._config = problem, grasp, config
+        self._constraints = constraints
+        hulls = hulls_of(problem.robot)
+        gripper = problem.robot.record.gripper
+        self._max_width_m = gripper.max_width_m
+        self._width_m = min(
+            max(grasp.open_m, grasp.width_m + config.open_more_m), gripper.max_width_m
+        )
+        self._points_m = surface_points(problem, grasp.object_id)
+        self._hand_m = hand_points(hulls, self._width_m, config.num_hand_points)
+        self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
+        pairs = _release_contacts(problem, grasp.object_id, allowed_contacts)
+        names = self._obstacles.names
+        self._allowed = allowed_with(grasp.object_id, pairs, names)
+        self._hand_allowed = allowed_with(gripper.name, pairs, names)
+        self._T_tcp_object = se3.invert(grasp.T_object_tcp)
+        self._sigma_m = sideways_sigma_m(problem, grasp.object_id)
+
+    def check_size(self, target: Target) -> None:
+        """Refuse what is too large for the area in every direction."""
+        if target.relation != "inside":
+            return
+        extents = np.sort(np.ptp(self._points_m, axis=0))
+        room = np.sort(2 * np.array(target.half_m))
+        if extents[0] > room[0] or extents[1] > room[1]:
+            message = (
+                f"{self._grasp.object_id} ({extents[0] * 1e3:.0f} x {extents[1] * 1e3:.0f} mm at "
+                f"its narrowest) does not fit into {target.name} "
+                f"({room[0] * 1e3:.0f} x {room[1] * 1e3:.0f} mm inside)."
+            )
+            raise NoFinalStateError(cause="container_too_small", message=message)
+
+    def stage(self, T_rest: Float[np.ndarray, "4 4"], target: Target | None) -> StageProblem:
+        """Write one way to rest as a stage problem."""
+        name, scene = self._grasp.object_id, self._problem.scene
+        terms = [
+            Term(name=f"{name} clear of what is around", violation=self._object_too_near),
+            Term(name="the open hand clear of what is around", violation=self._hand_too_near),
+            Term(name="the hand opens", violation=self._still_closed),
+        ]
+        if target is not None:
+            terms += self._placed(T_rest, target)
+        terms += [Term.of(constraint) for constraint in self._constraints]
+        return StageProblem(
+            nominal_T_base_tcp=T_rest @ self._grasp.T_object_tcp,
+            nominal_width_m=self._width_m,
+            subgoal=tuple(terms),
+            Ts_base_object={key: T for key, T in scene.Ts_base_object.items() if key != name},
+            Ts_tcp_object={name: self._T_tcp_object},
+            max_width_m=self._max_width_m,
+        )
+
+    def _object_too_near(self, state: State) -> Array:
+        T = state.Ts_base_object[self._grasp.object_id]
+        return self._too_near(self._obstacles.distances(self._points_m, T), self._allowed)
+
+    def _hand_too_near(self, state: State) -> Array:
+        found = self._obstacles.distances(self._hand_m, state.T_base_tcp)
+        return self._too_near(found, self._hand_allowed)
+
+    def _too_near(self, distances: Array, allowed: Array) -> Array:
+        return (self._config.eps_col_m * (1.0 - allowed) - distances).max(axis=1)
+
+    def _still_closed(self, state: State) -> Array:
+        return self._grasp.width_m + self._config.open_more_m / 2 - state.width_m
+
+    def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[Term]:
+        """Inside of the area, at a small height, level."""
+        config, name = self._config, self._grasp.object_id
+        margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
+        whole = target.relation == "inside"
+        half = np.array(target.half_m)
+        room = half - margin - (np.ptp(self._points_m @ T_rest[:3, :3].T, axis=0)[:2] / 2) * whole
+        if target.relation == "at":
+            half, margin = half + config.tau_p_m, 0.0
+        elif (room < 0).any():
+            margin = max(0.0, margin + float(room.min()))  # as much as there is
+        up = T_rest[:3, :3].T[:, 2]
+        points = self._points_m if whole else self._points_m.mean(axis=0, keepdims=True)
+
+        def beyond(state: State) -> Array:
+            T = state.Ts_base_object[name]
+            away = points @ np.swapaxes(T[:, :2, :3], 1, 2) + (T[:, None, :2, 3])
+            local = (away - target.T_base[:2, 3]) @ target.T_base[:2, :2]
+            return (np.abs(local) - half + margin).max(axis=(1, 2))
+
+        def off_height(state: State) -> Array:
+            T = state.Ts_base_object[name]
+            over = (T[:, 2, :3] @ self._points_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
+            return np.maximum(over - config.max_drop_m - target.rim_m, config.drop_m / 2 - over)
+
+        def leaning(state: State) -> Array:
+            z = state.Ts_base_object[name][:, :3, :3] @ up
+            return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2]) - config.max_tilt_rad
+
+        return [
+            Term(name=f"{name} within {target.name}", violation=beyond),
+            Term(name=f"{name} a little above {target.name}", violation=off_height),
+            Term(name=f"{name} level", violation=leaning, scale=ANGLE_RAD),
+        ]
+
+    def answer(
+        self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
+    ) -> FinalStates:
+        """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
+        config = self._config
+        settings = SolveConfig(num_starts=config.num_starts, max_candidates=config.max_releases)
+        solved: list[tuple[StageProblem, StageCandidate]] = []
+        nearest: list[StageCandidate] = []
+        states = 0
+        for stage in stages:
+            solution = solve(stage, settings, seed=seed)
+            solved += [(stage, candidate) for candidate in solution.candidates]
+            nearest.append(solution.nearest)
+            states += solution.work["states"]
+        if not solved:
+            raise self._nothing(min(nearest, key=lambda candidate: candidate.cost))
+        solved.sort(key=lambda pair: pair[1].cost)
+        Ts = [candidate.T_base_tcp[None] for _, candidate in solved]
+        costs = [np.array([candidate.cost]) for _, candidate in solved]
+        shares = []
+        for stage, candidate in solved[: config.num_nominal]:
+            count = config.num_samples // min(config.num_nominal, len(solved))
+            drawn, cost = self._perturbed(stage, candidate, count, rng)
+            Ts.append(drawn)
+            costs.append(cost)
+            shares.append(len(drawn) / count if count else 1.0)
+        log = sampling_record(config.tau_p_m, config.tau_r_rad, seed) | {
+            "num_nominal": min(config.num_nominal, len(solved)),
+            "num_samples": config.num_samples,
+            "share_feasible": [round(share, 4) for share in shares],
+            "stage_states": states,
+            "eps_col_m": config.eps_col_m,
+            "allowed_to_touch": self._allowed_names(),
+            "checked_against": list(self._obstacles.describe()),
+        }
+        return FinalStates(
+            releases=self._releases(np.concatenate(Ts), np.concatenate(costs)), log=log
+        )
+
+    def _perturbed(
+        self, stage: StageProblem, nominal: StageCandidate, count: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "num 4 4"], Float[np.ndarray, " num"]]:
+        """Draw poses around one and keep those that satisfy everything, with their J."""
+        config = self._config
+        T = perturbed(
+            nominal.T_base_tcp,
+            tau_p_m=config.tau_p_m,
+            tau_r_rad=config.tau_r_rad,
+            count=count,
+            rng=rng,
+        )
+        zeta = Zeta(T_base_tcp=T, width_m=np.full(count, nominal.width_m))
+        free = np.ones(count, dtype=np.bool_)
+        violations = stage.violations(zeta)
+        for parts in violations:
+            free &= np.all(parts <= 0, axis=1)
+        J = np.square(stage.residuals(zeta, violations)).sum(axis=1)
+        return T[free], J[free]
+
+    def _releases(
+        self, Ts: Float[np.ndarray, "num 4 4"], costs: Float[np.ndarray, " num"]
+    ) -> tuple[Release, ...]:
+        order = np.argsort(costs, kind="stable")
+        chosen = distinct(Ts, order, SolveConfig(max_candidates=self._config.max_releases))
+        Ts_object = Ts[chosen] @ self._T_tcp_object
+        distances = self._obstacles.distances(self._points_m, Ts_object)
+        counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
+        about = (*self._obstacles.describe(), *(f"{n}: may be touched" for n in self._may_touch()))
+        return tuple(
+            Release(
+                object_id=self._grasp.object_id,
+                T_base_object=T_object,
+                T_base_tcp=Ts[index],
+                clearance_m=float(clearance),
+                cost=float(costs[index]),
+                checked_against=about,
+            )
+            for index, T_object, clearance in zip(chosen, Ts_object, counted, strict=True)
+        )
+
+    def _may_touch(self) -> list[str]:
+        flags = zip(self._obstacles.names, self._allowed, strict=True)
+        return [name for name, allowed in flags if allowed]
+
+    def _allowed_names(self) -> list[list[str]]:
+        gripper = self._problem.robot.record.gripper.name
+        touched = zip(self._obstacles.names, self._hand_allowed, strict=True)
+        return [
+            *([self._grasp.object_id, name] for name in self._may_touch()),
+            *([gripper, name] for name, allowed in touched if allowed),
+        ]
+
+    def _nothing(self, nearest: StageCandidate) -> NoFinalStateError:
+        """Say what was in the way where the least was."""
+        wrong = {name: f for name, f in nearest.violations.items() if f > 0}
+        told = "; ".join(f"{name}: by {f * 1e3:.1f} mm" for name, f in wrong.items())
+        return NoFinalStateError(
+            cause="no_free_pose",
+            message=f"no final state of {self._grasp.object_id} was found. In the best one this "
+            f"does not hold: {told or 'nothing stands out'}.",
+        )
+
+
+def _release_contacts(
+    problem: Problem, object_id: str, given: Sequence[tuple[str, str]] | None
+) -> list[tuple[str, str]]:
+    """Pairs that may touch where an object is let go: those of its release stage."""
+    if given is not None:
+        return list(given)
+    for stage in problem.scene.task.stages:
+        if stage.get("release") == object_id:
+            return [(a, b) for a, b in stage.get("allowed_contacts", ())]
+    return []

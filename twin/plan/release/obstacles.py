@@ -1,0 +1,222 @@
+"""What a carried object and the hand must stay away from, measured for many poses at once.
+
+Near receptacles their panels and the grids of objects decide, which are right to a millimetre or
+two. The static grid of a rebuilt scene has voxels of about 10 mm: it is made thicker by its own
+error, half the diagonal of a voxel, and what has a name is taken out of it first.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from bridge.geometry import se3
+from twin.plan.problem import Problem
+from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
+from twin.replay.clearance.distance_grid import (
+    GridLookup,
+    candidate_box_clearance,
+    candidate_clearance,
+)
+from twin.replay.clearance.static_obstacles import (
+    PanelBox,
+    stationary_links,
+    unmodelled_obstacles,
+)
+from twin.robot.collision import RobotHulls
+
+TABLE_SIDE_M = 20.0
+"""The table is a box of this size below its top."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """One body that stands still: boxes, or a grid of distances."""
+
+    name: str
+    error_m: float
+    """How far its surface may be off: distances are smaller by this."""
+    source: str
+    """What its distances are made of, in words."""
+    boxes: tuple[PanelBox, ...] = ()
+    grid: GridLookup | None = None
+    T_grid_base: Float[np.ndarray, "4 4"] | None = None
+    """None: the grid is in the base frame."""
+
+    def describe(self) -> str:
+        """Name it with its source and its error."""
+        return f"{self.name}: {self.source}, made thicker by {self.error_m * 1e3:.1f} mm"
+
+
+class Obstacles:
+    """All bodies around, asked together."""
+
+    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+        """Lay their boxes out in one list.
+
+        Args:
+            obstacles: Any number; a name may come more than once.
+        """
+        self.all = tuple(obstacles)
+        self.names = tuple(obstacle.name for obstacle in self.all)
+        self._boxes = [box for obstacle in self.all for box in obstacle.boxes]
+        self._first = np.cumsum([0, *(len(obstacle.boxes) for obstacle in self.all)])
+
+    def describe(self) -> tuple[str, ...]:
+        """Say of each what its distances are made of, with its error."""
+        return tuple(obstacle.describe() for obstacle in self.all)
+
+    def distances(
+        self,
+        points_m: Float[np.ndarray, "num_points 3"],
+        Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
+    ) -> Float[np.ndarray, "num_poses num_obstacles"]:
+        """Least signed distance of a body's points to each obstacle, its error taken off [m].
+
+        Args:
+            points_m: Of the body's surface, in its own frame.
+            Ts_base_body: The poses that are proposed.
+        """
+        found = np.empty((len(Ts_base_body), len(self.all)))
+        to_boxes = candidate_box_clearance(self._boxes, points_m, Ts_base_body)
+        for index, obstacle in enumerate(self.all):
+            if obstacle.grid is None:
+                first, last = self._first[index : index + 2]
+                found[:, index] = to_boxes[:, first:last].min(axis=1)
+            else:
+                T = obstacle.T_grid_base
+                Ts = Ts_base_body if T is None else T @ Ts_base_body
+                found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts)
+            found[:, index] -= obstacle.error_m
+        return found
+
+
+def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) -> Obstacles:
+    """Collect what stands still around carried objects.
+
+    Args:
+        problem: The scene and the shapes of its objects.
+        hulls: The robot, whose foot is taken out of the static grid.
+        carried: Objects that move with the hand.
+    """
+    scene = problem.scene
+    found = [_table(scene.table_height_m)]
+    panels: list[PanelBox] = []
+    still = scene.containers()
+    for name, T in scene.Ts_base_object.items():
+        if name in carried:
+            continue
+        boxes = tuple(placed_panels(problem.model(name), T))
+        if name in still:
+            panels += boxes
+        found.append(_object(problem, name, T, boxes, exact=name in still))
+    if scene.static_sdf is not None:
+        foot = stationary_links(hulls)[1]
+        grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
+        if grid is not None:
+            found.append(
+                Obstacle(
+                    name=SCENE,
+                    error_m=float(np.sqrt(3) / 2 * grid.voxel_m),
+                    source=f"static grid of {grid.voxel_m * 1e3:.1f} mm voxels",
+                    grid=GridLookup(grid),
+                )
+            )
+    return Obstacles(found)
+
+
+def _table(height_m: float) -> Obstacle:
+    T = np.eye(4)
+    T[2, 3] = height_m - TABLE_SIDE_M / 2
+    boxes = ((T, np.full(3, TABLE_SIDE_M)),)
+    return Obstacle(name=TABLE, error_m=0.0, source="its plane", boxes=boxes)
+
+
+def _object(
+    problem: Problem,
+    name: str,
+    T_base_object: Float[np.ndarray, "4 4"],
+    boxes: tuple[PanelBox, ...],
+    *,
+    exact: bool,
+) -> Obstacle:
+    """An object by its own grid, where a scan made one; containers and others by their boxes."""
+    shape = problem.shapes[name]
+    if exact or shape.sdf is None:
+        what = "panels" if exact else "its box"
+        return Obstacle(
+            name=name, error_m=0.0, source=f"{what} of the task file's size", boxes=boxes
+        )
+    error_m = max(shape.error_m, shape.sdf.voxel_m / 2)
+    return Obstacle(
+        name=name,
+        error_m=error_m,
+        source=f"grid of {shape.sdf.voxel_m * 1e3:.1f} mm voxels of its scan",
+        grid=GridLookup(shape.sdf),
+        T_grid_base=se3.invert(T_base_object),
+    )
+
+
+def allowed_with(
+    body: str, allowed_contacts: Sequence[tuple[str, str]], names: Sequence[str]
+) -> Float[np.ndarray, " num_obstacles"]:
+    """Whether a stage allows a body to touch each obstacle, as 1 or 0.
+
+    Args:
+        body: The carried object, or the gripper.
+        allowed_contacts: Pairs of the stage.
+        names: Of the obstacles.
+    """
+    pairs = {frozenset(pair) for pair in allowed_contacts}
+    return np.array([frozenset((body, name)) in pairs for name in names], dtype=np.float64)
+
+
+def hand_points(
+    hulls: RobotHulls, width_m: float, num_points: int
+) -> Float[np.ndarray, "num_points 3"]:
+    """Points of the hand's hulls in the tool's frame, with this width between the pads [m].
+
+    Args:
+        hulls: The robot; the function moves them.
+        width_m: Between the finger pads.
+        num_points: At most; spread as evenly as corners and edges allow.
+    """
+    robot = hulls.robot
+    hulls.place(robot.home_rad, width_m)
+    T_tcp_base = se3.invert(robot.T_base_link(robot.record.tool_frame, robot.home_rad, width_m))
+    hulls.place(robot.home_rad, width_m)
+    found = []
+    for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True):
+        if hull.link in robot.record.gripper.links:
+            found.append(se3.apply(T_tcp_base, _dense(hull.points_m) @ R.T + t))
+    return spread_points(np.concatenate(found), num_points)
+
+
+def _dense(corners_m: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num_points 3"]:
+    """Corners of a hull and points on its faces."""
+    hull = ConvexHull(corners_m)
+    a, b, c = (corners_m[hull.simplices[:, k]] for k in range(3))
+    shares = [(i / 4, j / 4, (4 - i - j) / 4) for i in range(5) for j in range(5 - i)]
+    return np.concatenate([i * a + j * b + k * c for i, j, k in shares])
+
+
+def spread_points(
+    points_m: Float[np.ndarray, "num 3"], num_points: int
+) -> Float[np.ndarray, "num_points 3"]:
+    """Choose points that are far from each other, each the farthest from those before it.
+
+    Args:
+        points_m: To choose from (Gonzalez 1985: at most twice as far as the best choice).
+        num_points: How many at most.
+    """
+    centre = points_m.mean(axis=0)
+    index = int(np.argmax(np.linalg.norm(points_m - centre, axis=1)))
+    away = np.full(len(points_m), np.inf)
+    chosen: list[int] = []
+    while len(chosen) < num_points and away[index] > 1e-9:
+        chosen.append(index)
+        away = np.minimum(away, np.linalg.norm(points_m - points_m[index], axis=1))
+        index = int(np.argmax(away))
+    return np.ascontiguousarray(points_m[chosen])

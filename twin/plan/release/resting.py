@@ -1,0 +1,203 @@
+"""Where an object would come to rest: the poses that final states are looked for around.
+
+An object keeps the way up it has now, or another one that its symmetry makes the same, and its
+sides are turned along those of what it is put into or onto.
+"""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.task_file import ObjectModel
+from twin.errors import TwinError
+from twin.plan.constrain.kinds import surface_points
+from twin.plan.problem import Grasp, Problem
+
+QUARTER_TURNS = 4
+_SAME_RAD = 0.02
+
+
+class NoFinalStateError(TwinError):
+    """An object can be let go nowhere."""
+
+    def __init__(self, *, cause: str, message: str) -> None:
+        """Remember the cause.
+
+        Args:
+            cause: A short name, which steers what is planned next.
+            message: A sentence.
+        """
+        self.cause = cause
+        super().__init__(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """What an object is put into, onto, or where."""
+
+    relation: str
+    """inside, on, or at: a mark on the table."""
+    name: str
+    """Of the container or the support; the table."""
+    T_base: Float[np.ndarray, "4 4"]
+    """Upright frame in the middle of the area, at the height on which the object comes to lie."""
+    half_m: tuple[float, float]
+    """Half the extents of the area, along its axes."""
+    rim_m: float
+    """Height of the walls around it over that height."""
+    sigma_m: float
+    """Standard deviation of where it is, sideways."""
+
+
+def target_of(problem: Problem, object_id: str) -> Target:
+    """Find where the success predicates want an object.
+
+    Args:
+        problem: With the task and where its objects are.
+        object_id: One of its objects.
+
+    Raises:
+        NoFinalStateError: Nothing says it, or what it is put into was not localised.
+    """
+    scene = problem.scene
+    goal = scene.task.goal_of(object_id)
+    if goal is None and (mark := scene.task.mark_of(object_id)) is not None:
+        T = np.eye(4)
+        T[:3, 3] = (*mark, scene.table_height_m)
+        return Target(
+            relation="at", name="table", T_base=T, half_m=(0.0, 0.0), rim_m=0.0, sigma_m=0.0
+        )
+    if goal is None:
+        message = (
+            f"no success predicate of task {scene.task.name} says what {object_id} is to be "
+            "inside or on: give the final state's constraints and where to begin."
+        )
+        raise NoFinalStateError(cause="nowhere_said", message=message)
+    relation, name = goal
+    T_found = scene.Ts_base_object.get(name)
+    if T_found is None:
+        message = f"{name} was not localised: nobody knows where {object_id} is to be put."
+        raise NoFinalStateError(cause="not_localised", message=message)
+    model = problem.model(name)
+    inside = relation == "inside"
+    x, y, _ = model.inner_m if inside else model.size_m
+    top = model.size_m[2] / 2 if model.origin_at_centre else model.size_m[2]
+    height = model.wall_m if inside else top
+    return Target(
+        relation=relation,
+        name=name,
+        T_base=upright_frame(T_found, T_found[:3, 3] + T_found[:3, 2] * height),
+        half_m=(x / 2, y / 2),
+        rim_m=model.size_m[2] - model.wall_m if inside else 0.0,
+        sigma_m=sideways_sigma_m(problem, name),
+    )
+
+
+def sideways_sigma_m(problem: Problem, name: str) -> float:
+    """Standard deviation of an object's position in its worst horizontal direction [m]."""
+    covariance = problem.scene.covariances.get(name)
+    if covariance is None:
+        return 0.0
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance)[:2, :2])[-1], 0.0)))
+
+
+def upright_frame(
+    T: Float[np.ndarray, "4 4"], p_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Frame at a point with z up and x along the heading of a pose.
+
+    Args:
+        T: Whose x axis, seen from above, is followed.
+        p_m: Origin.
+    """
+    yaw = np.arctan2(T[1, 0], T[0, 0])
+    frame = np.eye(4)
+    frame[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    frame[:3, 3] = p_m
+    return frame
+
+
+def orientations(
+    model: ObjectModel, R_now: Float[np.ndarray, "3 3"], R_target: Float[np.ndarray, "3 3"]
+) -> list[Float[np.ndarray, "3 3"]]:
+    """Rotations in which an object may come to rest, the one nearest to now first.
+
+    Args:
+        model: Its symmetry says which ways up are the same.
+        R_now: How it lies now.
+        R_target: The sides it is turned along.
+    """
+    found: list[Float[np.ndarray, "3 3"]] = []
+    for S in _same(model):
+        R = R_now @ S
+        heading = (
+            np.arctan2(R[1, 0], R[0, 0])
+            if abs(R[2, 0]) < np.sqrt(0.5)
+            else np.arctan2(R[1, 1], R[0, 1])
+        )
+        aim = np.arctan2(R_target[1, 0], R_target[0, 0])
+        for quarter in range(QUARTER_TURNS):
+            about = np.array([0.0, 0.0, aim - heading + quarter * np.pi / 2])
+            turned = se3.rotation_from_vector(about) @ R
+            if all(se3.rotation_angle_rad(other.T @ turned) > _SAME_RAD for other in found):
+                found.append(turned)
+    return sorted(found, key=lambda R: round(float(se3.rotation_angle_rad(R_now.T @ R)), 6))
+
+
+def _same(model: ObjectModel) -> list[Float[np.ndarray, "3 3"]]:
+    """Turns that nobody could tell: of a cube 24, of others none."""
+    if model.symmetry != "cube":
+        return [np.eye(3)]
+    turns = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.zeros((3, 3))
+            R[range(3), order] = signs
+            if np.linalg.det(R) > 0:
+                turns.append(R)
+    return turns
+
+
+def resting_poses(
+    problem: Problem, grasp: Grasp, target: Target, *, drop_m: float, most_tilted_rad: float
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses ``T_base_object`` a little above where the object would lie, in the middle.
+
+    Args:
+        problem: With the object's shape and how it lies.
+        grasp: How the hand holds it.
+        target: Where it is put.
+        drop_m: Between its underside and what it will lie on.
+        most_tilted_rad: Poses in which the tool leans farther from straight down are left out.
+
+    Raises:
+        NoFinalStateError: The object was not localised, or in every pose the tool leans too far.
+    """
+    T_now = problem.scene.Ts_base_object.get(grasp.object_id)
+    if T_now is None:
+        message = f"{grasp.object_id} was not localised: nobody knows which way up it is."
+        raise NoFinalStateError(cause="not_localised", message=message)
+    points = surface_points(problem, grasp.object_id)
+    found = []
+    model = problem.model(grasp.object_id)
+    for R in orientations(model, T_now[:3, :3], target.T_base[:3, :3]):
+        approach = (R @ grasp.T_object_tcp[:3, :3])[:, 2]
+        if np.arctan2(np.hypot(*approach[:2]), -approach[2]) > most_tilted_rad:
+            continue
+        placed = points @ R.T
+        middle = (placed.min(axis=0) + placed.max(axis=0)) / 2
+        T = np.eye(4)
+        T[:3, :3] = R
+        T[:2, 3] = target.T_base[:2, 3] - middle[:2]
+        T[2, 3] = target.T_base[2, 3] + drop_m - placed[:, 2].min()
+        found.append(T)
+    if not found:
+        message = (
+            f"held as it is, {grasp.object_id} can be put down in no way in which the tool points "
+            "downwards: take it by another grasp."
+        )
+        raise NoFinalStateError(cause="tool_direction", message=message)
+    return found
