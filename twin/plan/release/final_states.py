@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from bridge.errors import refuse_outside
 from bridge.geometry import se3
@@ -99,6 +100,15 @@ class ReleaseConfig:
             },
         )
 
+    def solver(self) -> SolveConfig:
+        """How the stage problem of one way to rest is solved: from above, hardly leaning."""
+        return SolveConfig(
+            num_starts=self.num_starts,
+            only_above=True,
+            spread_rad=self.max_tilt_rad,
+            max_candidates=self.max_releases,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class FinalStates:
@@ -136,7 +146,7 @@ def final_states(
         NoFinalStateError: With its cause, and what is in the way.
     """
     config = ReleaseConfig() if config is None else config
-    search = _Search(problem, grasp, constraints, allowed_contacts, config)
+    search = ReleaseSearch(problem, grasp, constraints, allowed_contacts, config)
     target = target_of(problem, grasp.object_id) if near is None else None
     if target is not None:
         search.check_size(target)
@@ -154,7 +164,7 @@ def final_states(
     return search.answer(stages, seed, rng)
 
 
-class _Search:
+class ReleaseSearch:
     """What all ways to rest have in common."""
 
     def __init__(
@@ -165,6 +175,15 @@ class _Search:
         allowed_contacts: Sequence[tuple[str, str]] | None,
         config: ReleaseConfig,
     ) -> None:
+        """Collect obstacles and points.
+
+        Args:
+            problem: The scene.
+            grasp: How the hand holds the object.
+            constraints: What must hold besides.
+            allowed_contacts: Pairs that may touch; None: those of the stage that releases it.
+            config: Settings.
+        """
         self._problem, self._grasp, self._config = problem, grasp, config
         self._constraints = constraints
         hulls = hulls_of(problem.robot)
@@ -174,6 +193,7 @@ class _Search:
             max(grasp.open_m, grasp.width_m + config.open_more_m), gripper.max_width_m
         )
         self._points_m = surface_points(problem, grasp.object_id)
+        self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
         self._hand_m = hand_points(hulls, self._width_m, config.num_hand_points)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
         pairs = _release_contacts(problem, grasp.object_id, allowed_contacts)
@@ -198,7 +218,12 @@ class _Search:
             raise NoFinalStateError(cause="container_too_small", message=message)
 
     def stage(self, T_rest: Float[np.ndarray, "4 4"], target: Target | None) -> StageProblem:
-        """Write one way to rest as a stage problem."""
+        """Write one way to rest as a stage problem.
+
+        Args:
+            T_rest: Pose ``T_base_object`` a little above where it would lie.
+            target: What it is put into or onto; None: the constraints alone say it.
+        """
         name, scene = self._grasp.object_id, self._problem.scene
         terms = [
             Term(name=f"{name} clear of what is around", violation=self._object_too_near),
@@ -219,14 +244,14 @@ class _Search:
 
     def _object_too_near(self, state: State) -> Array:
         T = state.Ts_base_object[self._grasp.object_id]
-        return self._too_near(self._obstacles.distances(self._points_m, T), self._allowed)
+        return -self._obstacles.margins(self._points_m, T, self._keep_m(self._allowed))
 
     def _hand_too_near(self, state: State) -> Array:
-        found = self._obstacles.distances(self._hand_m, state.T_base_tcp)
-        return self._too_near(found, self._hand_allowed)
+        keep_m = self._keep_m(self._hand_allowed)
+        return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m)
 
-    def _too_near(self, distances: Array, allowed: Array) -> Array:
-        return (self._config.eps_col_m * (1.0 - allowed) - distances).max(axis=1)
+    def _keep_m(self, allowed: Array) -> Float[np.ndarray, " num_obstacles"]:
+        return np.asarray(self._config.eps_col_m * (1.0 - allowed))
 
     def _still_closed(self, state: State) -> Array:
         return self._grasp.width_m + self._config.open_more_m / 2 - state.width_m
@@ -243,17 +268,19 @@ class _Search:
         elif (room < 0).any():
             margin = max(0.0, margin + float(room.min()))  # as much as there is
         up = T_rest[:3, :3].T[:, 2]
-        points = self._points_m if whole else self._points_m.mean(axis=0, keepdims=True)
+        outline = self._outline_m if whole else self._outline_m.mean(axis=0, keepdims=True)
+        R_area = target.T_base[:2, :2]
 
         def beyond(state: State) -> Array:
             T = state.Ts_base_object[name]
-            away = points @ np.swapaxes(T[:, :2, :3], 1, 2) + (T[:, None, :2, 3])
-            local = (away - target.T_base[:2, 3]) @ target.T_base[:2, :2]
-            return (np.abs(local) - half + margin).max(axis=(1, 2))
+            axes = (R_area.T @ T[:, :2, :3]).reshape(-1, 3) @ outline.T
+            middle = ((T[:, :2, 3] - target.T_base[:2, 3]) @ R_area).reshape(-1, 1)
+            reach = np.abs(axes + middle).max(axis=1).reshape(-1, 2)
+            return (reach - half + margin).max(axis=1)
 
         def off_height(state: State) -> Array:
             T = state.Ts_base_object[name]
-            over = (T[:, 2, :3] @ self._points_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
+            over = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
             return np.maximum(over - config.max_drop_m - target.rim_m, config.drop_m / 2 - over)
 
         def leaning(state: State) -> Array:
@@ -269,9 +296,18 @@ class _Search:
     def answer(
         self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
     ) -> FinalStates:
-        """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
+        """Solve each way to rest, perturb the best, keep the distinct feasible ones.
+
+        Args:
+            stages: From ``stage``.
+            seed: Of the starts.
+            rng: Of the perturbations.
+
+        Raises:
+            NoFinalStateError: None is feasible.
+        """
         config = self._config
-        settings = SolveConfig(num_starts=config.num_starts, max_candidates=config.max_releases)
+        settings = config.solver()
         solved: list[tuple[StageProblem, StageCandidate]] = []
         nearest: list[StageCandidate] = []
         states = 0

@@ -16,9 +16,10 @@ from bridge.geometry import se3
 from twin.plan.problem import Problem
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.clearance.distance_grid import (
+    Boxes,
     GridLookup,
-    candidate_box_clearance,
     candidate_clearance,
+    lower_by_grid,
 )
 from twin.replay.clearance.static_obstacles import (
     PanelBox,
@@ -45,6 +46,11 @@ class Obstacle:
     T_grid_base: Float[np.ndarray, "4 4"] | None = None
     """None: the grid is in the base frame."""
 
+    def in_grid(self, Ts_base_body: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+        """Poses in the frame of the grid."""
+        T = self.T_grid_base
+        return Ts_base_body if T is None else np.asarray(T @ Ts_base_body)
+
     def describe(self) -> str:
         """Name it with its source and its error."""
         return f"{self.name}: {self.source}, made thicker by {self.error_m * 1e3:.1f} mm"
@@ -61,8 +67,11 @@ class Obstacles:
         """
         self.all = tuple(obstacles)
         self.names = tuple(obstacle.name for obstacle in self.all)
-        self._boxes = [box for obstacle in self.all for box in obstacle.boxes]
-        self._first = np.cumsum([0, *(len(obstacle.boxes) for obstacle in self.all)])
+        self._boxes = Boxes.of([box for obstacle in self.all for box in obstacle.boxes])
+        num_boxes = [len(obstacle.boxes) for obstacle in self.all]
+        self._first = np.cumsum([0, *num_boxes])
+        self._owner = np.repeat(np.arange(len(self.all)), num_boxes)
+        self._error_m = np.array([obstacle.error_m for obstacle in self.all])
 
     def describe(self) -> tuple[str, ...]:
         """Say of each what its distances are made of, with its error."""
@@ -80,16 +89,36 @@ class Obstacles:
             Ts_base_body: The poses that are proposed.
         """
         found = np.empty((len(Ts_base_body), len(self.all)))
-        to_boxes = candidate_box_clearance(self._boxes, points_m, Ts_base_body)
+        to_boxes = self._boxes.candidate_clearance(points_m, Ts_base_body)
         for index, obstacle in enumerate(self.all):
             if obstacle.grid is None:
                 first, last = self._first[index : index + 2]
                 found[:, index] = to_boxes[:, first:last].min(axis=1)
             else:
-                T = obstacle.T_grid_base
-                Ts = Ts_base_body if T is None else T @ Ts_base_body
+                Ts = obstacle.in_grid(Ts_base_body)
                 found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts)
-            found[:, index] -= obstacle.error_m
+        return found - self._error_m
+
+    def margins(
+        self,
+        points_m: Float[np.ndarray, "num_points 3"],
+        Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
+        keep_m: Float[np.ndarray, " num_obstacles"],
+    ) -> Float[np.ndarray, "num_poses num_points"]:
+        """How much farther each point is from what is around than it must be [m].
+
+        Args:
+            points_m: Of the body's surface, in its own frame.
+            Ts_base_body: The poses that are proposed.
+            keep_m: Distance to keep from each obstacle, on top of its error.
+        """
+        found = np.full((len(Ts_base_body), len(points_m)), np.inf)
+        keep = keep_m + self._error_m
+        self._boxes.lower(found, keep[self._owner], points_m, Ts_base_body)
+        for index, obstacle in enumerate(self.all):
+            if obstacle.grid is not None:
+                Ts = obstacle.in_grid(Ts_base_body)
+                lower_by_grid(obstacle.grid, found, float(keep[index]), points_m, Ts)
         return found
 
 

@@ -22,6 +22,10 @@ UNITS = np.array([LENGTH_M] * 3 + [ANGLE_RAD] * 3 + [LENGTH_M])
 """What a step of one is: 1 cm, 10 degrees, 1 cm."""
 _DIFFERENCE = 1e-4
 """Step of numeric derivatives, in units: 1 um, 0.001 degrees."""
+_NOTHING = 1e-10
+"""Of J."""
+_NEXT_SEED = 7919
+"""Between the seeds of one drawing of starts and the next."""
 _HOPELESS = 1e6
 """A start that needs more damping than this came as far as it can."""
 
@@ -54,8 +58,12 @@ class SolveConfig:
     """Most steps of each start,"""
     free_iterations: int = 12
     """of which at most this many go to what the constraints allow."""
+    redraws: int = 2
+    """How often a start that ends where a constraint is violated is drawn anew."""
     spread_m: float = 0.06
     """Starts are drawn this far around the nominal position, along each axis."""
+    only_above: bool = False
+    """No start is drawn below the nominal position: what is put down comes from above."""
     spread_rad: float = 0.6
     """And turned by up to this much."""
     spread_turn_rad: float = float(np.pi)
@@ -85,6 +93,7 @@ class SolveConfig:
                 "num_starts": (1, 4096),
                 "iterations": (1, 1000),
                 "free_iterations": (0, 1000),
+                "redraws": (0, 100),
                 "spread_m": (0, 2),
                 "spread_rad": (0, np.pi),
                 "spread_turn_rad": (0, np.pi),
@@ -161,17 +170,18 @@ def draw_starts(problem: StageProblem, config: SolveConfig, seed: int) -> Zeta:
     """
     rng = np.random.default_rng(seed)
     num = config.num_starts
-    shift = rng.uniform(-config.spread_m, config.spread_m, (num, 3))
-    about = rng.uniform(-config.spread_turn_rad, config.spread_turn_rad, num)
+    shift = rng.uniform(-1.0, 1.0, (num, 3)) * config.spread_m
+    if config.only_above:
+        shift[:, 2] = np.abs(shift[:, 2])
+    about = np.zeros((num, 3))
+    about[:, 2] = rng.uniform(-config.spread_turn_rad, config.spread_turn_rad, num)
     axis = rng.normal(size=(num, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     turn = axis * rng.uniform(0.0, config.spread_rad, (num, 1))
     width = rng.uniform(0.0, problem.max_width_m, num)
     shift[0], about[0], turn[0], width[0] = 0.0, 0.0, 0.0, problem.nominal_width_m
-    upright = np.zeros((num, 3))
-    upright[:, 2] = about
     T = np.repeat(problem.nominal_T_base_tcp[None], num, axis=0)
-    T[:, :3, :3] = se3.rotation_from_vector(upright) @ T[:, :3, :3] @ se3.rotation_from_vector(turn)
+    T[:, :3, :3] = se3.rotation_from_vector(about) @ T[:, :3, :3] @ se3.rotation_from_vector(turn)
     T[:, :3, 3] += shift
     return Zeta(T_base_tcp=T, width_m=width)
 
@@ -195,14 +205,72 @@ def solve(
         ValueError: A start is not finite.
     """
     config = SolveConfig() if config is None else config
+    drawn = starts is None
     zeta = draw_starts(problem, config, seed) if starts is None else starts
     if not (np.isfinite(zeta.T_base_tcp).all() and np.isfinite(zeta.width_m).all()):
         message = "a start of the stage optimisation is not finite."
         raise ValueError(message)
-    descent = _Descent(problem, config, backend_of(config), zeta)
+    backend = backend_of(config)
+    ends = _descended(problem, config, backend, zeta)
+    for attempt in range(1, config.redraws + 1 if drawn else 1):
+        stuck = np.flatnonzero(~ends.feasible)
+        if not len(stuck):
+            break
+        again = draw_starts(problem, config, seed + attempt * _NEXT_SEED)[stuck]
+        ends.replace(stuck, _descended(problem, config, backend, again))
+    return ends.solution(problem, config)
+
+
+def _descended(problem: StageProblem, config: SolveConfig, backend: Backend, zeta: Zeta) -> "_Ends":
+    descent = _Descent(problem, config, backend, zeta)
     while descent.iterations < config.iterations and descent.step():
         pass
-    return descent.solution()
+    return descent.ends()
+
+
+@dataclass
+class _Ends:
+    """Where starts ended, and all they have seen."""
+
+    costs: Float[np.ndarray, " num_starts"]
+    feasible: Bool[np.ndarray, " num_starts"]
+    seen: _Seen
+    work: dict[str, int]
+
+    def replace(self, rows: np.ndarray, others: "_Ends") -> None:
+        """Put other starts in the place of some; nothing that was seen is lost."""
+        self.costs[rows], self.feasible[rows] = others.costs, others.feasible
+        self.seen.states += others.seen.states
+        self.seen.costs += others.seen.costs
+        self.seen.violations += others.seen.violations
+        for name, count in others.work.items():
+            self.work[name] += count
+        self.work["redrawn"] += len(rows)
+
+    def solution(self, problem: StageProblem, config: SolveConfig) -> StageSolution:
+        """Keep what is feasible and distinct."""
+        zeta, violations, costs = self.seen.all()
+        costs = np.where(np.isfinite(costs), costs, np.inf)
+        order = np.argsort(costs, kind="stable")
+        names = _names(problem)
+
+        def candidate(index: int) -> StageCandidate:
+            return StageCandidate(
+                T_base_tcp=zeta.T_base_tcp[index],
+                width_m=float(zeta.width_m[index]),
+                cost=float(costs[index]),
+                violations=dict(zip(names, violations[index].tolist(), strict=True)),
+            )
+
+        feasible = np.all(violations <= 0, axis=1)
+        chosen = distinct(zeta.T_base_tcp, order[feasible[order]], config)
+        return StageSolution(
+            candidates=tuple(candidate(index) for index in chosen),
+            nearest=candidate(int(order[0])),
+            costs=self.costs,
+            feasible=self.feasible,
+            work=self.work,
+        )
 
 
 class _Descent:
@@ -242,7 +310,7 @@ class _Descent:
         won, lost = rows[better], rows[~better]
         self._damping[won] = np.maximum(self._damping[won] * 0.3, 1e-9)
         self._damping[lost] *= 5.0
-        done = better & (before - cost <= self._config.settled * before)
+        done = better & (before - cost <= self._config.settled * before + _NOTHING)
         done |= self._damping[rows] > _HOPELESS
         self._T[won], self._width[won] = trial.T_base_tcp[better], trial.width_m[better]
         self._violations[won], self._r[won] = violations[better], r[better]
@@ -287,29 +355,13 @@ class _Descent:
         width = np.clip(self._width[rows] + step[:, 6], 0.0, self._problem.max_width_m)
         return Zeta(T_base_tcp=moved(self._T[rows], step), width_m=width)
 
-    def solution(self) -> StageSolution:
-        """Keep what is feasible and distinct."""
-        zeta, violations, costs = self._seen.all()
-        costs = np.where(np.isfinite(costs), costs, np.inf)
-        order = np.argsort(costs, kind="stable")
-        names = _names(self._problem)
-
-        def candidate(index: int) -> StageCandidate:
-            return StageCandidate(
-                T_base_tcp=zeta.T_base_tcp[index],
-                width_m=float(zeta.width_m[index]),
-                cost=float(costs[index]),
-                violations=dict(zip(names, violations[index].tolist(), strict=True)),
-            )
-
-        feasible = np.all(violations <= 0, axis=1)
-        chosen = distinct(zeta.T_base_tcp, order[feasible[order]], self._config)
-        return StageSolution(
-            candidates=tuple(candidate(index) for index in chosen),
-            nearest=candidate(int(order[0])),
+    def ends(self) -> _Ends:
+        """Say where all starts are now."""
+        return _Ends(
             costs=np.square(self._r).sum(axis=1),
-            feasible=np.all(self._violations <= 0, axis=1),
-            work={"iterations": self.iterations, "states": self._num_states},
+            feasible=np.asarray(np.all(self._violations <= 0, axis=1)),
+            seen=self._seen,
+            work={"iterations": self.iterations, "states": self._num_states, "redrawn": 0},
         )
 
 
