@@ -27,7 +27,7 @@ from twin.plan.stage.objective import StageProblem, Zeta
 from twin.plan.stage.solver import StageSolution, solve
 
 SEEDS, MAX_EVALUATIONS, SLSQP_STEPS = 5, 5000, 200
-SETTINGS = replace(ReleaseConfig().solver(), num_starts=32)
+SETTINGS = replace(ReleaseConfig().solver(), num_starts=32, iterations=30, redraws=2)
 NOTE = "a cube into an occupied box beside a wall; CPU time of one thread; machine shared"
 
 

@@ -41,6 +41,9 @@ from twin.plan.stage.objective import ANGLE_RAD, StageProblem, Term, Zeta
 from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
 from twin.robot.collision import hulls_of
 
+NEAR_M = 0.02
+"""Margins above this are not told apart while a stage is solved."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseConfig:
@@ -54,7 +57,7 @@ class ReleaseConfig:
     """Poses drawn, over all nominal ones."""
     num_nominal: int = 4
     """Nominal poses that are perturbed."""
-    num_starts: int = 16
+    num_starts: int = 12
     """Starts of the stage optimisation for each way to rest."""
     num_ways: int = 4
     """Ways to rest that are tried, those nearest to how the object lies now first."""
@@ -104,6 +107,8 @@ class ReleaseConfig:
         """How the stage problem of one way to rest is solved: from above, hardly leaning."""
         return SolveConfig(
             num_starts=self.num_starts,
+            iterations=20,
+            redraws=1,
             only_above=True,
             spread_rad=self.max_tilt_rad,
             max_candidates=self.max_releases,
@@ -243,12 +248,12 @@ class ReleaseSearch:
         )
 
     def _object_too_near(self, state: State) -> Array:
-        T = state.Ts_base_object[self._grasp.object_id]
-        return -self._obstacles.margins(self._points_m, T, self._keep_m(self._allowed))
+        T, keep_m = state.Ts_base_object[self._grasp.object_id], self._keep_m(self._allowed)
+        return -self._obstacles.margins(self._points_m, T, keep_m, most_m=NEAR_M)
 
     def _hand_too_near(self, state: State) -> Array:
         keep_m = self._keep_m(self._hand_allowed)
-        return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m)
+        return -self._obstacles.margins(self._hand_m, state.T_base_tcp, keep_m, most_m=NEAR_M)
 
     def _keep_m(self, allowed: Array) -> Float[np.ndarray, " num_obstacles"]:
         return np.asarray(self._config.eps_col_m * (1.0 - allowed))

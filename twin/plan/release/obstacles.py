@@ -104,6 +104,8 @@ class Obstacles:
         points_m: Float[np.ndarray, "num_points 3"],
         Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
         keep_m: Float[np.ndarray, " num_obstacles"],
+        *,
+        most_m: float = np.inf,
     ) -> Float[np.ndarray, "num_poses num_points"]:
         """How much farther each point is from what is around than it must be [m].
 
@@ -111,8 +113,9 @@ class Obstacles:
             points_m: Of the body's surface, in its own frame.
             Ts_base_body: The poses that are proposed.
             keep_m: Distance to keep from each obstacle, on top of its error.
+            most_m: Larger margins are given as this one, and cost less to find.
         """
-        found = np.full((len(Ts_base_body), len(points_m)), np.inf)
+        found = np.full((len(Ts_base_body), len(points_m)), most_m)
         keep = keep_m + self._error_m
         self._boxes.lower(found, keep[self._owner], points_m, Ts_base_body)
         for index, obstacle in enumerate(self.all):

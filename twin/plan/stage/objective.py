@@ -177,7 +177,8 @@ class StageProblem:
 
     def violations(self, zeta: Zeta) -> list[Array]:
         """Evaluate f of every term, ``(num_states, num_parts)`` each; on the way the worst one."""
-        found = [_columns(term.violation(self._end(zeta))) for term in self.subgoal]
+        end = self._state(zeta.T_base_tcp, zeta.width_m)
+        found = [_columns(term.violation(end)) for term in self.subgoal]
         if self.path:
             way = self._way(zeta)
             found += [_columns(term.violation(way)) for term in self.path]
@@ -215,9 +216,6 @@ class StageProblem:
             ],
             1,
         )
-
-    def _end(self, zeta: Zeta) -> State:
-        return self._state(zeta.T_base_tcp, zeta.width_m)
 
     def _way(self, zeta: Zeta) -> State:
         """States along the ways, ``(num_states, num_steps, ...)``."""

@@ -8,7 +8,7 @@ a cheaper one are dropped, are answers that differ. Work is counted in states, n
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,24 +28,6 @@ _NEXT_SEED = 7919
 """Between the seeds of one drawing of starts and the next."""
 _HOPELESS = 1e6
 """A start that needs more damping than this came as far as it can."""
-
-
-class Backend(Protocol):
-    """Who evaluates a stage problem and differentiates it."""
-
-    def evaluate(
-        self, problem: StageProblem, zeta: Zeta
-    ) -> tuple[Float[np.ndarray, "num_states num_terms"], Float[np.ndarray, "num_states num_rows"]]:
-        """Violations and residuals of NumPy states."""
-
-    def linearise(
-        self, problem: StageProblem, zeta: Zeta
-    ) -> tuple[
-        Float[np.ndarray, "num_states num_terms"],
-        Float[np.ndarray, "num_states num_rows"],
-        Float[np.ndarray, "num_states num_rows 7"],
-    ]:
-        """The same with the residuals' derivatives by a step in units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +203,9 @@ def solve(
     return ends.solution(problem, config)
 
 
-def _descended(problem: StageProblem, config: SolveConfig, backend: Backend, zeta: Zeta) -> "_Ends":
+def _descended(
+    problem: StageProblem, config: SolveConfig, backend: "NumpyBackend | TorchBackend", zeta: Zeta
+) -> "_Ends":
     descent = _Descent(problem, config, backend, zeta)
     while descent.iterations < config.iterations and descent.step():
         pass
@@ -281,7 +265,11 @@ class _Descent:
     """
 
     def __init__(
-        self, problem: StageProblem, config: SolveConfig, backend: Backend, zeta: Zeta
+        self,
+        problem: StageProblem,
+        config: SolveConfig,
+        backend: "NumpyBackend | TorchBackend",
+        zeta: Zeta,
     ) -> None:
         self.iterations = 0
         self._problem, self._config, self._backend = problem, config, backend
@@ -395,7 +383,7 @@ def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, config: SolveC
     return kept
 
 
-def backend_of(config: SolveConfig) -> Backend:
+def backend_of(config: SolveConfig) -> "NumpyBackend | TorchBackend":
     """Return who evaluates, by its name; torch is loaded only then."""
     return NumpyBackend() if config.backend == "numpy" else TorchBackend(config.device)
 

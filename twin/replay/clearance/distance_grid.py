@@ -153,13 +153,14 @@ class Boxes:
         """Lower each point's margin to its distance to the boxes less what is to be kept.
 
         Args:
-            margins_m: Overwritten.
+            margins_m: Overwritten; one value everywhere at first, boxes beyond it do not count.
             keep_m: Distance to keep from each box.
             points_m: Points of the body's surface, in its own frame.
             Ts_base_body: The poses that are proposed.
         """
+        most = float(margins_m.max(initial=-np.inf))
         body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
-        points_to_boxes(self.R, self.centres_m, self.halves_m, keep_m, *body, margins_m)
+        points_to_boxes(self.R, self.centres_m, self.halves_m, keep_m, most, *body, margins_m)
 
 
 def lower_by_grid(

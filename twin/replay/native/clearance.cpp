@@ -108,6 +108,6 @@ NB_MODULE(_clearance, module) {
                "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
                "Lower answers to each point's distance to a grid less what is to be kept.");
     module.def("points_to_boxes", &points_to_boxes, "turns"_a, "centres"_a, "halves"_a, "keep"_a,
-               "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
-               "Lower answers to each point's distance to the boxes less what is to be kept.");
+               "most"_a, "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
+               "Lower answers, none above most, to each point's distance to the boxes less keep.");
 }

@@ -15,6 +15,31 @@ public:
         for (std::size_t i = 0; i < count_; ++i)
             for (std::size_t axis = 0; axis < 3; ++axis)
                 own_[axis * count_ + i] = points.data()[3 * i + axis];
+        for (std::size_t axis = 0; axis < 3 && count_ > 0; ++axis) {
+            const double* row = own_.data() + axis * count_;
+            const auto ends = std::minmax_element(row, row + count_);
+            centre_[axis] = (*ends.first + *ends.second) / 2.0;
+        }
+        for (std::size_t i = 0; i < count_; ++i) {
+            double square = 0.0;
+            for (std::size_t axis = 0; axis < 3; ++axis) {
+                const double away = own_[axis * count_ + i] - centre_[axis];
+                square += away * away;
+            }
+            radius_ = std::max(radius_, std::sqrt(square));
+        }
+    }
+
+    // What no placed point is nearer than to a box whose middle is the origin.
+    double bound(const double* R, const double* t, const double* half) const {
+        double square = 0.0;
+        for (std::size_t axis = 0; axis < 3; ++axis) {
+            const double at = R[3 * axis] * centre_[0] + R[3 * axis + 1] * centre_[1] +
+                              R[3 * axis + 2] * centre_[2] + t[axis];
+            const double away = std::max(std::fabs(at) - half[axis], 0.0);
+            square += away * away;
+        }
+        return std::sqrt(square) - radius_;
     }
 
     std::size_t size() const { return count_; }
@@ -33,6 +58,7 @@ public:
 private:
     std::size_t count_;
     std::vector<double> own_, placed_;
+    double centre_[3] = {0.0, 0.0, 0.0}, radius_ = 0.0;
 };
 
 inline void surface_to_grid(const Values& values, const Vector& origin, double voxel,
@@ -107,7 +133,7 @@ inline void each_to_box(const double* placed, std::size_t size, const double* ha
     }
 }
 
-// Goes through all boxes for all poses of a body, with the body's points in the frame of the box.
+// Goes through all boxes for all poses of a body, with the pose of the body in the box's frame.
 template <typename Look>
 void for_each_box(const Turns& turns, const Points& centres, const Points& halves, const Turns& R,
                   const Points& t, const Points& points, const Look& look) {
@@ -128,7 +154,7 @@ void for_each_box(const Turns& turns, const Points& centres, const Points& halve
                     turn[3 * i + j] =
                         B[i] * body[j] + B[3 + i] * body[3 + j] + B[6 + i] * body[6 + j];
             }
-            look(pose, box, surface.place(turn, shift), surface.size(), halves.data() + 3 * box);
+            look(pose, box, surface, turn, shift);
         }
     }
 }
@@ -140,23 +166,27 @@ inline void surface_to_boxes(const Turns& turns, const Points& centres, const Po
     if (answers.shape(0) != R.shape(0) || answers.shape(1) != boxes)
         throw std::invalid_argument("poses, boxes and answers differ in number");
     for_each_box(turns, centres, halves, R, t, points,
-                 [&](std::size_t pose, std::size_t box, const double* placed, std::size_t size,
-                     const double* half) {
-                     answers.data()[pose * boxes + box] = nearest_to_box(placed, size, half);
+                 [&](std::size_t pose, std::size_t box, Surface& surface, const double* turn,
+                     const double* shift) {
+                     answers.data()[pose * boxes + box] = nearest_to_box(
+                         surface.place(turn, shift), surface.size(), halves.data() + 3 * box);
                  });
 }
 
+// Boxes that are farther than most from all points are not looked at: answers are at most that.
 inline void points_to_boxes(const Turns& turns, const Points& centres, const Points& halves,
-                            const Vector& keep, const Turns& R, const Points& t,
+                            const Vector& keep, double most, const Turns& R, const Points& t,
                             const Points& points, const Distances& answers) {
     const std::size_t num = points.shape(0);
     if (answers.shape(0) != R.shape(0) || answers.shape(1) != num ||
         keep.shape(0) != turns.shape(0))
         throw std::invalid_argument("poses, points, boxes and answers differ in number");
     for_each_box(turns, centres, halves, R, t, points,
-                 [&](std::size_t pose, std::size_t box, const double* placed, std::size_t size,
-                     const double* half) {
-                     each_to_box(placed, size, half, keep.data()[box],
+                 [&](std::size_t pose, std::size_t box, Surface& surface, const double* turn,
+                     const double* shift) {
+                     const double *half = halves.data() + 3 * box, kept = keep.data()[box];
+                     if (surface.bound(turn, shift, half) - kept >= most) return;
+                     each_to_box(surface.place(turn, shift), num, half, kept,
                                  answers.data() + pose * num);
                  });
 }
