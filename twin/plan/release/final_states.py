@@ -267,14 +267,15 @@ class ReleaseSearch:
         margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
         whole = target.relation == "inside"
         half = np.array(target.half_m)
-        room = half - margin - (np.ptp(self._points_m @ T_rest[:3, :3].T, axis=0)[:2] / 2) * whole
+        R_area = target.T_base[:2, :2]
+        extents = np.ptp(self._outline_m @ T_rest[:2, :3].T @ R_area, axis=0)
+        room = half - margin - extents / 2 * whole
         if target.relation == "at":
             half, margin = half + config.tau_p_m, 0.0
         elif (room < 0).any():
             margin = max(0.0, margin + float(room.min()))  # as much as there is
         up = T_rest[:3, :3].T[:, 2]
         outline = self._outline_m if whole else self._outline_m.mean(axis=0, keepdims=True)
-        R_area = target.T_base[:2, :2]
 
         def beyond(state: State) -> Array:
             T = state.Ts_base_object[name]

@@ -1,0 +1,396 @@
+"""Final states: the distributions of Eq. 8 and 9, what is measured, and where things are let go."""
+
+from dataclasses import replace
+
+import coal
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial import ConvexHull
+
+from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
+from bridge.robots.default import ROBOT
+from bridge.task.task_file import ObjectModel, Task, load_task
+from twin.plan.constrain.kinds import compile_constraint, surface_points
+from twin.plan.problem import Grasp, Problem, Release, Shape, State
+from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
+from twin.plan.release.obstacles import Obstacles, hand_points, obstacles_of, spread_points
+from twin.plan.release.resting import NoFinalStateError, orientations, target_of
+from twin.plan.release.sampling import perturbed
+from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
+from twin.replay.scene import ReplayScene
+from twin.robot.collision import hulls_of, signed_distance
+from twin.robot.model import load_robot
+from twin.scene.shape.sdf import SdfGrid, distances_of_solid
+from twin.scene.shape.static import StaticSdf
+
+SURE = np.diag([1e-8] * 6)
+QUICK = ReleaseConfig(num_starts=6, num_ways=2, num_samples=256)
+
+
+def box_shape(size_m: tuple[float, ...]) -> Shape:
+    corners = box_corners(np.array(size_m))
+    hull = ConvexHull(corners)
+    triangles = hull.simplices.copy()
+    a, b, c = (corners[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return Shape(vertices_m=corners, triangles=triangles, source="test")
+
+
+def upright(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
+    q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    return se3.transform_from(q, np.array([x, y, z], dtype=np.float64))
+
+
+def problem_of(task: Task, poses: dict[str, np.ndarray], **scene: object) -> Problem:
+    where = ReplayScene(task=task, urdf=ROBOT.urdf_text(), Ts_base_object=poses, **scene)
+    shapes = {name: box_shape(model.size_m) for name, model in task.objects.items()}
+    return Problem(scene=where, robot=load_robot(where.urdf), shapes=shapes)
+
+
+def cube_problem(**scene: object) -> Problem:
+    poses = {"cube": upright(0.5, -0.15, 0.02, 0.4), "box": upright(0.5, 0.19, 0.0, 0.3)}
+    return problem_of(load_task("cube_into_box"), poses, **scene)
+
+
+def from_above(object_id: str = "cube", width_m: float = 0.04) -> Grasp:
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 0.004
+    return Grasp(
+        object_id=object_id,
+        T_object_tcp=T,
+        width_m=width_m,
+        open_m=width_m + 0.02,
+        margin=1.0,
+        joints_rad=np.zeros(6),
+        pregrasp_m=0.1,
+    )
+
+
+@pytest.fixture(scope="module")
+def found() -> FinalStates:
+    return final_states(cube_problem(), from_above(), config=QUICK)
+
+
+def test_shifts_and_turns_are_drawn_as_is_said() -> None:
+    nominal = upright(0.3, 0.1, 0.2, 0.7) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    Ts = perturbed(nominal, tau_p_m=0.02, tau_r_rad=0.3, count=4000, rng=np.random.default_rng(0))
+    shift = Ts[:, :3, 3] - nominal[:3, 3]
+    for axis in range(3):
+        assert stats.kstest(shift[:, axis], "uniform", (-0.02, 0.04)).pvalue > 1e-3
+    turn = se3.vector_from_rotation(nominal[:3, :3].T @ Ts[:, :3, :3])  # in the tool's frame
+    angle = np.linalg.norm(turn, axis=1)
+    assert stats.kstest(angle, "uniform", (0.0, 0.3)).pvalue > 1e-3
+    axis = turn / angle[:, None]
+    for k in range(3):  # Archimedes: each coordinate of a point on the sphere is uniform
+        assert stats.kstest(axis[:, k], "uniform", (-1.0, 2.0)).pvalue > 1e-3
+    assert abs(np.corrcoef(angle, axis[:, 2])[0, 1]) < 0.05
+
+
+def test_distances_are_those_of_coal_from_above() -> None:
+    """Never below, and hardly above: points on the faces, 200 of them."""
+    problem = cube_problem()
+    obstacles = obstacles_of(problem, hulls_of(problem.robot), {"cube"})
+    assert obstacles.names == (TABLE, "box")
+    points = surface_points(problem, "cube")
+    rng = np.random.default_rng(1)
+    nominal = upright(0.5, 0.19, 0.08)
+    Ts = perturbed(nominal, tau_p_m=0.09, tau_r_rad=1.0, count=150, rng=rng)
+    found = obstacles.distances(points, Ts)[:, 1]
+    cube = coal.Box(0.04, 0.04, 0.04)
+    panels = placed_panels(problem.model("box"), problem.scene.Ts_base_object["box"])
+    exact = []
+    for T in Ts:
+        placed = coal.Transform3s(T[:3, :3], T[:3, 3])
+        exact.append(
+            min(
+                signed_distance(cube, placed, coal.Box(*e), coal.Transform3s(P[:3, :3], P[:3, 3]))
+                for P, e in panels
+            )
+        )
+    apart = np.array(exact) > 0.001
+    assert apart.sum() > 30
+    assert (found[apart] >= np.array(exact)[apart] - 1e-6).all()
+    assert (found[apart] - np.array(exact)[apart]).max() < 0.004
+
+
+def test_margins_are_distances_less_what_is_kept() -> None:
+    problem = cube_problem()
+    obstacles = obstacles_of(problem, hulls_of(problem.robot), {"cube"})
+    points = surface_points(problem, "cube")
+    Ts = perturbed(
+        upright(0.5, 0.19, 0.05), tau_p_m=0.1, tau_r_rad=0.5, count=80,
+        rng=np.random.default_rng(2),
+    )  # fmt: skip
+    keep = np.array([0.0, 0.002])
+    whole = obstacles.margins(points, Ts, keep)
+    np.testing.assert_allclose(
+        whole.min(axis=1), (obstacles.distances(points, Ts) - keep).min(axis=1), atol=1e-12
+    )
+    near = obstacles.margins(points, Ts, keep, most_m=0.02)
+    np.testing.assert_allclose(near, np.minimum(whole, 0.02), atol=1e-12)
+
+
+def wall_behind(voxel_m: float) -> StaticSdf:
+    """A wall at y = 0.35 of a scene that was seen in coarse voxels."""
+    solid = np.zeros((60, 60, 40), dtype=np.bool_)
+    origin = np.array([0.2, -0.1, 0.005])
+    y = origin[1] + voxel_m * np.arange(60)
+    solid[:, (y > 0.35) & (y < 0.37), :] = True
+    grid = SdfGrid(
+        values_m=distances_of_solid(solid, voxel_m), origin_m=origin, voxel_m=voxel_m, closed=False
+    )
+    state = solid.astype(np.uint8)
+    return StaticSdf(
+        conservative=grid, observed=grid, state=state, truncation_m=0.03, table_z_m=None
+    )
+
+
+def test_the_static_grid_is_made_thicker_by_its_own_error_and_says_so() -> None:
+    voxel_m = 0.0107
+    problem = cube_problem(static_sdf=wall_behind(voxel_m))
+    obstacles = obstacles_of(problem, hulls_of(problem.robot), {"cube"})
+    assert obstacles.names == (TABLE, "box", SCENE)
+    scene = obstacles.all[2]
+    assert scene.error_m == pytest.approx(np.sqrt(3) / 2 * voxel_m)
+    assert "10.7 mm voxels, made thicker by 9.3 mm" in obstacles.describe()[2]
+    T = upright(0.5, 0.25, 0.2)[None]
+    point = np.zeros((1, 3))
+    distance = obstacles.distances(point, T)[0, 2]
+    assert scene.grid is not None
+    assert distance == pytest.approx(
+        float(scene.grid.distance(T[:, :3, 3])[0]) - scene.error_m, abs=1e-6
+    )
+    assert distance <= 0.36 - 0.25  # never more than there is
+
+
+def test_an_object_with_a_scan_is_measured_by_its_grid() -> None:
+    problem = cube_problem()
+    solid = np.zeros((50, 50, 50), dtype=np.bool_)
+    solid[12:38, 12:38, 12:38] = True
+    grid = SdfGrid(
+        values_m=distances_of_solid(solid, 0.0016),
+        origin_m=np.full(3, -0.0016 * 24.5),
+        voxel_m=0.0016,
+    )
+    shape = replace(problem.shapes["cube"], sdf=grid)
+    problem = replace(problem, shapes={**problem.shapes, "cube": shape})
+    obstacles = obstacles_of(problem, hulls_of(problem.robot), ())
+    index = obstacles.names.index("cube")
+    assert "grid of 1.6 mm voxels" in obstacles.describe()[index]
+    T = problem.scene.Ts_base_object["cube"] @ upright(0.035, 0.0, 0.0)
+    distance = obstacles.distances(np.zeros((1, 3)), T[None])[0, index]
+    assert distance == pytest.approx(0.035 - 13 * 0.0016 - 0.0008, abs=2e-4)
+
+
+def every_pose(releases: tuple[Release, ...], problem: Problem) -> State:
+    num = len(releases)
+    poses = {
+        name: np.broadcast_to(T, (num, 4, 4)) for name, T in problem.scene.Ts_base_object.items()
+    }
+    poses[releases[0].object_id] = np.stack([r.T_base_object for r in releases])
+    return State(
+        Ts_base_object=poses,
+        T_base_tcp=np.stack([r.T_base_tcp for r in releases]),
+        width_m=np.full(num, 0.06),
+    )
+
+
+def test_a_cube_is_let_go_inside_of_the_box_and_touches_nothing(found: FinalStates) -> None:
+    problem, grasp = cube_problem(), from_above()
+    assert len(found.releases) >= 5
+    inside = compile_constraint({"kind": "inside", "obj": "cube", "container": "box"}, problem)
+    assert (inside.violation(every_pose(found.releases, problem)) <= 0).all()
+    costs = [release.cost for release in found.releases]
+    assert costs == sorted(costs)
+    cube = coal.Box(0.04, 0.04, 0.04)
+    panels = placed_panels(problem.model("box"), problem.scene.Ts_base_object["box"])
+    for release in found.releases:
+        T = release.T_base_object
+        np.testing.assert_allclose(release.T_base_tcp, T @ grasp.T_object_tcp, atol=1e-12)
+        placed = coal.Transform3s(T[:3, :3], T[:3, 3])
+        for P, extents in panels:
+            box = coal.Transform3s(P[:3, :3], P[:3, 3])
+            assert signed_distance(cube, placed, coal.Box(*extents), box) > -0.001
+        assert np.arccos(min(1.0, T[2, 2])) <= np.radians(12.0) + 1e-6
+    best = found.releases[0].T_base_object
+    np.testing.assert_allclose(best[:2, 3], (0.5, 0.19), atol=1e-3)
+    assert best[2, 3] == pytest.approx(0.006 + 0.02 + 0.004, abs=1e-3)
+
+
+def test_the_log_says_how_it_was_drawn_and_what_was_asked(found: FinalStates) -> None:
+    assert found.log["rotation"].endswith("in [0, tau_r], in the end-effector frame")
+    assert found.log["tau_p_m"] == 0.02
+    assert ["cube", "box"] in found.log["allowed_to_touch"]
+    assert len(found.log["checked_against"]) == 2
+    assert "panels of the task file's size" in found.releases[0].checked_against[1]
+    assert all(0 < share <= 1 for share in found.log["share_feasible"])
+
+
+def test_the_same_seed_gives_the_same_bytes(found: FinalStates) -> None:
+    again = final_states(cube_problem(), from_above(), config=QUICK)
+    poses = [release.T_base_object.tobytes() for release in found.releases]
+    assert poses == [release.T_base_object.tobytes() for release in again.releases]
+    other = final_states(cube_problem(), from_above(), config=QUICK, seed=1)
+    assert poses != [release.T_base_object.tobytes() for release in other.releases]
+
+
+def test_the_less_sure_a_place_is_the_farther_the_edge() -> None:
+    def farthest(sigma_m: float) -> float:
+        covariance = np.diag([sigma_m**2] * 3 + [1e-6] * 3)
+        problem = cube_problem(covariances={"box": covariance, "cube": SURE})
+        found = final_states(problem, from_above(), config=QUICK)
+        local = [
+            se3.apply(se3.invert(problem.scene.Ts_base_object["box"]), release.T_base_object[:3, 3])
+            for release in found.releases
+        ]
+        return float(np.abs(np.array(local)[:, :2]).max())
+
+    assert farthest(0.026) <= 0.075 - 0.02 - 2 * 0.026 + 1e-6
+    assert farthest(0.0001) > 0.008
+
+
+def test_a_box_that_is_taken_is_shared_without_touching() -> None:
+    task = load_task("cube_into_box")
+    objects = {**task.objects, "other": replace(task.objects["cube"], id="other")}
+    poses = {
+        "cube": upright(0.5, -0.15, 0.02),
+        "box": upright(0.5, 0.19, 0.0),
+        "other": upright(0.5, 0.19, 0.026),
+    }
+    problem = problem_of(replace(task, objects=objects), poses)
+    found = final_states(problem, from_above(), config=QUICK)
+    cube = coal.Box(0.04, 0.04, 0.04)
+    other = coal.Transform3s(poses["other"][:3, :3], poses["other"][:3, 3])
+    for release in found.releases:
+        T = release.T_base_object
+        placed = coal.Transform3s(T[:3, :3], T[:3, 3])
+        assert signed_distance(cube, placed, cube, other) > 0
+        assert release.clearance_m >= QUICK.eps_col_m
+
+
+def test_a_cube_is_put_on_a_cube() -> None:
+    task = load_task("stack_two_cubes")
+    (name,) = task.manipulated[:1]
+    relation, support = task.goal_of(name) or ("", "")
+    assert relation == "on"
+    poses = {key: upright(0.4 + 0.1 * i, 0.1 * i, model.rest_height_m, 0.2 * i)
+             for i, (key, model) in enumerate(task.objects.items())}  # fmt: skip
+    problem = problem_of(task, poses)
+    found = final_states(problem, from_above(name), config=QUICK)
+    T = found.releases[0].T_base_object
+    np.testing.assert_allclose(T[:2, 3], poses[support][:2, 3], atol=2e-3)
+    heights = [task.objects[key].size_m[2] / 2 for key in (name, support)]
+    gap = T[2, 3] - poses[support][2, 3] - sum(heights)
+    assert 0 < gap < 0.01
+
+
+def test_constraints_alone_say_where() -> None:
+    """Beside the box: no success predicate says so, a pose to look around and a constraint do."""
+    problem = cube_problem()
+    record = {
+        "kind": "beside",
+        "obj": "cube",
+        "reference": "box",
+        "direction": "right",
+        "min_gap": 0.02,
+        "max_gap": 0.05,
+    }
+    constraint = compile_constraint(record, problem)
+    found = final_states(
+        problem,
+        from_above(),
+        constraints=[constraint],
+        near=[upright(0.5, 0.05, 0.024)],
+        config=replace(QUICK, num_samples=512),
+    )
+    violations = constraint.violation(every_pose(found.releases, problem))
+    assert (violations <= 0).all()
+
+
+def test_the_hand_is_as_wide_as_it_opens() -> None:
+    hulls = hulls_of(load_robot(ROBOT.urdf_text()))
+    closed, opened = (hand_points(hulls, width, 400) for width in (0.0, 0.08))
+    assert np.ptp(opened[:, 1]) >= np.ptp(closed[:, 1])
+    tips = opened[opened[:, 2] > -0.01]
+    assert np.abs(tips[:, 1]).min() >= 0.039
+    assert opened[:, 2].max() == pytest.approx(0.01, abs=0.003)  # tips reach past the tool frame
+
+
+def test_spread_points_leave_no_large_gap() -> None:
+    points = np.random.default_rng(4).uniform(-1, 1, (3000, 3))
+    chosen = spread_points(points, 200)
+    assert len(chosen) == 200
+    gaps = np.linalg.norm(points[:, None] - chosen[None], axis=2).min(axis=1)
+    apart = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 9 * np.eye(200)
+    assert gaps.max() <= apart.min() + 1e-12
+    assert len(spread_points(np.ones((5, 3)), 10)) <= 1
+
+
+def model_of(symmetry: str) -> ObjectModel:
+    return replace(load_task("cube_into_box").objects["cube"], symmetry=symmetry)
+
+
+@pytest.mark.parametrize(("symmetry", "count"), [("none", 4), ("cube", 24)])
+def test_ways_to_lie_are_as_many_as_the_symmetry_says(symmetry: str, count: int) -> None:
+    R_now = upright(0, 0, 0, 0.4)[:3, :3]
+    R_target = upright(0, 0, 0, 0.1)[:3, :3]
+    found = orientations(model_of(symmetry), R_now, R_target)
+    assert len(found) == count
+    for R in found:
+        local = np.abs(R_target.T @ R)
+        np.testing.assert_allclose(np.sort(local.ravel()), [0] * 6 + [1] * 3, atol=1e-9)
+    angles = [se3.rotation_angle_rad(R_now.T @ R) for R in found]
+    assert angles[0] == pytest.approx(min(angles))
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ("large", "container_too_small"),
+        ("lost", "not_localised"),
+        ("nowhere", "nowhere_said"),
+        ("sideways", "tool_direction"),
+        ("full", "no_free_pose"),
+    ],
+)
+def test_where_nothing_can_be_let_go_the_cause_is_named(change: str, cause: str) -> None:
+    problem, grasp = cube_problem(), from_above()
+    task, poses = problem.scene.task, dict(problem.scene.Ts_base_object)
+    if change == "large":
+        big = replace(task.objects["cube"], size_m=(0.2, 0.2, 0.04))
+        problem = problem_of(replace(task, objects={**task.objects, "cube": big}), poses)
+    elif change == "lost":
+        del poses["box"]
+        problem = problem_of(task, poses)
+    elif change == "nowhere":
+        problem = problem_of(replace(task, success=()), poses)
+    elif change == "sideways":
+        task = replace(task, objects={**task.objects, "cube": model_of("none")})
+        problem = problem_of(task, poses)
+        T = np.eye(4)
+        T[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+        grasp = replace(grasp, T_object_tcp=T)
+    else:
+        lid = replace(task.objects["cube"], id="lid", size_m=(0.148, 0.148, 0.2))
+        poses["lid"] = upright(0.5, 0.19, 0.107, 0.3)
+        problem = problem_of(replace(task, objects={**task.objects, "lid": lid}), poses)
+    with pytest.raises(NoFinalStateError) as caught:
+        final_states(problem, grasp, config=replace(QUICK, max_drop_m=0.005))
+    assert caught.value.cause == cause
+    assert str(caught.value).endswith(".")
+
+
+def test_the_mark_of_a_pushed_object_is_a_target_too() -> None:
+    task = load_task("push_cube_to_mark")
+    (name,) = task.manipulated
+    problem = problem_of(task, {name: upright(0.5, 0.0, 0.02)})
+    target = target_of(problem, name)
+    assert target.relation == "at"
+    assert tuple(target.T_base[:2, 3]) == task.mark_of(name)
+
+
+def test_nothing_around_is_no_obstacle() -> None:
+    assert Obstacles([]).margins(np.zeros((2, 3)), np.eye(4)[None], np.zeros(0)).min() == np.inf
