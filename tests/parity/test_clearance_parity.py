@@ -11,7 +11,12 @@ from bridge.geometry.mesh import box_corners
 from twin.replay import _clearance
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
-from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.distance_grid import (
+    Boxes,
+    GridLookup,
+    candidate_clearance,
+    lower_by_grid,
+)
 from twin.robot.collision import convex_hull, signed_distance
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 
@@ -132,3 +137,72 @@ def test_bounds_refuse_what_does_not_fit_together() -> None:
         bounds.nearest_first(np.eye(3)[None], np.zeros((2, 3)), np.zeros(1), order)
     with pytest.raises(ValueError, match="differ in number"):
         bounds.nearest_first(np.eye(3)[None], three, np.zeros(2), order)
+
+
+def bodies(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a body, and poses of it as matrices."""
+    R, t = poses(count, seed)
+    Ts = np.repeat(np.eye(4)[None], count, axis=0)
+    Ts[:, :3, :3], Ts[:, :3, 3] = R, t
+    return np.random.default_rng(seed).uniform(-0.04, 0.04, (60, 3)), Ts
+
+
+def distances_to_boxes(boxes: list, points: np.ndarray, Ts: np.ndarray) -> np.ndarray:
+    """Of every point of every pose to every box."""
+    placed = np.einsum("nij,pj->npi", Ts[:, :3, :3], points) + Ts[:, None, :3, 3]
+    found = []
+    for T, extents in boxes:
+        q = np.abs((placed - T[:3, 3]) @ T[:3, :3]) - extents / 2
+        found.append(np.linalg.norm(np.maximum(q, 0), axis=2) + np.minimum(q.max(axis=2), 0))
+    return np.stack(found, axis=2)
+
+
+def some_boxes(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    points, Ts = bodies(count, 11)
+    return [(T, np.abs(p) * 8 + 0.01) for T, p in zip(Ts, points, strict=False)]
+
+
+def test_a_surface_is_as_near_to_boxes_as_its_nearest_point() -> None:
+    boxes = some_boxes(6)
+    points, Ts = bodies(200, 12)
+    every = distances_to_boxes(boxes, points, Ts)
+    found = Boxes.of(boxes).candidate_clearance(points, Ts)
+    np.testing.assert_allclose(found, every.min(axis=1), atol=1e-12)
+    assert (found < 0).sum() > 20
+    assert Boxes.of([]).candidate_clearance(points, Ts).shape == (200, 0)
+
+
+def test_margins_of_points_are_their_distances_less_what_is_kept(grid: SdfGrid) -> None:
+    boxes, lookup = some_boxes(6), GridLookup(grid)
+    points, Ts = bodies(150, 13)
+    keep = np.linspace(0.0, 0.01, 6)
+    to_boxes = (distances_to_boxes(boxes, points, Ts) - keep).min(axis=2)
+    placed = np.einsum("nij,pj->npi", Ts[:, :3, :3], points) + Ts[:, None, :3, 3]
+    to_grid = lookup.distance(placed.reshape(-1, 3)).reshape(150, -1) - 0.003
+    for most in (np.inf, 0.02):
+        margins = np.full((150, 60), most)
+        Boxes.of(boxes).lower(margins, keep, points, Ts)
+        np.testing.assert_allclose(margins, np.minimum(to_boxes, most), atol=1e-12)
+        lower_by_grid(lookup, margins, 0.003, points, Ts)
+        expected = np.minimum(np.minimum(to_boxes, to_grid), most)
+        np.testing.assert_allclose(margins, expected, atol=1e-6)
+    nearest = candidate_clearance(lookup, points, Ts)
+    np.testing.assert_allclose(nearest, to_grid.min(axis=1) + 0.003, atol=1e-6)
+
+
+def test_lists_of_other_lengths_are_refused(grid: SdfGrid) -> None:
+    points, Ts = bodies(3, 14)
+    R, t = np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])
+    fixed = (grid.values_m, grid.origin_m, grid.voxel_m)
+    boxes = (np.eye(3)[None], np.zeros((1, 3)), np.ones((1, 3)))
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.surface_to_grid(*fixed, R, t[:2], points, np.zeros(3))
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.surface_to_boxes(*boxes, R, t, points, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.surface_to_boxes(boxes[0], np.zeros((2, 3)), boxes[2], R, t, points,
+                                    np.zeros((3, 1)))  # fmt: skip
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.points_to_grid(*fixed, 0.0, R, t, points, np.zeros((3, 59)))
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.points_to_boxes(*boxes, np.zeros(2), 1.0, R, t, points, np.zeros((3, 60)))
