@@ -108,6 +108,10 @@ def _float(digits: str) -> float | Unreadable:
     return number if math.isfinite(number) else Unreadable(digits)
 
 
+def _int(digits: str) -> int | Unreadable:
+    return int(digits) if len(digits) <= _MOST_DIGITS else Unreadable(digits)
+
+
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     record = dict(pairs)
     return record if len(record) == len(pairs) else Repeated(pairs)

@@ -64,8 +64,9 @@ class Vocabulary:
             allowed_contacts=frozenset(frozenset(pair) for pair in pairs),
         )
 
+    @cache  # noqa: B019  # as many as there are tasks
     def schema(self) -> dict[str, Any]:
-        """The schema of constraints with the ids of this scene."""
+        """The schema of constraints with the ids of this scene; not to be changed."""
         schema = copy.deepcopy(_schema())
         tops = [name for name in self.objects if name not in self.containers]
         ids = {
@@ -279,7 +280,7 @@ def _is_unicode(value: str) -> bool:
     return True
 
 
-def _bounds(value: float, spec: Schema, where: Where) -> Problems:
+def _bounds(value: int | float, spec: Schema, where: Where) -> Problems:
     low = spec.get("minimum", spec.get("exclusiveMinimum", -math.inf))
     high = spec.get("maximum", math.inf)
     if value < low or value > high or value == spec.get("exclusiveMinimum"):
@@ -318,10 +319,23 @@ def meaning_problems(record: Mapping[str, Any], where: Where) -> Problems:
     for low, high in _ORDERED:
         if low in record and high in record and record[low] > record[high]:
             yield where, f"{low} {record[low]:g} is above {high} {record[high]:g}"
+    yield from _alike(record, where)
+    if "q_wxyz" in record and abs(math.hypot(*record["q_wxyz"]) - 1.0) > 0.01:
+        yield (*where, "q_wxyz"), "is not of unit length"
+    if record["kind"] == "moved":
+        yield from _course(record, where)
+    if "box" in record.get("region", {}):
+        box = record["region"]["box"]
+        if any(low >= high for low, high in zip(box["min"], box["max"], strict=True)):
+            yield (*where, "region", "box"), "has no volume: min must be below max"
+
+
+def _alike(record: Mapping[str, Any], where: Where) -> Problems:
+    """Nothing is related to itself."""
     for key in _OTHERS:
         if "obj" in record and record.get(key) == record["obj"]:
             yield (*where, key), f"{record['obj']} cannot be related to itself"
-    if record.get("first") is not None and record.get("first") == record.get("second"):
+    if record["kind"] == "between" and record["first"] == record["second"]:
         yield (*where, "second"), f"{record['second']} is named twice"
     if record["kind"] in ("distance", "above", "align") and record["a"] == record["b"]:
         yield (*where, "b"), "is the same as a"
@@ -329,14 +343,16 @@ def meaning_problems(record: Mapping[str, Any], where: Where) -> Problems:
         direction = record.get(key, {})
         if "from" in direction and direction["from"] == direction["to"]:
             yield (*where, key), "runs from a point to the same point"
-    if "q_wxyz" in record and abs(math.hypot(*record["q_wxyz"]) - 1.0) > 0.01:
-        yield (*where, "q_wxyz"), "is not of unit length"
-    if "direction" in record and isinstance(record["direction"], list):
-        if not any(record["direction"]):
-            yield (*where, "direction"), "has no length"
-        if "at_least" not in record and "at_most" not in record:
-            yield (*where, "direction"), "belongs to at_least or at_most"
-    if "box" in record.get("region", {}):
-        box = record["region"]["box"]
-        if any(low >= high for low, high in zip(box["min"], box["max"], strict=True)):
-            yield (*where, "region", "box"), "has no volume: min must be below max"
+
+
+def _course(record: Mapping[str, Any], where: Where) -> Problems:
+    """The direction of kind ``moved``, as a word or as a vector."""
+    named = [key for key in ("way", "direction") if key in record]
+    if len(named) == 2:
+        yield where, "way and direction are two names of one thing; give one"
+    if named and not any(key in record for key in ("at_least", "at_most", "by")):
+        yield (*where, named[0]), "belongs to at_least, at_most or by"
+    if "by" in record and not named:
+        yield (*where, "by"), "needs a way or a direction"
+    if not any(record.get("direction", (1,))):
+        yield (*where, "direction"), "has no length"
