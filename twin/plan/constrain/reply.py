@@ -83,7 +83,7 @@ def parse_strictly(text: str | bytes) -> Any:
         plain = data.decode()
     except UnicodeError:
         _refuse("is not text in UTF-8")
-    if _depth(plain) > MAX_DEPTH:
+    if _is_deep(plain):
         _refuse(f"is nested more than {MAX_DEPTH} deep")
     try:
         return json.loads(
@@ -121,16 +121,17 @@ _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+(?:"|\Z|\\\Z)|[\[\]{}]', re.DOTALL)
 """Strings, so that brackets in them do not count, and brackets; never looks back."""
 
 
-def _depth(text: str) -> int:
-    depth = deepest = 0
+def _is_deep(text: str) -> bool:
+    depth = 0
     for token in _TOKEN.finditer(text):
         first = text[token.start()]
         if first in "[{":
             depth += 1
-            deepest = max(deepest, depth)
+            if depth > MAX_DEPTH:
+                return True
         elif first in "]}":
             depth -= 1
-    return deepest
+    return False
 
 
 def _contradictions(record: Mapping[str, Any], vocabulary: Vocabulary, task: str) -> Problems:

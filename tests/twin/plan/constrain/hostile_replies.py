@@ -49,6 +49,7 @@ def valid_reply() -> dict[str, Any]:
 
 GOAL = ("stages", 1, "subgoal", 0)
 NO_NUMBERS: tuple[Any, ...] = ("0.02", None, True, [0.02], {"m": 0.02}, "", "1e-2")
+NO_JSON_NUMBERS = ("NaN", "Infinity", "-Infinity", "1e400", "-1e999", "9" * 5000, "-" + "1" * 40)
 CODE = (
     "__import__('os').system('touch pwned')",
     "lambda s: 0",
@@ -102,7 +103,15 @@ def _numbers() -> Iterator[tuple[str, str, str]]:
     for path in places:
         for value in NO_NUMBERS:
             yield f"{path[-1]} is {value!r}", json.dumps(put(path, value)), text_of(path)
-        for number in ("NaN", "Infinity", "-Infinity", "1e400", "-1e999", "9" * 5000, "-" + "1" * 40):
+        for number in (
+            "NaN",
+            "Infinity",
+            "-Infinity",
+            "1e400",
+            "-1e999",
+            "9" * 5000,
+            "-" + "1" * 40,
+        ):
             text = json.dumps(put(path, "@")).replace('"@"', number)
             yield f"{path[-1]} is {number[:12]}", text, text_of(path)
         for number in (100.0, -7, 1e300):
@@ -167,7 +176,13 @@ def _forms() -> Iterator[tuple[str, str, str]]:
     for path in (("stages",), ("stages", 0), GOAL, (*GOAL, "a"), ("task",), ("version",)):
         for value in (7, "x", None):
             yield f"{path[-1]} is {value!r}", json.dumps(put(path, value)), text_of(path)
-    for point in ({}, {"ee": False}, {"ee": True, "obj": "cube"}, {"anchor": "top"}, {"xyz": [0, 0]}):
+    for point in (
+        {},
+        {"ee": False},
+        {"ee": True, "obj": "cube"},
+        {"anchor": "top"},
+        {"xyz": [0, 0]},
+    ):
         path = (*GOAL, "a")
         place = (*path, next(iter(point))) if point in ({"ee": False}, {"xyz": [0, 0]}) else path
         yield f"point {point!r}", json.dumps(put(path, point)), text_of(place)
@@ -183,6 +198,7 @@ def _sizes() -> Iterator[tuple[str, str, str]]:
     for depth in (13, 100, 5000, 30_000):
         yield f"{depth} lists", "[" * depth + "]" * depth, "top level"
         yield f"{depth} objects", '{"a":' * depth + "1" + "}" * depth, "top level"
+    yield "many lists", "[" + "[]," * 20_000 + "[]]", "top level"
     yield "lists without end", "[" * 60_000, "top level"
     yield "a string without end", '"' + '\\"' * 30_000, "top level"
     for count in (9, 200):
