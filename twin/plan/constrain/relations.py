@@ -302,7 +302,7 @@ def _moved(record: Record, problem: Problem) -> Constraint:
         message = f"moved {obj}: it was not localised, so nobody knows where it was before."
         raise UsageError(message)
     start = problem.scene.Ts_base_object[obj][:3, 3]
-    named = record.get("way", record.get("direction"))
+    named = record.get("way", record.get("vector"))
     direction = None if named is None else direction_of(named)
 
     def way(state: State) -> Array:
@@ -377,8 +377,9 @@ def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
         record["max_deg"] = np.degrees(record.pop("tolerance_rad", TILT_TOLERANCE_RAD)).item()
         record.pop("tol", None)
     if kind == "moved":
-        if isinstance(record.get("direction"), str):
-            record["way"] = record.pop("direction")
+        if "direction" in record:
+            key = "way" if isinstance(record["direction"], str) else "vector"
+            record[key] = record.pop("direction")
         if "by" in record:
             record.setdefault("tol", MOVED_TOLERANCE_M)
     return record

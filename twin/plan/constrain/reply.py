@@ -28,6 +28,8 @@ MAX_BYTES = 64 * 1024
 """Of a reply."""
 MAX_DEPTH = 12
 """Of lists and objects within each other."""
+MAX_VALUES = 5000
+"""Lists and objects in a reply."""
 MAX_CONSTRAINTS = 16
 """Of one stage, subgoal and path together."""
 _MOST_DIGITS = 18
@@ -83,6 +85,8 @@ def parse_strictly(text: str | bytes) -> Any:
         plain = data.decode()
     except UnicodeError:
         _refuse("is not text in UTF-8")
+    if plain.count("[") + plain.count("{") > MAX_VALUES:
+        _refuse(f"has more than {MAX_VALUES} lists and objects")
     if _is_deep(plain):
         _refuse(f"is nested more than {MAX_DEPTH} deep")
     try:

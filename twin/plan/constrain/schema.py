@@ -136,6 +136,53 @@ def find_problems(value: Any, name: str, schema: Schema) -> tuple[str, ...]:
     return told(_Fitting(schema["$defs"]).problems(value, {"$ref": f"#/$defs/{name}"}, ()))
 
 
+def portable_schema(schema: Schema, name: str) -> dict[str, Any]:
+    """Part of a schema in the words that every model server knows: types, properties, items.
+
+    Servers differ in what else they understand, and some refuse a request for an enum or a bound.
+    Kinds are laid over each other, so that each key of any of them may be there. What comes back is
+    judged by the whole schema in any case.
+
+    Args:
+        schema: Of constraints, filled in or not.
+        name: Of the part in ``$defs``.
+    """
+    return _portable({"$ref": f"#/$defs/{name}"}, schema["$defs"])
+
+
+def _portable(spec: Schema, defs: Mapping[str, Schema]) -> dict[str, Any]:
+    if "$ref" in spec:
+        return _portable(defs[spec["$ref"].rpartition("/")[2]], defs)
+    if "const" in spec or "enum" in spec:
+        value = spec.get("const", "text")
+        found = {bool: "boolean", int: "integer", str: "string"}
+        return {"type": found[type(value)]}
+    if spec["type"] == "array":
+        return {"type": "array", "items": _portable(spec["items"], defs)}
+    if spec["type"] != "object":
+        return {"type": spec["type"]}
+    properties = {key: _portable(inner, defs) for key, inner in spec["properties"].items()}
+    for option in spec.get("oneOf", ()):
+        if "$ref" in option:
+            for key, inner in _portable(option, defs)["properties"].items():
+                properties[key] = _laid_over(properties.get(key, inner), inner)
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(spec.get("required", ())),
+        "additionalProperties": False,
+    }
+
+
+def _laid_over(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Both of two objects at once; of anything else the first."""
+    if one.get("type") != "object" or other.get("type") != "object":
+        return one
+    properties = one["properties"] | other["properties"]
+    required = [key for key in one["required"] if key in other["required"]]
+    return one | {"properties": properties, "required": required}
+
+
 def told(problems: Problems) -> tuple[str, ...]:
     """One line for each of the first problems: place and what is wrong."""
     lines = (f"{place(where)}: {said}" for where, said in islice(problems, MOST_PROBLEMS))
@@ -347,12 +394,12 @@ def _alike(record: Mapping[str, Any], where: Where) -> Problems:
 
 def _course(record: Mapping[str, Any], where: Where) -> Problems:
     """The direction of kind ``moved``, as a word or as a vector."""
-    named = [key for key in ("way", "direction") if key in record]
+    named = [key for key in ("way", "vector") if key in record]
     if len(named) == 2:
-        yield where, "way and direction are two names of one thing; give one"
+        yield where, "way and vector both say the direction; give one"
     if named and not any(key in record for key in ("at_least", "at_most", "by")):
         yield (*where, named[0]), "belongs to at_least, at_most or by"
     if "by" in record and not named:
-        yield (*where, "by"), "needs a way or a direction"
-    if not any(record.get("direction", (1,))):
-        yield (*where, "direction"), "has no length"
+        yield (*where, "by"), "needs a way or a vector"
+    if not any(record.get("vector", (1,))):
+        yield (*where, "vector"), "has no length"

@@ -303,7 +303,7 @@ EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
         START,
     ),
     "moved": (
-        {"kind": "moved", "obj": "cube", "at_least": 0.05, "direction": [0.0, 1.0, 0.0]},
+        {"kind": "moved", "obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]},
         ON_BRICK,
         START,
     ),
