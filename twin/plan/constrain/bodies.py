@@ -58,7 +58,7 @@ def heights(state: State, object_id: str, problem: Problem) -> tuple[Array, Arra
 def _anchor_m(model: ObjectModel, anchor: str) -> Float[np.ndarray, "3"]:
     """A named point of an object, in its frame."""
     up = np.array([0.0, 0.0, model.size_m[2] / 2])
-    places = {
+    places: dict[str, Float[np.ndarray, 3]] = {
         "centroid": _middle_m(model),
         "origin": np.zeros(3),
         "top": _middle_m(model) + up,

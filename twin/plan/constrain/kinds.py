@@ -12,9 +12,7 @@ from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.task.relations import (
-    TABLE,
-)
+from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain import arrays
 from twin.plan.constrain.arrays import Array, like, namespace, norm

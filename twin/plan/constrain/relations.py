@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import UsageError
+from bridge.task.check import TABLE
 from bridge.task.predicate import MOVED_TOLERANCE_M
 from bridge.task.relations import (
     BESIDE_GAP_M,
@@ -18,7 +19,6 @@ from bridge.task.relations import (
     ON_TOLERANCE_M,
     SECTOR_RAD,
     SIDES,
-    TABLE,
     TILT_TOLERANCE_RAD,
     direction_of,
 )
