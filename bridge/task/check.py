@@ -24,8 +24,8 @@ CAVITIES = ("open_box", "basket")
 VERBS = ("grasp", "carry", "release", "push")
 MOST_LISTED = 40
 """Problems in one message."""
-REFERENCES = ("object", "container", "support")
-"""Keys of a success predicate that name an object."""
+REFERENCES = ("object", "container", "support", "reference", "first", "second")
+"""Keys of a success predicate that name an object; the first is the one that moves."""
 
 
 class TaskFileError(UsageError):
@@ -245,13 +245,15 @@ def _predicates(table: Mapping[str, Any]) -> Iterator[str]:
     for index, spec in enumerate(table["success"]):
         place = f"success[{index}]"
         for key in REFERENCES:
-            if key in spec:
+            if key in spec and (key, spec[key]) != ("support", TABLE):
                 yield from _is_no_object(f"{place}.{key}", spec[key], table)
         if "container" in spec:
             yield from _has_no_cavity(f"{place}.container", spec["container"], table)
-        for key in ("container", "support"):
-            if spec.get(key) == spec.get("object", ""):
-                yield f"{place}.{key}: {spec[key]} cannot be in or on itself"
+        named = [(key, spec[key]) for key in REFERENCES if key in spec]
+        for number, (key, name) in enumerate(named):
+            if name in (before for _, before in named[:number]):
+                yield f"{place}.{key}: {name} cannot be in, on or beside itself"
+        yield from _direction(place, spec)
         if "support" in spec:
             yield from _has_no_top(f"{place}.support", spec["support"], table)
         if spec["kind"] == "moved":
@@ -264,15 +266,30 @@ def _has_no_top(place: str, name: str, table: Mapping[str, Any]) -> Iterator[str
         yield f"{place}: {name} is open above; what is put there is inside, not on it"
 
 
+def _direction(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
+    """Three numbers need a length; beside something, and by a distance, one seen from above."""
+    direction = spec.get("direction", "")
+    if not isinstance(direction, str):
+        if not any(direction):
+            yield f"{place}.direction: has no length"
+        elif direction[2] and (spec["kind"] == "beside" or "by_m" in spec):
+            yield f"{place}.direction: must be level, its third number 0"
+    if "gap_m" in spec and spec["gap_m"][0] > spec["gap_m"][1]:
+        low, high = spec["gap_m"]
+        yield f"{place}.gap_m: runs from {low:g} down to {high:g}; turn it round"
+
+
 def _moved(place: str, spec: Mapping[str, Any]) -> Iterator[str]:
-    limits = ("at_least_m", "at_most_m", "target_m")
+    limits = ("at_least_m", "at_most_m", "by_m", "target_m")
     if not any(key in spec for key in limits):
         yield f"{place}: says no limit. Give one or more of {', '.join(limits)}."
-    if ("target_m" in spec) != ("tolerance_m" in spec):
+    if "target_m" in spec and "by_m" in spec:
+        yield f"{place}: by_m and target_m each say where it is to end; give one"
+    elif ("target_m" in spec) != ("tolerance_m" in spec) and "by_m" not in spec:
         yield f"{place}: target_m and tolerance_m belong together"
-    if "direction" in spec and not any(key in spec for key in limits[:2]):
-        yield f"{place}.direction: belongs to at_least_m or at_most_m"
-    if "direction" in spec and not any(spec["direction"]):
-        yield f"{place}.direction: has no length"
+    if "by_m" in spec and "direction" not in spec:
+        yield f"{place}.by_m: needs a direction"
+    if "direction" in spec and not any(key in spec for key in limits[:3]):
+        yield f"{place}.direction: belongs to at_least_m, at_most_m or by_m"
     if spec.get("at_least_m", 0) > spec.get("at_most_m", math.inf):
         yield f"{place}: at_least_m {spec['at_least_m']} is above at_most_m {spec['at_most_m']}"

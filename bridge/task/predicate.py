@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
+from bridge.task.check import REFERENCES, TABLE
+from bridge.task.relations import RELATIONS, Box, direction_of
 from bridge.task.task_file import ObjectModel, Task
 
 
@@ -98,8 +100,8 @@ def all_hold(findings: list[PredicateResult]) -> bool | None:
 
 def is_goal(spec: Mapping[str, Any]) -> bool:
     """Say whether a predicate asks for a change of place: it does not hold by doing nothing."""
-    return spec["kind"] in ("inside", "on") or (
-        spec["kind"] == "moved" and ("at_least_m" in spec or "target_m" in spec)
+    return spec["kind"] in ("inside", *RELATIONS) or (
+        spec["kind"] == "moved" and any(key in spec for key in ("at_least_m", "by_m", "target_m"))
     )
 
 
@@ -107,7 +109,7 @@ def already_true_at_start(task: Task, rollout: Rollout) -> bool:
     """Say whether the geometric part of the goal held before anything moved (a useless trial).
 
     Args:
-        task: Of its predicates only those of kind ``inside`` are looked at.
+        task: Of its predicates only goals are looked at, see ``is_goal``.
         rollout: Of its poses only the first.
     """
     start = Rollout(
@@ -125,22 +127,25 @@ def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Predicat
         message = f"success predicate {spec['kind']!r} is unknown. Known: {', '.join(_RULES)}."
         raise UsageError(message)
     object_id = str(spec.get("object", ""))
-    if spec["kind"] != ALLOWED_CONTACTS and object_id not in rollout.Ts_base_object:
+    asked = [] if spec["kind"] == ALLOWED_CONTACTS else bodies_of(spec)
+    lost = [key for key in asked if key not in rollout.Ts_base_object]
+    if lost:
         return PredicateResult(
             kind=spec["kind"],
             value=None,
-            detail=f"{object_id} was not localised",
+            detail=f"{lost[0]} was not localised",
             object_id=object_id,
         )
     return replace(rule(spec, task, rollout), object_id=object_id)
 
 
+def bodies_of(spec: Mapping[str, Any]) -> list[str]:
+    """Objects that a predicate is about, the one that is to move first; the table is none."""
+    return [spec[key] for key in REFERENCES if key in spec and spec[key] != TABLE]
+
+
 def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
     container_id = spec["container"]
-    if container_id not in rollout.Ts_base_object:
-        return PredicateResult(
-            kind="inside", value=None, detail=f"{container_id} was not localised"
-        )
     container = task.objects[container_id]
     T_container_base = se3.invert(rollout.Ts_base_object[container_id][-1])
     p = se3.apply(T_container_base, rollout.Ts_base_object[spec["object"]][-1][:3, 3])
@@ -160,49 +165,30 @@ def _cavity_excess_m(
     return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
 
 
-ON_TOLERANCE_M = 0.008
-"""Of a resting object's underside from the top below it, where a task says nothing else [m]."""
+def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+    """Whether objects stand to each other as asked, between the boxes around them at the end."""
+    boxes = {key: _box_of(key, task, rollout) for key in bodies_of(spec)}
+    for key, box in boxes.items():
+        if not (np.isfinite(box.T_base_box).all() and np.isfinite(box.half_m).all()):
+            detail = f"the pose of {key} is not a number"
+            return PredicateResult(kind=spec["kind"], value=None, detail=detail)
+    value, detail = RELATIONS[spec["kind"]](spec, boxes)
+    return PredicateResult(kind=spec["kind"], value=bool(value), detail=detail)
 
 
-def _on(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
-    """Whether an object rests on another: at the height of its top, and not over its edge.
-
-    The bodies are the boxes of their outer extents. Their heights are along z of the base frame,
-    against gravity: the underside of the object may be ``tolerance_m`` above or below the top of
-    the support. The middle of the object, at the height of the contact, must lie within the
-    support's uppermost face, ``margin_m`` away from its edges: it would tip otherwise.
-    """
-    object_id, support_id = spec["object"], spec["support"]
-    if support_id not in rollout.Ts_base_object:
-        return PredicateResult(kind="on", value=None, detail=f"{support_id} was not localised")
-    T_object, half = _box_of(object_id, task, rollout)
-    T_support, half_support = _box_of(support_id, task, rollout)
-    bottom = T_object[2, 3] - float(np.abs(T_object[2, :3]) @ half)
-    top = T_support[2, 3] + float(np.abs(T_support[2, :3]) @ half_support)
-    gap_m = bottom - top
-    contact = np.array([T_object[0, 3], T_object[1, 3], top])
-    excess = np.abs(se3.apply(se3.invert(T_support), contact)) - half_support
-    upward = int(np.argmax(np.abs(T_support[2, :3])))  # the face that looks up is no edge
-    over_m = float(np.max(np.delete(excess, upward))) + float(spec.get("margin_m", 0.0))
-    high = abs(gap_m) <= float(spec.get("tolerance_m", ON_TOLERANCE_M))
-    detail = (
-        f"{object_id} is {abs(gap_m) * 1e3:.0f} mm {'above' if gap_m >= 0 else 'below'} the top of "
-        f"{support_id}, its middle {abs(over_m) * 1e3:.0f} mm {'over' if over_m > 0 else 'within'} "
-        "the edge"
-    )
-    return PredicateResult(kind="on", value=bool(high and over_m <= 0), detail=detail)
-
-
-def _box_of(
-    object_id: str, task: Task, rollout: Rollout
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]:
-    """The box around an object at the end: its middle with its axes, and half its extents [m]."""
+def _box_of(object_id: str, task: Task, rollout: Rollout) -> Box:
+    """The box around an object at the end."""
     model = task.objects[object_id]
     T = rollout.Ts_base_object[object_id][-1].copy()
     if not model.origin_at_centre:
         T[:3, 3] += T[:3, 2] * model.size_m[2] / 2
     extents = rollout.extents_m.get(object_id)
-    return T, np.array(model.size_m if extents is None else extents[-1]) / 2
+    half = np.array(model.size_m if extents is None else extents[-1], dtype=np.float64) / 2
+    return Box(T_base_box=T, half_m=half, is_cube=model.symmetry == "cube")
+
+
+MOVED_TOLERANCE_M = 0.02
+"""Of where an object ends that is to move ``by_m``, where a task says nothing else [m]."""
 
 
 def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
@@ -210,8 +196,10 @@ def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateRe
 
     The way from the first state to the last one is measured straight, or, with ``direction`` (in
     the base frame), along that direction, backwards counting as negative. It must be
-    ``at_least_m`` and ``at_most_m`` long. With ``target_m`` the origin must end within
-    ``tolerance_m`` of that point of the base frame; of a point with two numbers, seen from above.
+    ``at_least_m`` and ``at_most_m`` long. With ``by_m`` the origin must end, seen from above,
+    within ``tolerance_m`` of the point so far along ``direction`` from its start. With
+    ``target_m`` it must end within ``tolerance_m`` of that point of the base frame; of a point
+    with two numbers, seen from above.
     """
     object_id = spec["object"]
     first, last = rollout.Ts_base_object[object_id][[0, -1], :3, 3]
@@ -219,13 +207,17 @@ def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateRe
         detail = f"{object_id} was not localised before"
         return PredicateResult(kind="moved", value=None, detail=detail)
     way = last - first
-    direction = np.array(spec.get("direction", (0.0, 0.0, 0.0)), dtype=np.float64)
-    if direction.any():
-        length_m = float(way @ direction / np.linalg.norm(direction))
-    else:
-        length_m = float(np.linalg.norm(way))
+    if not np.isfinite(last).all():
+        detail = f"{object_id} was not localised at the end"
+        return PredicateResult(kind="moved", value=None, detail=detail)
+    direction = direction_of(spec["direction"]) if "direction" in spec else None
+    length_m = float(np.linalg.norm(way) if direction is None else way @ direction)
     value = spec.get("at_least_m", -np.inf) <= length_m <= spec.get("at_most_m", np.inf)
     detail = f"{object_id} moved {length_m * 1e3:.0f} mm"
+    if "by_m" in spec and direction is not None:
+        off_m = float(np.linalg.norm((way - spec["by_m"] * direction)[:2]))
+        value = value and off_m <= spec.get("tolerance_m", MOVED_TOLERANCE_M)
+        detail += f" and is {off_m * 1e3:.0f} mm from where {spec['by_m'] * 1e3:g} mm lead"
     if "target_m" in spec:
         target = np.array(spec["target_m"], dtype=np.float64)
         off_m = float(np.linalg.norm(last[: len(target)] - target))
@@ -328,8 +320,8 @@ def objects_done(
 
 _RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], PredicateResult]] = {
     "inside": _inside,
-    "on": _on,
     "moved": _moved,
+    **dict.fromkeys(RELATIONS, _relation),
     "settled": _settled,
     "no_finger_contact": _no_finger_contact,
     "shape": _shape,

@@ -1,11 +1,17 @@
 """Say in words what a task asks for: objects, stages, what counts as success."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from bridge.task.check import VERBS
-from bridge.task.predicate import ON_TOLERANCE_M
+from bridge.task.check import TABLE, VERBS
+from bridge.task.predicate import MOVED_TOLERANCE_M
+from bridge.task.relations import (
+    BESIDE_GAP_M,
+    BETWEEN_TOLERANCE_M,
+    ON_TOLERANCE_M,
+    TILT_TOLERANCE_RAD,
+)
 from bridge.task.task_file import ObjectModel, StartRange, Task
 
 
@@ -77,9 +83,59 @@ def _inside(spec: Mapping[str, Any]) -> str:
 
 def _on(spec: Mapping[str, Any]) -> str:
     tolerance, margin = spec.get("tolerance_m", ON_TOLERANCE_M), spec.get("margin_m", 0.0)
+    if spec["support"] == TABLE:
+        return f"{spec['object']} stands on the table, within {_mm(tolerance)} mm"
     return (
         f"{spec['object']} rests on {spec['support']}: its underside within {_mm(tolerance)} mm of "
         f"the top, its middle at least {_mm(margin)} mm within the edges"
+    )
+
+
+def _outside(spec: Mapping[str, Any]) -> str:
+    margin = spec.get("margin_m", 0.0)
+    far = f" by at least {_mm(margin)} mm" if margin else ""
+    return f"{spec['object']} is outside {spec['container']}{far}, seen from above"
+
+
+def _beside(spec: Mapping[str, Any]) -> str:
+    where = f"next to {spec['reference']}"
+    if "direction" in spec:
+        direction = spec["direction"]
+        where = (
+            f"{_SIDE_WORDS[direction]} {spec['reference']}, as the robot sees it,"
+            if isinstance(direction, str)
+            else f"{where} along {_vector(direction)}"
+        )
+    low, high = spec.get("gap_m", BESIDE_GAP_M)
+    return f"{spec['object']} is {where} with a gap of {_mm(low)} to {_mm(high)} mm"
+
+
+_SIDE_WORDS = {
+    "left": "left of",
+    "right": "right of",
+    "in_front": "in front of",
+    "behind": "behind",
+}
+
+
+def _between(spec: Mapping[str, Any]) -> str:
+    off = spec.get("tolerance_m", BETWEEN_TOLERANCE_M)
+    return (
+        f"{spec['object']} is between {spec['first']} and {spec['second']}, at most {_mm(off)} mm "
+        "off the line between them"
+    )
+
+
+def _upright(spec: Mapping[str, Any]) -> str:
+    tilt = math.degrees(spec.get("tolerance_rad", TILT_TOLERANCE_RAD))
+    return f"{spec['object']} is upright within {tilt:.0f} degrees"
+
+
+def _aligned(spec: Mapping[str, Any]) -> str:
+    off = math.degrees(spec.get("tolerance_rad", TILT_TOLERANCE_RAD))
+    return (
+        f"the {spec.get('axis', 'x')} axis of {spec['object']} is parallel to the "
+        f"{spec.get('reference_axis', 'x')} axis of {spec['reference']} within {off:.0f} degrees"
     )
 
 
@@ -89,12 +145,25 @@ def _moved(spec: Mapping[str, Any]) -> str:
         said.append(f"by at least {_mm(spec['at_least_m'])} mm")
     if "at_most_m" in spec:
         said.append(f"by at most {_mm(spec['at_most_m'])} mm")
+    if "by_m" in spec:
+        off = spec.get("tolerance_m", MOVED_TOLERANCE_M)
+        said.append(f"by {_mm(spec['by_m'])} mm, give or take {_mm(off)} mm,")
     if "direction" in spec:
-        said.append(f"along ({', '.join(f'{part:g}' for part in spec['direction'])})")
+        word = spec["direction"]
+        to = "to the " if word in ("left", "right") else ""
+        said.append(
+            f"{to}{word}, as the robot sees it"
+            if isinstance(word, str)
+            else f"along {_vector(word)}"
+        )
     if "target_m" in spec:
-        point = ", ".join(f"{part:g}" for part in spec["target_m"])
-        said.append(f"to within {_mm(spec['tolerance_m'])} mm of ({point}) m")
+        target = _vector(spec["target_m"])
+        said.append(f"to within {_mm(spec['tolerance_m'])} mm of {target} m")
     return f"{spec['object']} has moved from its start {' and '.join(said)}"
+
+
+def _vector(values: Sequence[int | float]) -> str:
+    return f"({', '.join(f'{part:g}' for part in values)})"
 
 
 def _allowed(spec: Mapping[str, Any]) -> str:
@@ -107,6 +176,11 @@ def _allowed(spec: Mapping[str, Any]) -> str:
 _WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "inside": _inside,
     "on": _on,
+    "outside": _outside,
+    "beside": _beside,
+    "between": _between,
+    "upright": _upright,
+    "aligned": _aligned,
     "moved": _moved,
     "settled": lambda spec: (
         f"{spec['object']} lies still: below {_mm(spec['max_speed_m_s'])} mm/s in the last "

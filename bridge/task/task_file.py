@@ -15,6 +15,13 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.task.check import TaskFileError, task_problems
 
+DESTINATIONS = {
+    "inside": "container",
+    "on": "support",
+    "beside": "reference",
+    "between": "first",
+}
+"""Predicates that say where an object belongs, and which of their keys names what is there."""
 BASKET = "basket"
 SCANNED = "scanned"
 MAX_BYTES = 64 * 1024
@@ -137,13 +144,17 @@ class Task:
         return poses
 
     def goal_of(self, object_id: str) -> tuple[str, str] | None:
-        """Where an object belongs: ``inside`` a container or ``on`` a support; None: nowhere said.
+        """Where an object belongs: in which relation to which other; None: nowhere said.
 
-        The first success predicate that says so counts.
+        The first success predicate that says so counts: ``inside`` a container, ``on`` a support
+        (an object or the table), ``beside`` or ``between`` others; ``outside`` only where none of
+        those is asked for.
         """
-        for spec in self.success:
-            if spec.get("object") == object_id and spec["kind"] in ("inside", "on"):
-                return spec["kind"], spec["container" if spec["kind"] == "inside" else "support"]
+        named = [spec for spec in self.success if spec.get("object") == object_id]
+        for kinds in (DESTINATIONS, {"outside": "container"}):
+            for spec in named:
+                if spec["kind"] in kinds:
+                    return spec["kind"], spec[kinds[spec["kind"]]]
         return None
 
     def mark_of(self, object_id: str) -> tuple[float, float] | None:

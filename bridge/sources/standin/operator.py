@@ -108,6 +108,8 @@ def _stage_result(
     if stage.get("carry"):
         goal = task.goal_of(stage["carry"])
         targets = task.containers if goal is None else (goal[1],)
+        if goal is not None and (goal[0] not in ("inside", "on") or goal[1] not in task.objects):
+            return None  # nothing to be above
         return any(_above(truth.poses[stage["carry"]], truth, task, key) for key in targets)
     placed = stage.get("release") or stage.get("push")
     return done[placed] if placed else verdict

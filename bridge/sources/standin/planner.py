@@ -112,7 +112,7 @@ def destination_of(
     goal = task.goal_of(object_id)
     if goal is None and task.containers:
         goal = ("inside", task.containers[0])
-    if goal is None:
+    if goal is None or goal[0] not in ("inside", "on") or goal[1] not in task.objects:
         message = (
             f"nothing in the success predicates of task {task.name} says what {object_id} is to be "
             "inside or on: the scripted planner cannot plan it. See docs/tasks.md."

@@ -114,7 +114,7 @@ ON_BLOCK = (Path(str(bridge.task.__file__)).parent / "template.toml").read_text(
 @pytest.mark.parametrize(
     ("new", "place", "said"),
     [
-        ('kind = "on"\nobject = "cube"\nsupport = "cube"', "success[0].support", "on itself"),
+        ('kind = "on"\nobject = "cube"\nsupport = "cube"', "success[0].support", "beside itself"),
         ('kind = "on"\nobject = "cube"\nsuport = "block"', "success[0]", "'support'?"),
         ('kind = "moved"\nobject = "cube"', "success[0]", "says no limit"),
         ('kind = "moved"\nobject = "cube"\ntarget_m = [1, 1]', "success[0]", "belong together"),

@@ -70,6 +70,11 @@ class Constraint:
     """Kinds about a path and not a state: f at its worst, of states as ``worst_along`` takes them.
     A single state is then always well."""
 
+    @staticmethod
+    def of(record: Mapping[str, Any], *terms: Term) -> "Constraint":
+        """Make one of a record and what it measures."""
+        return Constraint(kind=record["kind"], record=dict(record), terms=terms)
+
     @property
     def scale(self) -> float:
         """What counts as one unit of violation: 1 cm, 10 degrees, 10 cm/s."""

@@ -1,0 +1,321 @@
+"""A scene of a cube, a brick, an open box and a fixed post, and states around good ones."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.geometry.mesh import box_corners
+from bridge.robots.default import ROBOT
+from bridge.task.task_file import Task, TaskFile
+from twin.plan.problem import CameraView, Keypoint, Problem, Shape, State
+from twin.replay.scene import ReplayScene
+from twin.robot.model import load_robot
+
+TOML = b"""
+schema_version = 1
+name = "blocks"
+instruction = "Put the cube onto the brick."
+manipulated = ["cube", "brick"]
+containers = ["box"]
+[objects.cube]
+shape = "box"
+size_m = [0.04, 0.04, 0.04]
+color_srgb = [200, 45, 40]
+symmetry = "cube"
+[objects.brick]
+shape = "box"
+size_m = [0.12, 0.06, 0.05]
+color_srgb = [40, 45, 200]
+[objects.box]
+shape = "open_box"
+inner_m = [0.15, 0.15, 0.05]
+wall_m = 0.006
+color_srgb = [60, 110, 180]
+fixed = true
+[objects.post]
+shape = "box"
+size_m = [0.05, 0.05, 0.2]
+color_srgb = [60, 60, 60]
+fixed = true
+[start.cube]
+x_m = [0.4, 0.5]
+y_m = [-0.2, -0.1]
+yaw_rad = [0.0, 0.5]
+[start.brick]
+x_m = [0.4, 0.5]
+y_m = [0.0, 0.0]
+yaw_rad = [0.0, 0.5]
+[start.box]
+x_m = [0.5, 0.5]
+y_m = [0.2, 0.2]
+yaw_rad = [0.0, 0.0]
+[start.post]
+x_m = [0.7, 0.7]
+y_m = [0.0, 0.0]
+yaw_rad = [0.0, 0.0]
+[[stages]]
+id = "grasp"
+text = "Grasp the cube."
+grasp = "cube"
+allowed_contacts = [["cube", "table"], ["gripper", "cube"]]
+[[stages]]
+id = "place"
+text = "Put it onto the brick."
+release = "cube"
+allowed_contacts = [["cube", "brick"], ["gripper", "cube"], ["brick", "table"]]
+[[success]]
+kind = "on"
+object = "cube"
+support = "brick"
+"""
+
+
+@cache
+def blocks_task() -> Task:
+    return TaskFile(TOML, "test").task()
+
+
+def pose(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:
+    q = np.array([np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)])
+    return se3.transform_from(q, np.array([x, y, z]))
+
+
+PLACES = {
+    "cube": pose(0.45, -0.15, 0.02, 0.3),
+    "brick": pose(0.45, 0.0, 0.025, 0.2),
+    "box": pose(0.5, 0.2, 0.0, 0.1),
+    "post": pose(0.7, 0.0, 0.1, 0.4),
+}
+LOOKING_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def box_shape(size_m: tuple[float, float, float]) -> Shape:
+    corners = box_corners(np.array(size_m))
+    triangles = ConvexHull(corners).simplices.astype(np.int64)
+    return Shape(vertices_m=corners, triangles=triangles, source="test")
+
+
+@cache
+def blocks() -> Problem:
+    task = blocks_task()
+    scene = ReplayScene(task=task, Ts_base_object=dict(PLACES), urdf=ROBOT.urdf_text())
+    eye, target, up = np.array([1.1, 0.5, 0.6]), np.array([0.5, 0.0, 0.0]), np.array([0, 0, 1.0])
+    side = CameraView(
+        camera=Camera(width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0),
+        T_base_camera=se3.look_at(eye, target, up),
+    )
+    return Problem(
+        scene=scene,
+        robot=load_robot(scene.urdf),
+        shapes={key: box_shape(model.size_m) for key, model in task.objects.items()},
+        keypoints=(
+            Keypoint(p_m=np.array([0.02, 0.0, 0.02]), object_id="cube"),
+            Keypoint(p_m=np.array([0.5, 0.1, 0.1])),
+        ),
+        cameras={"side": side},
+    )
+
+
+def state(**Ts: np.ndarray) -> State:
+    """One state: the scene's poses, with those that are given, and the tool 20 cm over the cube."""
+    tcp = Ts.pop("tcp", None)
+    objects = {key: T[None] for key, T in (PLACES | Ts).items()}
+    if tcp is None:
+        tcp = objects["cube"][0] @ LOOKING_DOWN
+        tcp[2, 3] += 0.2
+    return State(Ts_base_object=objects, T_base_tcp=tcp[None], width_m=np.full(1, 0.05))
+
+
+def around(
+    start: State,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    far_m: float = 0.08,
+    turn_rad: float = 0.5,
+) -> State:
+    """States near one: what can move and the tool are shifted and turned."""
+
+    def shaken(T: np.ndarray) -> np.ndarray:
+        size = rng.uniform(0.0, 1.0, size=(count, 1)) ** 2  # many near, some far
+        moved = np.repeat(T, count, axis=0)
+        moved[:, :3, 3] += size * rng.uniform(-far_m, far_m, size=(count, 3))
+        turned = se3.rotation_from_vector(size * rng.uniform(-turn_rad, turn_rad, size=(count, 3)))
+        moved[:, :3, :3] = turned @ moved[:, :3, :3]
+        return moved
+
+    objects = {
+        key: shaken(T) if key in ("cube", "brick") else T for key, T in start.Ts_base_object.items()
+    }
+    return State(
+        Ts_base_object=objects, T_base_tcp=shaken(start.T_base_tcp), width_m=np.full(count, 0.05)
+    )
+
+
+def of_torch(start: State) -> State:
+    """The same states as torch tensors that ask for derivatives."""
+    import torch
+
+    return State(
+        Ts_base_object={
+            key: torch.tensor(T, requires_grad=True) for key, T in start.Ts_base_object.items()
+        },
+        T_base_tcp=torch.tensor(start.T_base_tcp, requires_grad=True),
+        width_m=torch.tensor(start.width_m),
+    )
+
+
+CUBE, OPENING = {"obj": "cube", "anchor": "bottom"}, {"obj": "box", "anchor": "opening"}
+IN_BOX = state(cube=pose(0.5, 0.2, 0.03, 0.3))
+ON_BRICK = state(cube=pose(0.46, 0.01, 0.07, 0.5))
+OVER_BOX = state(cube=pose(0.51, 0.2, 0.096, 0.5))
+BESIDE = state(cube=pose(0.45, 0.07, 0.02, 0.2))
+BETWEEN = state(cube=pose(0.59, 0.0, 0.02, 0.1))
+OUT = state(cube=pose(0.5, 0.05, 0.02, 0.3))
+START = state()
+TILTED = state(
+    brick=PLACES["brick"] @ se3.transform_from(np.array([0.9, 0.3, 0.2, 0.1]), np.zeros(3))
+)
+
+EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
+    "distance": (
+        {"kind": "distance", "a": {"ee": True}, "b": {"obj": "cube"}, "target": 0.2, "tol": 0.01},
+        START,
+        state(tcp=pose(0.5, 0.1, 0.3) @ LOOKING_DOWN),
+    ),
+    "distance at least": (
+        {"kind": "distance", "a": {"kp": 0}, "b": {"mean": [0, 1]}, "min": 0.1},
+        START,
+        state(cube=pose(0.5, 0.1, 0.1)),
+    ),
+    "above": (
+        {"kind": "above", "a": CUBE, "b": OPENING, "height": 0.02, "tol": 0.01, "xy_tol": 0.03},
+        OVER_BOX,
+        START,
+    ),
+    "on": ({"kind": "on", "obj": "cube", "support": "brick"}, ON_BRICK, START),
+    "on table": ({"kind": "on", "obj": "cube", "support": "table"}, START, ON_BRICK),
+    "inside": ({"kind": "inside", "obj": "cube", "container": "box"}, IN_BOX, START),
+    "inside point": ({"kind": "inside", "a": CUBE, "container": "box"}, IN_BOX, START),
+    "inside share": (
+        {"kind": "inside", "obj": "cube", "container": "box", "frac": 0.8, "margin": 0.001},
+        IN_BOX,
+        OVER_BOX,
+    ),
+    "outside": ({"kind": "outside", "obj": "cube", "container": "box"}, OUT, IN_BOX),
+    "beside": ({"kind": "beside", "obj": "cube", "reference": "brick"}, BESIDE, ON_BRICK),
+    "beside left": (
+        {"kind": "beside", "obj": "cube", "reference": "brick", "direction": "left"},
+        BESIDE,
+        state(cube=pose(0.45, -0.07, 0.02, 0.2)),
+    ),
+    "between": (
+        {"kind": "between", "obj": "cube", "first": "brick", "second": "post"},
+        BETWEEN,
+        START,
+    ),
+    "align": (
+        {"kind": "align", "a": {"ee": "approach"}, "b": {"world": "-z"}, "max_deg": 10},
+        START,
+        state(tcp=np.eye(4)),
+    ),
+    "align bodies": (
+        {
+            "kind": "align",
+            "a": {"obj": "cube", "axis": "any"},
+            "b": {"from": {"obj": "brick"}, "to": {"obj": "post"}},
+            "max_deg": 20,
+        },
+        BETWEEN,
+        state(cube=pose(0.5, -0.2, 0.02, 0.7)),
+    ),
+    "upright": ({"kind": "upright", "obj": "brick", "max_deg": 10}, START, TILTED),
+    "upright cube": (
+        {"kind": "upright", "obj": "cube", "max_deg": 10},
+        START,
+        state(cube=TILTED.Ts_base_object["brick"][0]),
+    ),
+    "relpose": (
+        {
+            "kind": "relpose",
+            "obj": "cube",
+            "reference": "brick",
+            "p": [0.0, 0.0, 0.045],
+            "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+            "tol": 0.03,
+            "tol_deg": 30.0,
+        },
+        ON_BRICK,
+        START,
+    ),
+    "clearance": (
+        {"kind": "clearance", "obj": "cube", "against": "box", "min": 0.02},
+        START,
+        IN_BOX,
+    ),
+    "clearance table": (
+        {"kind": "clearance", "obj": "cube", "against": "table", "min": 0.02},
+        ON_BRICK,
+        START,
+    ),
+    "keepout over": (
+        {"kind": "keepout", "obj": "cube", "region": {"over": "box"}, "margin": 0.01},
+        START,
+        OVER_BOX,
+    ),
+    "keepout box": (
+        {
+            "kind": "keepout",
+            "a": {"ee": True},
+            "region": {"box": {"min": [0.4, 0.1, 0.0], "max": [0.6, 0.3, 0.4]}},
+        },
+        START,
+        OVER_BOX,
+    ),
+    "keepout sphere": (
+        {
+            "kind": "keepout",
+            "obj": "cube",
+            "region": {"sphere": {"centre": [0.5, 0.2, 0.0], "radius": 0.2}},
+        },
+        START,
+        OVER_BOX,
+    ),
+    "height": ({"kind": "height", "a": CUBE, "min": 0.04}, ON_BRICK, START),
+    "height of a body": ({"kind": "height", "obj": "cube", "max": 0.03}, START, ON_BRICK),
+    "reach": (
+        {"kind": "reach", "margin": 0.1},
+        START,
+        state(tcp=pose(1.5, 0.5, 0.3) @ LOOKING_DOWN),
+    ),
+    "visible": (
+        {"kind": "visible", "obj": "cube", "camera": "side", "frac": 0.4},
+        OUT,
+        state(cube=pose(0.9, -0.9, 0.02)),
+    ),
+    "stable": (
+        {"kind": "stable", "obj": "cube", "support": "brick", "margin": 0.005},
+        ON_BRICK,
+        START,
+    ),
+    "moved": (
+        {"kind": "moved", "obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]},
+        ON_BRICK,
+        START,
+    ),
+    "moved to": (
+        {"kind": "moved", "obj": "cube", "target": [0.45, 0.0], "tol": 0.03},
+        ON_BRICK,
+        START,
+    ),
+    "moved by": (
+        {"kind": "moved", "obj": "cube", "by": 0.16, "way": "left", "tol": 0.03},
+        ON_BRICK,
+        START,
+    ),
+}
+"""A record of each kind, a state in which it holds, and one in which it does not."""

@@ -1,0 +1,264 @@
+"""Laws of every kind of constraint: sign, unit, derivative, invariance, both libraries."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from block_scene import EXAMPLES, IN_BOX, START, around, blocks, of_torch, pose, state
+
+from bridge.geometry import se3
+from twin.plan.constrain.constraint import Constraint, violated, worst_along
+from twin.plan.constrain.kinds import KINDS, compile_constraint
+from twin.plan.problem import State
+
+PATH_KINDS = {"hold", "speed"}
+RIGID = ("distance at least", "inside", "inside share", "relpose", "clearance", "align bodies")
+"""Only what is between bodies counts."""
+UPRIGHT = (
+    *RIGID[1:],
+    *("above", "on", "on table", "outside", "beside", "between", "align", "upright"),
+    *("upright cube", "clearance table", "keepout over", "height", "height of a body", "stable"),
+)
+"""Where things are on the table and which way they are turned makes no difference."""
+
+
+def made(name: str) -> Constraint:
+    return compile_constraint(EXAMPLES[name][0], blocks())
+
+
+def moved(start: State, T: np.ndarray) -> State:
+    """All of the states seen from another base frame."""
+    return State(
+        Ts_base_object={key: T @ Ts for key, Ts in start.Ts_base_object.items()},
+        T_base_tcp=T @ start.T_base_tcp,
+        width_m=start.width_m,
+    )
+
+
+def test_every_kind_has_an_example() -> None:
+    assert {record["kind"] for record, _, _ in EXAMPLES.values()} | PATH_KINDS == set(KINDS)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_f_is_at_most_zero_where_it_holds_and_above_zero_where_not(name: str) -> None:
+    record, good, bad = EXAMPLES[name]
+    constraint = compile_constraint(record, blocks())
+    assert constraint.violation(good) <= 0, constraint.explain(good)
+    assert constraint.violation(bad) > 0, constraint.explain(bad)
+    assert "holds" in constraint.explain(good)
+    assert "is violated" in constraint.explain(bad)
+    assert "missed by" in constraint.explain(bad)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_both_libraries_say_the_same(name: str) -> None:
+    pytest.importorskip("torch")
+    constraint = made(name)
+    states = around(EXAMPLES[name][1], 200, np.random.default_rng(1))
+    f = constraint.violation(states)
+    assert f.shape == (200,)
+    found = constraint.violation(of_torch(states))
+    np.testing.assert_allclose(found.detach().numpy(), f, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_derivative_is_that_of_f(name: str) -> None:
+    torch = pytest.importorskip("torch")
+
+    constraint = made(name)
+    start = of_torch(around(EXAMPLES[name][2], 3, np.random.default_rng(2), far_m=0.01))
+    names = list(start.Ts_base_object)
+
+    def f(tcp: Any, *Ts: Any) -> Any:
+        objects = dict(zip(names, Ts, strict=True))
+        return constraint.violation(
+            State(Ts_base_object=objects, T_base_tcp=tcp, width_m=start.width_m)
+        )
+
+    inputs = (start.T_base_tcp, *start.Ts_base_object.values())
+    assert torch.autograd.gradcheck(f, inputs, eps=1e-7, atol=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_derivatives_are_finite_at_the_best_state(name: str) -> None:
+    torch = pytest.importorskip("torch")
+
+    constraint = made(name)
+    record, good, _ = EXAMPLES[name]
+    if record["kind"] == "relpose":
+        T = good.Ts_base_object["brick"][0] @ se3.transform_from(
+            np.array(record["q_wxyz"]), np.array(record["p"])
+        )
+        good = state(cube=T)
+    found = of_torch(good)
+    f = constraint.violation(found).sum()
+    inputs = [found.T_base_tcp, *found.Ts_base_object.values()]
+    for slope in torch.autograd.grad(f, inputs, allow_unused=True):
+        assert slope is None or bool(torch.isfinite(slope).all())
+
+
+@pytest.mark.parametrize("name", RIGID)
+def test_a_rigid_motion_of_everything_changes_nothing(name: str) -> None:
+    rng = np.random.default_rng(3)
+    record = EXAMPLES[name][0] | ({"b": {"obj": "box"}} if name == "distance at least" else {})
+    constraint = compile_constraint(record, blocks())
+    states = around(EXAMPLES[name][1], 50, rng)
+    q = rng.normal(size=4)
+    T = se3.transform_from(q / np.linalg.norm(q), rng.normal(size=3))
+    f = constraint.violation(moved(states, T))
+    np.testing.assert_allclose(f, constraint.violation(states), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", UPRIGHT)
+def test_turning_the_table_changes_nothing(name: str) -> None:
+    constraint = made(name)
+    states = around(EXAMPLES[name][1], 50, np.random.default_rng(4))
+    T = se3.transform_from(np.array([0.6, 0.0, 0.0, 0.8]), np.array([0.3, -2.0, 0.0]))
+    f = constraint.violation(moved(states, T))
+    np.testing.assert_allclose(f, constraint.violation(states), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name != "beside left"])
+def test_f_is_in_metres_or_radians(name: str) -> None:
+    """Nothing changes f by more than the shift of a body, and along some way all of it counts."""
+    constraint = made(name)
+    rng = np.random.default_rng(5)
+    states = around(EXAMPLES[name][2], 400, rng, turn_rad=0.0)
+    size = 1e-4
+    if constraint.unit == "m":
+        way = rng.normal(size=(400, 3))
+        step = np.tile(np.eye(4), (400, 1, 1))
+        step[:, :3, 3] = way / np.linalg.norm(way, axis=1, keepdims=True) * size
+    else:
+        axis = rng.normal(size=(400, 3))
+        axis *= size / np.linalg.norm(axis, axis=1, keepdims=True)
+        step = np.tile(np.eye(4), (400, 1, 1))
+        step[:, :3, :3] = se3.rotation_from_vector(axis)
+
+    def stepped(T: np.ndarray) -> np.ndarray:
+        shifted = T.copy() if len(T) > 1 else np.repeat(T, 400, axis=0)
+        shifted[:, :3, 3] += step[:, :3, 3]
+        shifted[:, :3, :3] = step[:, :3, :3] @ shifted[:, :3, :3]
+        return shifted
+
+    objects = dict(states.Ts_base_object)
+    tcp, mover = states.T_base_tcp, "cube" if name != "upright" else "brick"
+    if constraint.kind in ("reach", "distance", "align", "keepout"):
+        tcp = stepped(tcp)
+    if constraint.kind not in ("reach", "distance") and name not in ("align", "keepout box"):
+        objects[mover] = stepped(objects[mover])
+    after = State(Ts_base_object=objects, T_base_tcp=tcp, width_m=states.width_m)
+    if name == "distance at least":
+        objects["cube"] = stepped(objects["cube"])
+    ratio = np.abs(constraint.violation(after) - constraint.violation(states)) / size
+    assert ratio.max() <= 1 + 1e-6
+    assert ratio.max() > 0.45
+    assert constraint.scale == (0.01 if constraint.unit == "m" else np.radians(10))
+
+
+def test_parts_have_the_violation_as_their_greatest() -> None:
+    constraint = made("relpose")
+    states = around(EXAMPLES["relpose"][1], 20, np.random.default_rng(6))
+    parts = constraint.parts(states)
+    assert parts.shape == (20, 2)
+    np.testing.assert_array_equal(parts.max(axis=1), constraint.violation(states))
+
+
+def paths(num_states: int, num_steps: int) -> State:
+    states = around(START, num_states * num_steps, np.random.default_rng(7))
+    objects = {
+        key: T.reshape(num_states, num_steps, 4, 4) if len(T) > 1 else T[None]
+        for key, T in states.Ts_base_object.items()
+    }
+    return State(
+        Ts_base_object=objects,
+        T_base_tcp=states.T_base_tcp.reshape(num_states, num_steps, 4, 4),
+        width_m=np.zeros((num_states, num_steps)),
+    )
+
+
+def at_step(states: State, index: int) -> State:
+    return State(
+        Ts_base_object={
+            key: T[:, min(index, T.shape[1] - 1)] for key, T in states.Ts_base_object.items()
+        },
+        T_base_tcp=states.T_base_tcp[:, index],
+        width_m=states.width_m[:, index],
+    )
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_along_a_path_the_worst_step_counts(name: str) -> None:
+    constraint, states = made(name), paths(6, 5)
+    each = np.stack([constraint.violation(at_step(states, step)) for step in range(5)], axis=1)
+    np.testing.assert_allclose(worst_along(constraint, states), each.max(axis=1), atol=1e-15)
+
+
+def carried(slip_m: float) -> State:
+    """One path of four steps along which the hand turns and the cube goes with it."""
+    turns = np.zeros((4, 3))
+    turns[:, 2] = np.linspace(0.0, 1.0, 4)
+    tcp = np.tile(START.T_base_tcp[0], (4, 1, 1))
+    tcp[:, :3, :3] = se3.rotation_from_vector(turns) @ tcp[:, :3, :3]
+    tcp[:, 0, 3] += np.linspace(0.0, 0.3, 4)
+    T_tcp_object = np.linalg.inv(START.T_base_tcp[0]) @ START.Ts_base_object["cube"][0]
+    cube = tcp @ T_tcp_object
+    cube[2:, 2, 3] -= slip_m
+    objects = {key: T[None] for key, T in START.Ts_base_object.items()} | {"cube": cube[None]}
+    return State(Ts_base_object=objects, T_base_tcp=tcp[None], width_m=np.zeros((1, 4)))
+
+
+def test_what_slides_in_the_hand_is_not_held() -> None:
+    constraint = compile_constraint({"kind": "hold", "obj": "cube", "tol": 0.005}, blocks())
+    assert worst_along(constraint, carried(0.0))[0] == pytest.approx(-0.005)
+    assert worst_along(constraint, carried(0.008))[0] == pytest.approx(0.003)
+    assert constraint.violation(at_step(carried(0.008), 3))[0] < 0  # nothing slides in one state
+    parts = worst_along(constraint, of_torch(carried(0.008)))
+    assert parts[0].item() == pytest.approx(0.003)
+
+
+def test_a_speed_needs_times() -> None:
+    constraint = compile_constraint({"kind": "speed", "max": 0.25}, blocks())
+    assert constraint.unit == "m/s"
+    times_s = np.array([0.0, 0.5, 1.0, 1.2])
+    assert worst_along(constraint, carried(0.0), times_s=times_s)[0] == pytest.approx(0.25)
+    assert worst_along(constraint, carried(0.0))[0] == pytest.approx(-0.25)
+
+
+def test_contradicting_constraints_are_both_named_at_the_best_compromise() -> None:
+    above, height = (
+        {
+            "kind": "above",
+            "a": {"obj": "cube", "anchor": "bottom"},
+            "b": {"obj": "box", "anchor": "opening"},
+            "height": 0.02,
+            "tol": 0.01,
+            "xy_tol": 0.03,
+        },
+        {"kind": "height", "a": {"obj": "cube", "anchor": "bottom"}, "min": 0.5, "max": 0.6},
+    )
+    constraints = [compile_constraint(record, blocks()) for record in (above, height)]
+    heights = np.linspace(0.0, 0.8, 801)
+    cube = np.tile(IN_BOX.Ts_base_object["cube"][0], (801, 1, 1))
+    cube[:, 2, 3] = heights
+    states = State(
+        Ts_base_object=IN_BOX.Ts_base_object | {"cube": cube},
+        T_base_tcp=np.repeat(IN_BOX.T_base_tcp, 801, axis=0),
+        width_m=np.zeros(801),
+    )
+    cost = sum(np.square(np.maximum(c.violation(states), 0) / c.scale) for c in constraints)
+    best = cube[int(np.argmin(cost))]
+    told = violated(constraints, state(cube=best))
+    assert [text.split()[0] for text in told] == ["above", "height"]
+
+
+def test_what_is_hidden_behind_the_post_is_not_visible() -> None:
+    constraint = made("visible")
+    eye = blocks().cameras["side"].T_base_camera[:3, 3]
+    behind = eye + 1.6 * (np.array([0.7, 0.0, 0.1]) - eye)
+    hidden = state(cube=pose(*behind))
+    assert constraint.violation(hidden)[0] > 0.02
+    beside = behind + np.array([-0.1, 0.12, 0.0])
+    assert (
+        constraint.violation(state(cube=se3.transform_from(np.array([1.0, 0, 0, 0]), beside))) < 0
+    )

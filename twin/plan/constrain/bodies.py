@@ -1,0 +1,164 @@
+"""Bodies, points and directions of many states: what constraints measure between."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry.mesh import sample_triangles
+from bridge.task.relations import AXES
+from bridge.task.task_file import ObjectModel
+from twin.plan.constrain import arrays
+from twin.plan.constrain.arrays import Array, like, namespace
+from twin.plan.constrain.schema import BASE
+from twin.plan.problem import Problem, State
+
+NUM_POINTS = 200
+"""Of an object's surface; its corners first."""
+
+Record = Mapping[str, Any]
+Point = Callable[[State], Array]
+"""A point of each state in the base frame, ``(num_states, 3)``."""
+
+
+def pose_of(state: State, object_id: str) -> Array:
+    """Poses of an object, ``(num_states, 4, 4)``, or one for all states."""
+    return like(state.Ts_base_object[object_id], state.T_base_tcp)
+
+
+def half_extents_m(model: ObjectModel) -> Float[np.ndarray, "3"]:
+    """Of the box around an object."""
+    return np.array(model.size_m) / 2
+
+
+def _middle_m(model: ObjectModel) -> Float[np.ndarray, "3"]:
+    """Of the outer extents, in the object frame."""
+    return np.array([0.0, 0.0, 0.0 if model.origin_at_centre else model.size_m[2] / 2])
+
+
+def box_pose(state: State, object_id: str, problem: Problem) -> Array:
+    """Poses of the middle of the box around an object, ``(num_states, 4, 4)``."""
+    T = pose_of(state, object_id)
+    model = problem.model(object_id)
+    if model.origin_at_centre:
+        return T
+    shift = np.eye(4)
+    shift[:3, 3] = _middle_m(model)
+    return T @ like(shift, T)
+
+
+def heights(state: State, object_id: str, problem: Problem) -> tuple[Array, Array]:
+    """Of the lowest and of the highest point of the box around an object [m]."""
+    T = box_pose(state, object_id, problem)
+    reach = (abs(T[:, 2, :3]) * like(half_extents_m(problem.model(object_id)), T)).sum(-1)
+    return T[:, 2, 3] - reach, T[:, 2, 3] + reach
+
+
+def _anchor_m(model: ObjectModel, anchor: str) -> Float[np.ndarray, "3"]:
+    """A named point of an object, in its frame."""
+    up = np.array([0.0, 0.0, model.size_m[2] / 2])
+    places: dict[str, Float[np.ndarray, 3]] = {
+        "centroid": _middle_m(model),
+        "origin": np.zeros(3),
+        "top": _middle_m(model) + up,
+        "bottom": _middle_m(model) - up,
+        "opening": _middle_m(model) + up,
+        "handle": np.array(model.grasp_m),
+    }
+    return places[anchor]
+
+
+def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
+    """A point of each state, and its name in words."""
+    offset = np.array(spec.get("offset", (0.0, 0.0, 0.0)), dtype=np.float64)
+    aside = f" offset by {millimetres(offset)}" if offset.any() else ""
+    if "ee" in spec:
+        return lambda state: _at(state.T_base_tcp, offset), f"the tool{aside}"
+    if "obj" in spec:
+        name, anchor = spec["obj"], spec.get("anchor", "centroid")
+        p_object = _anchor_m(problem.model(name), anchor) + offset
+        return lambda state: _at(pose_of(state, name), p_object), f"{name}'s {anchor}{aside}"
+    if "xyz" in spec:
+        p, frame = np.array(spec["xyz"], dtype=np.float64) + offset, spec.get("frame", BASE)
+        if frame == BASE:
+            return lambda state: like(p, state.T_base_tcp)[None], f"the point {millimetres(p)}"
+        return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
+    ids = [spec["kp"]] if "kp" in spec else list(spec["mean"])
+    points = [problem.keypoints[index] for index in ids]
+
+    def mean(state: State) -> Array:
+        places = [
+            like(point.p_m, state.T_base_tcp)[None]
+            if point.object_id is None
+            else _at(pose_of(state, point.object_id), point.p_m)
+            for point in points
+        ]
+        return sum(places) / len(places) + like(offset, state.T_base_tcp)
+
+    said = f"keypoint {ids[0]}" if "kp" in spec else f"the middle of keypoints {ids}"
+    return mean, said + aside
+
+
+def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
+    return arrays.carried(T, like(p_m, T)[None])[:, 0]
+
+
+def millimetres(p_m: Float[np.ndarray, " num"]) -> str:
+    """A point in words."""
+    return "(" + ", ".join(f"{value * 1e3:.0f}" for value in p_m) + ") mm"
+
+
+def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
+    """A direction of each state in the base frame, and its name in words.
+
+    ``(num_states, num_axes, 3)``: three axes where any of them will do, else one.
+    """
+    if "from" in spec:
+        (start, start_name), (end, end_name) = (point_of(spec[k], problem) for k in ("from", "to"))
+        return (
+            lambda state: (end(state) - start(state))[:, None],
+            f"the way from {start_name} to {end_name}",
+        )
+    if "ee" in spec:
+        column = {"approach": 2, "closing": 1}[spec["ee"]]
+        return (
+            lambda state: state.T_base_tcp[:, None, :3, column],
+            f"the tool's {spec['ee']} direction",
+        )
+    name = spec["axis"] if "obj" in spec else spec["world"]
+    if name == "any":
+        return (
+            lambda state: pose_of(state, spec["obj"])[:, :3, :3].swapaxes(1, 2),
+            f"the nearest axis of {spec['obj']}",
+        )
+    sign, column = (-1.0 if name[0] == "-" else 1.0), AXES.index(name[-1])
+    if "obj" in spec:
+        return (
+            lambda state: sign * pose_of(state, spec["obj"])[:, None, :3, column],
+            f"{spec['obj']}'s {name} axis",
+        )
+    axis = sign * np.eye(3)[column]
+    return lambda state: like(axis, state.T_base_tcp)[None, None], f"the base frame's {name} axis"
+
+
+def surface_points(problem: Problem, object_id: str) -> Float[np.ndarray, "num_points 3"]:
+    """Points of an object's surface in its frame: corners, and more spread evenly over it [m]."""
+    shape = problem.shapes[object_id]
+    corners = shape.vertices_m[np.unique(shape.triangles)]
+    corners = corners[:: max(1, -(-2 * len(corners) // NUM_POINTS))]
+    a, b, c = (shape.vertices_m[shape.triangles[:, k]] for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    rng = np.random.default_rng(0)
+    chosen, u, v = sample_triangles(areas, NUM_POINTS - len(corners), rng, in_order=True)
+    spread = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    return np.concatenate([corners, spread])
+
+
+def quantile(values: Array, share: float) -> Array:
+    """The value that this share of each row does not exceed."""
+    xp = namespace(values)
+    count = values.shape[-1]
+    index = min(max(int(np.ceil(share * count)) - 1, 0), count - 1)
+    ordered = np.sort(values, axis=-1) if xp is np else xp.sort(values, axis=-1)[0]
+    return ordered[..., index]

@@ -1,0 +1,395 @@
+"""Constraints with a hard twin among the success predicates: how bodies stand to each other.
+
+Bodies are the boxes of their outer extents, and the decisions are those of the predicates in
+``bridge/task``. Heights are against gravity, along z of the base frame; sides are the robot's.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import UsageError
+from bridge.task.check import TABLE
+from bridge.task.predicate import MOVED_TOLERANCE_M
+from bridge.task.relations import (
+    BESIDE_GAP_M,
+    BETWEEN_TOLERANCE_M,
+    ON_TOLERANCE_M,
+    SECTOR_RAD,
+    SIDES,
+    TILT_TOLERANCE_RAD,
+    direction_of,
+)
+from bridge.task.task_file import Task
+from twin.plan.constrain import arrays
+from twin.plan.constrain.arrays import Array, like, namespace, norm
+from twin.plan.constrain.bodies import (
+    Point,
+    Record,
+    box_pose,
+    half_extents_m,
+    heights,
+    millimetres,
+    point_of,
+    pose_of,
+    quantile,
+    surface_points,
+)
+from twin.plan.constrain.constraint import Constraint, Term
+from twin.plan.problem import Problem, State
+
+
+def _on(record: Record, problem: Problem) -> Constraint:
+    obj, support = record["obj"], record["support"]
+    tol = record.get("tol", ON_TOLERANCE_M)
+
+    def gap(state: State) -> Array:
+        bottom, _ = heights(state, obj, problem)
+        return bottom - _top(state, support, problem)
+
+    terms = [Term(what=f"the gap from {support} up to {obj}", measure=gap, low=-tol, high=tol)]
+    if support != TABLE:
+        terms.append(_over_support(record, problem, support, record.get("margin", 0.0)))
+    return Constraint.of(record, *terms)
+
+
+def _top(state: State, support: str, problem: Problem) -> Array:
+    if support == TABLE:
+        return like(problem.scene.table_height_m, state.T_base_tcp)
+    return heights(state, support, problem)[1]
+
+
+def _over_support(record: Record, problem: Problem, support: str, margin: float) -> Term:
+    """The middle of an object within its support's uppermost face: else it tips."""
+    obj, half = record["obj"], half_extents_m(problem.model(support))
+
+    def over(state: State) -> Array:
+        T_object, T = box_pose(state, obj, problem), box_pose(state, support, problem)
+        xp = namespace(state.T_base_tcp)
+        top = heights(state, support, problem)[1]
+        x, y = T_object[:, 0, 3], T_object[:, 1, 3]
+        contact = xp.stack([x, y, top + 0.0 * x], axis=-1)
+        excess = abs(arrays.seen_from(T, contact[:, None])[:, 0]) - like(half, T)
+        up = abs(T[:, 2, :3])
+        upward = up == xp.amax(up, axis=-1)[:, None]  # the face that looks up is no edge
+        return xp.amax(xp.where(upward, -np.inf, excess), axis=-1)
+
+    return Term(
+        what=f"the middle of {obj} beyond the edge of {support}", measure=over, high=-margin
+    )
+
+
+def _inside(record: Record, problem: Problem) -> Constraint:
+    container, margin = record["container"], record.get("margin", 0.0)
+    if "frac" in record:
+        return Constraint.of(record, _share_inside(record, problem, margin))
+    if "obj" in record:
+        point, name = point_of({"obj": record["obj"], "anchor": "origin"}, problem)
+        name = f"the middle of {record['obj']}"
+    else:
+        point, name = point_of(record["a"], problem)
+    excess = _cavity_excess(container, lambda state: point(state)[:, None], problem)
+    term = Term(
+        what=f"{name} beyond the cavity of {container}",
+        measure=lambda state: excess(state)[:, 0],
+        high=-margin,
+    )
+    return Constraint.of(record, term)
+
+
+def _share_inside(record: Record, problem: Problem, margin: float) -> Term:
+    """The share of a surface that is inside, as the excess of the point that decides it [m]."""
+    obj, share = record["obj"], record["frac"]
+    points = surface_points(problem, obj)
+    excess = _cavity_excess(
+        record["container"],
+        lambda state: arrays.carried(pose_of(state, obj), like(points, state.T_base_tcp)),
+        problem,
+    )
+    return Term(
+        what=f"{share:.0%} of the surface of {obj} beyond the cavity of {record['container']}",
+        measure=lambda state: quantile(excess(state), share),
+        high=-margin,
+    )
+
+
+def _cavity_excess(container: str, points: Point, problem: Problem) -> Callable[[State], Array]:
+    """How far each of ``(num_states, num_points, 3)`` leaves a cavity; negative inside [m]."""
+    model = problem.model(container)
+    inner = np.array(model.inner_m)
+    centre = np.array([0.0, 0.0, model.wall_m + inner[2] / 2])
+
+    def excess(state: State) -> Array:
+        T = pose_of(state, container)
+        q = arrays.seen_from(T, points(state)) - like(centre, T)
+        return namespace(T).amax(abs(q) - like(inner / 2, T), axis=-1)
+
+    return excess
+
+
+def _outside(record: Record, problem: Problem) -> Constraint:
+    obj, container = record["obj"], record["container"]
+    return Constraint.of(
+        record,
+        Term(
+            what=f"the gap between {obj} and {container} seen from above",
+            measure=_outline_gap(obj, container, problem),
+            low=record.get("margin", 0.0),
+        ),
+    )
+
+
+def _outline_gap(a: str, b: str, problem: Problem) -> Callable[[State], Array]:
+    """Gap between the boxes around two objects, seen from above; negative: overlap [m]."""
+    half_a, half_b = (half_extents_m(problem.model(name)) for name in (a, b))
+
+    def gap(state: State) -> Array:
+        T_a, T_b = (box_pose(state, name, problem) for name in (a, b))
+        return arrays.footprint_gap(T_a, like(half_a, T_a), T_b, like(half_b, T_b))
+
+    return gap
+
+
+def _beside(record: Record, problem: Problem) -> Constraint:
+    obj, reference = record["obj"], record["reference"]
+    terms = [
+        Term(
+            what=f"the gap between {obj} and {reference} seen from above",
+            measure=_outline_gap(obj, reference, problem),
+            low=record.get("min_gap", BESIDE_GAP_M[0]),
+            high=record.get("max_gap", BESIDE_GAP_M[1]),
+        ),
+        _level(obj, reference, problem),
+    ]
+    if "direction" in record:
+        x, y, _ = SIDES[record["direction"]]
+
+        def off(state: State) -> Array:
+            way = (box_pose(state, obj, problem) - box_pose(state, reference, problem))[:, :2, 3]
+            side = like((x, y), way)
+            across = way[:, 0] * side[1] - way[:, 1] * side[0]
+            return namespace(way).arctan2(norm(across[:, None]), (way * side).sum(-1))
+
+        terms.append(
+            Term(
+                what=f"the side of {reference} it is on, off {record['direction']},",
+                measure=off,
+                high=SECTOR_RAD,
+                unit="rad",
+            )
+        )
+    return Constraint.of(record, *terms)
+
+
+def _level(a: str, b: str, problem: Problem) -> Term:
+    return Term(
+        what=f"the height that {a} and {b} have in common",
+        measure=_common_height(a, b, problem),
+        low=0.0,
+    )
+
+
+def _common_height(a: str, b: str, problem: Problem) -> Callable[[State], Array]:
+    """Height that two boxes have in common; negative: the gap between their heights [m]."""
+
+    def measure(state: State) -> Array:
+        low_a, high_a = heights(state, a, problem)
+        low_b, high_b = heights(state, b, problem)
+        xp = namespace(low_a)
+        return xp.minimum(high_a, high_b) - xp.maximum(low_a, low_b)
+
+    return measure
+
+
+def _between(record: Record, problem: Problem) -> Constraint:
+    obj, first, second = (record[key] for key in ("obj", "first", "second"))
+
+    def line(state: State) -> tuple[Array, Array, Array]:
+        """Way between the two, its length, and the object's place from the first, from above."""
+        p, p_first, p_second = (
+            box_pose(state, name, problem)[:, :2, 3] for name in (obj, first, second)
+        )
+        way = p_second - p_first
+        length = norm(way)
+        return way / length[:, None], length, p - p_first
+
+    def reach(state: State, name: str, along: Array) -> Array:
+        """How far a box extends along a horizontal unit vector."""
+        T = box_pose(state, name, problem)
+        shares = (along[:, None] @ T[:, :2, :3])[:, 0]
+        return (abs(shares) * like(half_extents_m(problem.model(name)), T)).sum(-1)
+
+    def before(state: State) -> Array:
+        along, _, offset = line(state)
+        at = (along * offset).sum(-1)
+        return at - reach(state, obj, along) - reach(state, first, along)
+
+    def after(state: State) -> Array:
+        along, length, offset = line(state)
+        at = (along * offset).sum(-1)
+        return length - at - reach(state, obj, along) - reach(state, second, along)
+
+    def aside(state: State) -> Array:
+        along, _, offset = line(state)
+        return norm((along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0])[:, None])
+
+    return Constraint.of(
+        record,
+        Term(what=f"the gap between {first} and {obj}", measure=before, low=0.0),
+        Term(what=f"the gap between {obj} and {second}", measure=after, low=0.0),
+        Term(
+            what=f"the middle of {obj} off the line between them",
+            measure=aside,
+            high=record.get("tol", BETWEEN_TOLERANCE_M),
+        ),
+        _level(obj, first, problem),
+        _level(obj, second, problem),
+    )
+
+
+def _upright(record: Record, problem: Problem) -> Constraint:
+    obj = record["obj"]
+    is_cube = problem.model(obj).symmetry == "cube"
+
+    def tilt(state: State) -> Array:
+        R = pose_of(state, obj)[:, :3, :3]
+        if not is_cube:
+            up = R[:, :, 2]
+            return namespace(R).arctan2(norm(up[:, :2]), up[:, 2])
+        up = abs(R[:, 2])  # of each axis, either way up
+        xp = namespace(R)
+        flat = norm(R[:, :2].swapaxes(1, 2))
+        return xp.amin(xp.arctan2(flat, up), axis=-1)
+
+    return Constraint.of(
+        record,
+        Term(
+            what=f"the tilt of {obj}",
+            measure=tilt,
+            high=float(np.radians(record["max_deg"])),
+            unit="rad",
+        ),
+    )
+
+
+def _stable(record: Record, problem: Problem) -> Constraint:
+    """The middle stays over the face that the object stands on, and over its support."""
+    obj, support = record["obj"], record.get("support", TABLE)
+    half, margin = half_extents_m(problem.model(obj)), record.get("margin", 0.0)
+
+    def beyond(state: State) -> Array:
+        """How far the plumb line through the middle leaves the face that looks down."""
+        down = -pose_of(state, obj)[:, 2, :3]  # in the object frame
+        xp = namespace(down)
+        steep = abs(down)
+        lower = steep == xp.amax(steep, axis=-1)[:, None]
+        length = xp.where(lower, like(half, down) / xp.where(lower, steep, 1.0), 0.0).sum(-1)
+        aside = abs(down) * length[:, None] - like(half, down)
+        return xp.amax(xp.where(lower, -np.inf, aside), axis=-1)
+
+    what = f"the plumb line of {obj} beyond its own lower face"
+    terms = [Term(what=what, measure=beyond, high=-margin)]
+    if support != TABLE:
+        terms.append(_over_support(record, problem, support, margin))
+    return Constraint.of(record, *terms)
+
+
+def _moved(record: Record, problem: Problem) -> Constraint:
+    obj = record["obj"]
+    if obj not in problem.scene.Ts_base_object:
+        message = f"moved {obj}: it was not localised, so nobody knows where it was before."
+        raise UsageError(message)
+    start = problem.scene.Ts_base_object[obj][:3, 3]
+    named = record.get("way", record.get("vector"))
+    direction = None if named is None else direction_of(named)
+
+    def way(state: State) -> Array:
+        return pose_of(state, obj)[:, :3, 3] - like(start, state.T_base_tcp)
+
+    def length(state: State) -> Array:
+        if direction is None:
+            return norm(way(state))
+        return (way(state) * like(direction, state.T_base_tcp)).sum(-1)
+
+    terms = []
+    if "at_least" in record or "at_most" in record:
+        low, high = record.get("at_least", -np.inf), record.get("at_most", np.inf)
+        terms.append(Term(what=f"the way {obj} was moved", measure=length, low=low, high=high))
+    targets = []
+    if "by" in record and direction is not None:
+        targets.append((start + record["by"] * direction)[:2])
+    if "target" in record:
+        targets.append(np.array(record["target"], dtype=np.float64))
+    terms += [_near_point(obj, target, record["tol"]) for target in targets]
+    return Constraint.of(record, *terms)
+
+
+def _near_point(obj: str, target: Float[np.ndarray, " num"], tol: float) -> Term:
+    """An object's origin near a point of the base frame; near one of two numbers from above."""
+
+    def off(state: State) -> Array:
+        return norm(pose_of(state, obj)[:, : len(target), 3] - like(target, state.T_base_tcp))
+
+    return Term(what=f"the distance of {obj} from {millimetres(target)}", measure=off, high=tol)
+
+
+RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
+    "on": _on,
+    "inside": _inside,
+    "outside": _outside,
+    "beside": _beside,
+    "between": _between,
+    "upright": _upright,
+    "stable": _stable,
+    "moved": _moved,
+}
+"""By the name of the kind."""
+
+_KEYS = {
+    "object": "obj",
+    "margin_m": "margin",
+    "tolerance_m": "tol",
+    "at_least_m": "at_least",
+    "at_most_m": "at_most",
+    "by_m": "by",
+    "target_m": "target",
+}
+
+
+def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
+    """Write a success predicate as the constraint that decides the same; None: about no pose.
+
+    Args:
+        predicate: One of the task's ``success``.
+        task: Says of which objects all axes are alike.
+    """
+    kind = predicate["kind"]
+    if kind == "aligned":
+        return _aligned(predicate, task)
+    if kind not in RELATIONS:
+        return None
+    record = {_KEYS.get(key, key): value for key, value in predicate.items()}
+    if kind == "beside" and "gap_m" in record:
+        record["min_gap"], record["max_gap"] = record.pop("gap_m")
+    if kind == "upright":
+        record["max_deg"] = np.degrees(record.pop("tolerance_rad", TILT_TOLERANCE_RAD)).item()
+        record.pop("tol", None)
+    if kind == "moved":
+        if "direction" in record:
+            key = "way" if isinstance(record["direction"], str) else "vector"
+            record[key] = record.pop("direction")
+        if "by" in record:
+            record.setdefault("tol", MOVED_TOLERANCE_M)
+    return record
+
+
+def _aligned(predicate: Record, task: Task) -> dict[str, Any]:
+    sides = {}
+    for side, key, axis in (("a", "object", "axis"), ("b", "reference", "reference_axis")):
+        name = predicate[key]
+        is_cube = task.objects[name].symmetry == "cube"
+        sides[side] = {"obj": name, "axis": "any" if is_cube else predicate.get(axis, "x")}
+    most_deg = np.degrees(predicate.get("tolerance_rad", TILT_TOLERANCE_RAD)).item()
+    return {"kind": "align", **sides, "max_deg": most_deg, "undirected": True}
