@@ -21,8 +21,8 @@ from scipy.spatial import ConvexHull
 from bridge.errors import refuse_outside
 from bridge.geometry import se3
 from twin.plan.constrain.arrays import Array
+from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import Constraint
-from twin.plan.constrain.kinds import surface_points
 from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.obstacles import (
     allowed_with,

@@ -97,7 +97,7 @@ class Obstacles:
             else:
                 Ts = obstacle.in_grid(Ts_base_body)
                 found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts)
-        return found - self._error_m
+        return np.asarray(found - self._error_m)
 
     def margins(
         self,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.errors import TwinError
-from twin.plan.constrain.kinds import surface_points
+from twin.plan.constrain.bodies import surface_points
 from twin.plan.problem import Grasp, Problem
 
 QUARTER_TURNS = 4

@@ -12,7 +12,8 @@ from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, Task, load_task
-from twin.plan.constrain.kinds import compile_constraint, surface_points
+from twin.plan.constrain.bodies import surface_points
+from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.problem import Grasp, Problem, Release, Shape, State
 from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
 from twin.plan.release.obstacles import Obstacles, hand_points, obstacles_of, spread_points
