@@ -233,7 +233,7 @@ class ReleaseSearch:
         terms = [
             Term(name=f"{name} clear of what is around", violation=self._object_too_near),
             Term(name="the open hand clear of what is around", violation=self._hand_too_near),
-            Term(name="the hand opens", violation=self._still_closed),
+            Term(name="the hand opens", violation=self._not_open),
         ]
         if target is not None:
             terms += self._placed(T_rest, target)
@@ -258,7 +258,7 @@ class ReleaseSearch:
     def _keep_m(self, allowed: Array) -> Float[np.ndarray, " num_obstacles"]:
         return np.asarray(self._config.eps_col_m * (1.0 - allowed))
 
-    def _still_closed(self, state: State) -> Array:
+    def _not_open(self, state: State) -> Array:
         return self._grasp.width_m + self._config.open_more_m / 2 - state.width_m
 
     def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[Term]:

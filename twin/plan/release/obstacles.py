@@ -136,14 +136,14 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
     scene = problem.scene
     found = [_table(scene.table_height_m)]
     panels: list[PanelBox] = []
-    still = scene.containers()
+    stationary = scene.containers()
     for name, T in scene.Ts_base_object.items():
         if name in carried:
             continue
         boxes = tuple(placed_panels(problem.model(name), T))
-        if name in still:
+        if name in stationary:
             panels += boxes
-        found.append(_object(problem, name, T, boxes, exact=name in still))
+        found.append(_object(problem, name, T, boxes, exact=name in stationary))
     if scene.static_sdf is not None:
         foot = stationary_links(hulls)[1]
         grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
