@@ -85,6 +85,12 @@ COMMANDS: tuple[Command, ...] = (
         "runs/monday",
     ),
     (
+        "plan",
+        "twin.cli:plan",
+        "Plan for a cell that asks over zenoh.",
+        "runs/monday --live",
+    ),
+    (
         "evaluate",
         "evaluator.cli:evaluate",
         "Compute success rates and agreement; write a report.",
