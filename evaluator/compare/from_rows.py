@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.decisions import decisions
@@ -19,7 +20,7 @@ from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
 from evaluator.compare.stages import failures_table, stage_results
-from evaluator.compare.study import VOID_CAUSES, study_results
+from evaluator.compare.study import study_results
 from evaluator.compare.success import (
     WITH,
     WITHOUT,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow, is_streamed
 from evaluator.measurements import (
@@ -26,8 +27,6 @@ from evaluator.statistics.differences import mcnemar, tango_points
 
 WITH = "with"
 AGAINST = ("without", "control")
-VOID_CAUSES = ("interrupted",)
-"""Where no protocol says which."""
 SCOPE = "study of replanning"
 
 
@@ -178,12 +177,11 @@ def _gains(
     executed = [start for start in starts if start.executed(WITH, against)]
     parts = {"against": against, "policy": policy}
     count = len(tasks)
-    measurements = [
-        _gain(partial(STUDY_GAIN_POOLED.of, **parts, count=count), starts, against),
-        _test(partial(STUDY_P.of, **parts, count=count), starts, against),
-        _test(partial(STUDY_P_EXECUTED.of, **parts, count=count), executed, against),
-    ]
-    lines = [_gain_line("all tasks", policy, against, *measurements[:2], measurements[2])]
+    pooled = _gain(partial(STUDY_GAIN_POOLED.of, **parts, count=count), starts, against)
+    test = _test(partial(STUDY_P.of, **parts, count=count), starts, against)
+    test_executed = _test(partial(STUDY_P_EXECUTED.of, **parts, count=count), executed, against)
+    measurements = [pooled, test, test_executed]
+    lines = [_gain_line("all tasks", policy, against, pooled, test, test_executed)]
     for task in tasks:
         all_ = [start for start in starts if start.task == task]
         both = [start for start in executed if start.task == task]

@@ -261,7 +261,7 @@ class Operator:
 
     def start_seeds(self, count: int) -> list[int]:
         """One seed per start; both conditions share them."""
-        first = self._config.seed * SEEDS_PER_SESSION
+        first = self._config.seed * SEEDS_PER_SESSION + self._config.first_start
         return [first + k for k in range(count)]
 
     def _recorded(self) -> list[dict[str, Any]]:

@@ -55,6 +55,7 @@ def run_session(
             rate_hz=config.rate_hz, scale=config.image_scale, real_time=config.real_time
         ),
         seed=config.seed,
+        first_start=config.first_start,
         start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
         should_stop=should_stop,
     )

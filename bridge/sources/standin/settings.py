@@ -35,6 +35,8 @@ class SessionConfig:
     """Name of the scan's episode; empty: scan_ and the run's next number."""
     trials: int = 3
     """Starts to try, each once per condition; 0 records the scan only."""
+    first_start: int = 0
+    """Leave out so many starts of the session: one that is tried alone is the same start."""
     conditions: tuple[str, ...] = CONDITIONS
     """without_replanning, with_replanning or both."""
     first_trial: int | None = None
@@ -95,6 +97,7 @@ class SessionConfig:
         allowed: dict[str, tuple[int | float, int | float]] = {
             "seed": (0, 2**31),
             "trials": (0, 8_000),
+            "first_start": (0, SEEDS_PER_SESSION - 1),
             "first_trial": (0, 9_999),
             "probes": (0, 1_000),
             "first_probe": (1, 9_999),
