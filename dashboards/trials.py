@@ -276,18 +276,22 @@ def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Outpu
             except BaseException as error:  # noqa: BLE001  # told by the thread that waits
                 failures.append(error)
                 stop.set()
+            finally:
+                ended.release()
 
+        # Ctrl-C within Thread.join() makes Python take a running thread for ended.
+        ended = threading.Semaphore(0)
         threads = [threading.Thread(target=work, args=(index,)) for index in range(workers)]
+        running_threads = workers
         for thread in threads:
             thread.start()
         try:
-            for thread in threads:
-                while thread.is_alive():
-                    thread.join(POLL_S)
+            while running_threads:
+                running_threads -= ended.acquire(timeout=POLL_S)
         finally:
             stop.set()
-            for thread in threads:
-                thread.join()
+            while running_threads:
+                running_threads -= ended.acquire(timeout=POLL_S)
     if failures:
         raise failures[0]
 
