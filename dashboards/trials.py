@@ -270,6 +270,8 @@ def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Outpu
                 with _laboratory(run, config, jobs, index) as (endpoint, background):
                     while not stop.is_set() and (job := _next(left)) is not None:
                         _try(job, config, endpoint, background, stop, run)
+                        if stop.is_set():
+                            break
                         with counting:
                             done += 1
                             advance(done, f"{job.task} {job.policy} start {job.start}")
