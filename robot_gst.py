@@ -21,7 +21,7 @@ HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
     "execution in it, and say how far the twin can be trusted."
 )
-RESUMED = ("demo", "rebuild", "replay", "evaluate")
+RESUMED = ("demo", "trials", "rebuild", "replay", "evaluate")
 """Commands that keep what they did when they are interrupted, and go on from there."""
 
 EPISODES, PUBLISH = "bridge.cli.episodes", "bridge.cli.publish"
@@ -36,6 +36,12 @@ COMMANDS: tuple[Command, ...] = (
         "dashboards.cli:demo",
         "Run the whole loop on the stand-in cell, in minutes.",
         "runs/demo",
+    ),
+    (
+        "trials",
+        "dashboards.cli:trials",
+        "Try policies without and with replanning on the same starts.",
+        "runs/study --trials 20",
     ),
     ("record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday"),
     (
@@ -83,6 +89,12 @@ COMMANDS: tuple[Command, ...] = (
         "twin.cli:gate",
         "Judge plans over zenoh before the robot moves.",
         "runs/monday",
+    ),
+    (
+        "plan",
+        "twin.cli:plan",
+        "Plan for a cell that asks over zenoh.",
+        "runs/monday --live",
     ),
     (
         "evaluate",

@@ -66,7 +66,6 @@ def judge_task(task_name: str, options: argparse.Namespace) -> list[Judged]:
     from cell_run import record_ungated
 
     from bridge.episode.run_folder import RunFolder
-    from bridge.task.task_file import load_task
     from bridge.terminal import Output
     from twin.gate.config import GateConfig
     from twin.gate.twin_process import TwinProcess
@@ -86,7 +85,7 @@ def judge_task(task_name: str, options: argparse.Namespace) -> list[Judged]:
         run = RunFolder.open(folder) if folder.is_dir() else RunFolder.create(folder)
         paths = record_ungated(run, task_name, seed, PER_SESSION, cell)
         todo = options.trials - len(judged)
-        with TwinProcess(run.path, load_task(task_name), config, Output(quiet=True)) as twin:
+        with TwinProcess(run.path, config, Output(quiet=True)) as twin:
             judged += [judge_trial(run, path, config, twin) for path in paths[:todo]]
     return judged
 
@@ -113,7 +112,8 @@ def judge_trial(run: Any, path: Path, config: Any, twin: Any) -> Judged:
 def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[Any, float]:
     """Let the gate see what came before the plan, and judge it."""
     from bridge.episode import streams
-    from bridge.task.task_file import load_task
+    from bridge.task.find import chosen_task_file
+    from twin.gate.gate import JudgedTasks
     from twin.gate.service import make_gate
     from twin.scene.localise.live import LiveView
 
@@ -127,7 +127,8 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
         )
         if watched and not is_truth(message.topic):
             perception.take(message.topic, message.data, message.log_time_ns, message.type_name)
-    gate = make_gate(load_task(config.task), config, perception, lambda: stamp_ns, twin)
+    tasks = JudgedTasks(only=chosen_task_file(config.task))
+    gate = make_gate(tasks, config, perception, lambda: stamp_ns, twin)
     before = time.monotonic()
     return gate.judge(plan.to_json()), time.monotonic() - before
 

@@ -6,11 +6,12 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from dashboards.config import DashboardConfig, DemoConfig
+from dashboards.config import DashboardConfig, DemoConfig, TrialsConfig
 
 OUTPUT = Output()
 DASHBOARD = DashboardConfig()
 DEMO = DemoConfig()
+TRIALS = TrialsConfig()
 
 
 def dashboard(
@@ -57,6 +58,23 @@ def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) ->
     from dashboards.demo import run_demo
 
     return run_demo(run, config, output)
+
+
+def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTPUT) -> int:
+    """Try policies on the same starts, without and with replanning, in the stand-in cell.
+
+    Example: robot-gst trials runs/study --task cube_into_box --trials 20
+    With a coin in the gate's place too:
+    robot-gst trials runs/study --arms without --arms with --arms control --coin 0.4
+
+    Args:
+        run: Run folder; made where needed. The same command again goes on where it was stopped.
+        config: What the study does; written to protocol.json before the first trial.
+        output: How to talk.
+    """
+    from dashboards.trials import run_trials
+
+    return run_trials(run, config, output)
 
 
 def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:

@@ -1,6 +1,7 @@
 """Settings of the review pages and of the demo; imports nothing heavy."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from cyclopts import Parameter
 
@@ -21,6 +22,54 @@ class DashboardConfig:
     def __post_init__(self) -> None:
         """Refuse a port that no machine has."""
         refuse_outside(self, PORTS)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class TrialsConfig:
+    """A study of replanning in the stand-in cell."""
+
+    task: tuple[str, ...] = ("cube_into_box",)
+    """Tasks: names in datasets/tasks, files, or all, which is every one that ships."""
+    policies: tuple[str, ...] = ("perturbed",)
+    """How plans are made: perturbed, the cell's own planner, or a policy of robot-gst plan --live.
+    The first one is tried in --arms, the others in the arm without alone."""
+    trials: int = 5
+    """Starts of each task; each is tried once in each arm of each policy."""
+    arms: tuple[str, ...] = ("without", "with")
+    """Of the first policy: without, with, control."""
+    coin: float | None = None
+    """Arm control: the chance of yes to each plan; or --development."""
+    development: Path | None = None
+    """Arm control: a run whose gate's share of yes, by task, is that chance; its seeds are no part
+    of the study."""
+    rounds: int = 5
+    """Plans per trial in the arms with and control."""
+    seed: int = 1
+    """Draws the laboratory and the starts."""
+    study_seed: int = 0
+    """Draws the order of the arms on each start, of the starts, and the coins."""
+    workers: int = 0
+    """Cells at work at once, each with its recorder, gate and planner; 0: one per core."""
+    samples: int = 0
+    """Varied replays behind each verdict of the replay afterwards."""
+    rate_hz: float = 5.0
+    """Frames per second of each camera."""
+    image_scale: float = 1.0
+    """Resize the images of the cell file."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no study can have."""
+        refuse_outside(
+            self,
+            {
+                "trials": (1, 1000),
+                "coin": (0, 1),
+                "rounds": (1, 1000),
+                "workers": (0, 256),
+                "samples": (0, 100_000),
+            },
+        )
 
 
 @Parameter(name="*")

@@ -72,7 +72,7 @@ class Background:
         raise DashboardError(message)
 
 
-def _stop(process: subprocess.Popen[bytes]) -> None:
+def stop_command(process: subprocess.Popen[bytes]) -> None:
     """Ask it to finish, as Ctrl-C would, and insist after a while or when told so twice."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
@@ -127,7 +127,7 @@ def look(run: RunFolder, config: DemoConfig) -> Recorded:
         info = episode.info
         _refuse_other(run, config, episode)
         outcome = outcome_of(run, episode)
-        problem = _cut_short(episode, outcome)
+        problem = cut_short(episode, outcome)
         if problem:
             found.unusable[path] = problem
         elif info.kind == "scan":
@@ -156,7 +156,7 @@ def _refuse_other(run: RunFolder, config: DemoConfig, episode: Episode) -> None:
     raise UsageError(message)
 
 
-def _cut_short(episode: Episode, outcome: Outcome | None) -> str:
+def cut_short(episode: Episode, outcome: Outcome | None) -> str:
     """What ended an episode before its time; empty when nothing did."""
     records = episode.metadata_records
     stopped_by = records.get("recorder", {}).get("stopped_by", "command")
@@ -167,7 +167,7 @@ def _cut_short(episode: Episode, outcome: Outcome | None) -> str:
     return INTERRUPTED if outcome is not None and outcome.detail == INTERRUPTED else ""
 
 
-def _set_aside(run: RunFolder, path: Path, why: str, output: Output) -> None:
+def set_aside(run: RunFolder, path: Path, why: str, output: Output) -> None:
     """Move an episode, and all that was made of it, to where no command looks for episodes."""
     folder = run.notes_dir / INTERRUPTED / time.strftime("%Y%m%d_%H%M%S")
     folder.mkdir(parents=True, exist_ok=True)
@@ -193,18 +193,18 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
     started = time.monotonic()
     chosen_task_file(config.task).task()  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
-    with _ending_on_signals():
+    with ending_on_signals():
         void = _record(run, config, output).void
         replay = ["replay", str(path), "--samples", str(config.samples)]
-        _step(output, "5/6 replaying every plan and execution in PyBullet", replay)
-        _step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
+        step(output, "5/6 replaying every plan and execution in PyBullet", replay)
+        step(output, "6/6 evaluating", ["evaluate", str(path)], show_result=True)
         _refuse_nothing(run)
     _close(run, config, output, time.monotonic() - started, void)
     return 0
 
 
 @contextmanager
-def _ending_on_signals() -> Iterator[None]:
+def ending_on_signals() -> Iterator[None]:
     """Let SIGTERM and a closed terminal end the demo as Ctrl-C does, with all that it started."""
     signals = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(each, signal.default_int_handler) for each in signals]
@@ -224,30 +224,30 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     found = look(run, config)
     useless = found.unusable | found.void
     for episode, why in useless.items():
-        _set_aside(run, episode, why, output)
+        set_aside(run, episode, why, output)
     if useless:
         found = look(run, config)
     if found.has_scan and not found.missing:
         output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
         if not _scene(run):
-            _step(output, label, rebuild)
+            step(output, label, rebuild)
         return found
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     standin = ["publish", "standin", "--connect", endpoint, "--seed", str(config.seed)]
     standin += ["--task", config.task, "--trials"]
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
-    with _running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
-        recorder.wait_until(lambda: _answers(endpoint, "rec/main/ctl/status"))
+    with running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
+        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
         if found.has_scan:
             output.say("2/6 the scan is recorded; it is kept and used")
         else:
-            _step(output, "2/6 the stand-in cell scans its table", [*standin, "0"], recorder)
+            step(output, "2/6 the stand-in cell scans its table", [*standin, "0"], recorder)
         if found.has_scan and _scene(run):
             output.say("3/6 the scene is rebuilt; it is kept and used")
         else:
-            _step(output, label, rebuild, recorder)
+            step(output, label, rebuild, recorder)
         if found.missing:
             _record_trials(run, config, endpoint, standin, len(found.missing), recorder, output)
     found = look(run, config)
@@ -273,10 +273,10 @@ def _record_trials(
     log = run.notes_dir / "logs" / "gate.log"
     judge = ["gate", str(run.path), "--connect", endpoint, "--task", config.task]
     label = f"4/6 {count} trials, {config.trials} starts without and with replanning"
-    with _running(judge, log) as gate:
+    with running(judge, log) as gate:
         gate.wait_until(lambda: "ready" in log.read_text(errors="replace"))
         trials = [*standin, str(config.trials), "--no-scan", "--ask-always", "--missing"]
-        _step(output, label, trials, recorder, gate)
+        step(output, label, trials, recorder, gate)
 
 
 def _scene(run: RunFolder) -> Mapping[str, Any]:
@@ -305,7 +305,7 @@ def _command(arguments: list[str]) -> list[str]:
     return [sys.executable, "-m", "robot_gst", *arguments]
 
 
-def _step(
+def step(
     output: Output,
     label: str,
     arguments: list[str],
@@ -317,11 +317,11 @@ def _step(
     started = time.monotonic()
     quiet = ["--quiet"] if output.quiet else []
     stdout = None if show_result and not output.json else subprocess.DEVNULL
-    process = _start([*arguments, *quiet], stdout=stdout)
+    process = start_command([*arguments, *quiet], stdout=stdout)
     try:
         code = process.wait()
     finally:
-        _stop(process)
+        stop_command(process)
     for background in needed:
         background.check()
     if code != 0:
@@ -329,7 +329,7 @@ def _step(
     output.say(f"    {time.monotonic() - started:.0f} s: robot-gst {' '.join(arguments)}")
 
 
-def _start(arguments: list[str], **options: Any) -> subprocess.Popen[bytes]:
+def start_command(arguments: list[str], **options: Any) -> subprocess.Popen[bytes]:
     """Start a command that Ctrl-C does not reach: it is told to end in its turn."""
     return subprocess.Popen(
         _command(arguments), stdin=subprocess.DEVNULL, start_new_session=True, **options
@@ -337,16 +337,22 @@ def _start(arguments: list[str], **options: Any) -> subprocess.Popen[bytes]:
 
 
 @contextmanager
-def _running(arguments: list[str], log: Path) -> Iterator[Background]:
+def running(arguments: list[str], log: Path) -> Iterator[Background]:
     """Leave a command running while the context lasts."""
     with ExitStack() as stack, log.open("wb") as stream:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        process = _start(arguments, stdout=stream, stderr=subprocess.STDOUT, env=environment)
-        stack.callback(_stop, process)
+        process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT, env=environment)
+        stack.callback(stop_command, process)
         yield Background(command=f"robot-gst {' '.join(arguments)}", process=process, log=log)
 
 
-def _answers(endpoint: str, key: str) -> bool:
+def answers(endpoint: str, key: str) -> bool:
+    """Whether somebody answers a question at an endpoint.
+
+    Args:
+        endpoint: Where to connect.
+        key: What is asked.
+    """
     from bridge.wire.config import WireConfig  # noqa: PLC0415  # zenoh only when recording
     from bridge.wire.session import open_session  # noqa: PLC0415
 
@@ -358,7 +364,8 @@ def _answers(endpoint: str, key: str) -> bool:
     return True
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of the loopback address at which nobody listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -285,6 +285,49 @@ MCNEMAR = {
     )
     for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
 }
+STUDY_GAIN = _new(
+    "study.gain_pp.{against}.{task}.{policy}",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "success in the study arm with less that in the arm {against} over the same starts, in percentage points, "
+    "whatever was not executed counted as a failure: {words}",
+)
+STUDY_GAIN_POOLED = _new(
+    "study.gain_pp.{against}.{policy}",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "the same over the starts of {count} tasks: {words}",
+)
+STUDY_P = _new(
+    "study.mcnemar_p_mid.{against}.{policy}",
+    "1",
+    "none",
+    differences.mcnemar,
+    "two-sided McNemar test of the arm with against {against}, mid-p, over the starts of {count} tasks that differ: {words}",
+)
+STUDY_GAIN_EXECUTED = _new(
+    "study.executed_gain_pp.{against}.{task}.{policy}",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "per protocol: the gain over the starts that were executed in both arms alone: {words}",
+)
+STUDY_P_EXECUTED = _new(
+    "study.executed_mcnemar_p_mid.{against}.{policy}",
+    "1",
+    "none",
+    differences.mcnemar,
+    "per protocol: the same test over the starts of {count} tasks that were executed in both arms: {words}",
+)
+STUDY_NOT_EXECUTED = _new(
+    "study.not_executed.{arm}.{task}.{policy}",
+    "1",
+    "lower",
+    None,
+    "share of starts on which the arm {arm} executed nothing: {words}",
+)
 START_DISTANCE = {
     kind: _new(
         f"paired.start_distance_{kind}_m",

@@ -5,6 +5,7 @@ from pathlib import Path
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.gate.config import GateConfig
+from twin.plan.config import LivePlanConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
 
@@ -12,6 +13,7 @@ OUTPUT = Output()
 REPLAY = ReplayRunConfig()
 REBUILD = RebuildConfig()
 RENDER = RenderConfig()
+LIVE_PLAN = LivePlanConfig()
 CALIBRATE = CalibrateConfig()
 
 
@@ -60,6 +62,33 @@ def gate(
     from twin.gate.service import run_gate
 
     return run_gate(run, config, output)
+
+
+def plan(
+    run: Path,
+    /,
+    *,
+    live: bool = False,
+    config: LivePlanConfig = LIVE_PLAN,
+    output: Output = OUTPUT,
+) -> int:
+    """Plan for a cell that asks over zenoh (--live); stop with Ctrl-C.
+
+    Example: robot-gst plan runs/today --live --cell standin
+
+    Args:
+        run: Run folder with the rebuilt scene.
+        live: Answer a cell's requests.
+        config: Settings.
+        output: How to talk.
+    """
+    from bridge.errors import UsageError
+    from twin.plan.live import run_planner
+
+    if not live:
+        message = "say whom to plan for: robot-gst plan RUN --live answers a cell's requests."
+        raise UsageError(message)
+    return run_planner(run, config, output)
 
 
 def rebuild(

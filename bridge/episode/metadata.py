@@ -5,7 +5,7 @@ survive the round trip.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import cache
 from types import UnionType
@@ -42,6 +42,28 @@ class EpisodeInfo:
     stand_in: bool = False
     tags: tuple[str, ...] = ()
     schema_version: int = SCHEMA_VERSION
+
+    @property
+    def study_arm(self) -> str:
+        """The study arm of a trial; empty outside a study."""
+        return study_arm_of(self.tags)
+
+
+STUDY_ARM_TAG = "study_arm:"
+
+
+def study_arm_of(tags: Iterable[str]) -> str:
+    """Read the study arm from an episode's tags; empty outside a study."""
+    found = (tag for tag in tags if tag.startswith(STUDY_ARM_TAG))
+    return next(found, "").removeprefix(STUDY_ARM_TAG)
+
+
+CONTROL = "control"
+
+
+def treatment_of(condition: str, study_arm: str) -> str:
+    """What trials are grouped by: the condition, but for a study's control, a group of its own."""
+    return CONTROL if study_arm == CONTROL else condition
 
 
 @dataclass(frozen=True, kw_only=True)

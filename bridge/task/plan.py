@@ -10,6 +10,9 @@ from jaxtyping import Float, Int
 from bridge.task.record import check_record, load_record, parse_record
 
 SCHEMA_VERSION = 1
+STUDY_ARMS = ("without", "with", "control")
+"""How a study treats a start: the first plan is executed; the gate chooses among several; a coin
+does. A robot's arm is another thing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +49,27 @@ class Stage:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Ranking:
+    """Which of a planner's candidates a plan is."""
+
+    rank: int
+    """0 is the one the planner likes best."""
+    cost: float
+    """What it is ranked by; less is better."""
+    seed: int
+    """What it was drawn with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteeredBy:
+    """What of a refusal changed this plan."""
+
+    clause: str
+    """The factor that failed, and its cause: ``terminal.inside``."""
+    bodies: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What will be commanded, and why; the authority over the viewers' trajectory topics."""
 
@@ -66,6 +90,14 @@ class Plan:
     entities: dict[str, Any] = field(default_factory=dict)
     keypoints_m: tuple[tuple[float, float, float], ...] = ()
     joint_names: tuple[str, ...] = ()
+    task_sha256: str = ""
+    """Of the task file it was made for; empty: not known."""
+    scene_hash: str | None = None
+    """Of the rebuilt scene it was made in; None: in none."""
+    candidate: Ranking | None = None
+    steered_by: SteeredBy | None = None
+    study_arm: str = ""
+    """One of ``STUDY_ARMS``; empty outside a study."""
 
     def to_json(self) -> bytes:
         """Serialise, refusing what the schema refuses."""
@@ -73,6 +105,9 @@ class Plan:
         for stage in record["stages"]:
             if stage["push"] is None:  # plans that push nothing are written as they always were
                 del stage["push"]
+        for name in LATER_FIELDS:  # likewise what plans had not from the beginning
+            if not record[name]:
+                del record[name]
         check_record(record, name="plan")
         return json.dumps(record, separators=(",", ":")).encode()
 
@@ -99,6 +134,13 @@ class Plan:
         known["tau"] = tuple(_waypoint(waypoint) for waypoint in record["tau"])
         known["keypoints_m"] = tuple(tuple(p) for p in record.get("keypoints_m", []))
         known["joint_names"] = tuple(record.get("joint_names", []))
+        if known.get("candidate") is not None:
+            ranking = known["candidate"]
+            names = Ranking.__dataclass_fields__
+            known["candidate"] = Ranking(**{name: ranking[name] for name in names})
+        if known.get("steered_by") is not None:
+            clause, bodies = known["steered_by"]["clause"], known["steered_by"].get("bodies", [])
+            known["steered_by"] = SteeredBy(clause=clause, bodies=tuple(bodies))
         return Plan(**known)
 
     def times_ns(self) -> Int[np.ndarray, " num_waypoints"]:
@@ -119,6 +161,10 @@ class Plan:
             if stage.t_start_ns <= t_ns < stage.t_end_ns:
                 return stage
         return self.stages[-1] if self.stages and t_ns >= self.stages[-1].t_end_ns else None
+
+
+LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm")
+"""Written only where they say something: plans without them keep their bytes."""
 
 
 def _stage(record: dict[str, Any]) -> Stage:

@@ -64,6 +64,10 @@ class Verdict:
     """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
     checks: Mapping[str, Factor] = field(default_factory=dict)
     """Further factors, by their names in ``CHECKS``; one that was not asked for is absent."""
+    grasps: tuple[dict[str, Any], ...] = ()
+    """What became of each grasp in the simulation: object, touched and held (yes or no), and
+    p_object_m, where the tool was in the object's frame when a finger first touched it; a planner
+    steers by them."""
 
     def factors(self) -> dict[str, Factor]:
         """All factors by name, in the order in which a plan is examined."""
@@ -89,6 +93,8 @@ class Verdict:
         """Serialise, refusing what the schema refuses."""
         record = {"schema_version": SCHEMA_VERSION, "accepted": self.accepted, **asdict(self)}
         record = json.loads(json.dumps(record))
+        if not record["grasps"]:
+            del record["grasps"]
         check_record(record, name="verdict")
         return json.dumps(record, separators=(",", ":")).encode()
 
@@ -101,6 +107,7 @@ class Verdict:
             known[name] = _factor(record[name])
         known["warnings"] = tuple(record.get("warnings") or ())
         known["findings"] = tuple(record.get("findings") or ())
+        known["grasps"] = tuple(record.get("grasps") or ())
         checks = record.get("checks") or {}
         known["checks"] = {name: _factor(item) for name, item in checks.items()}
         known.setdefault("trajectory", "planned")

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.decisions import decisions
@@ -19,6 +20,7 @@ from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
 from evaluator.compare.stages import failures_table, stage_results
+from evaluator.compare.study import study_results
 from evaluator.compare.success import (
     WITH,
     WITHOUT,
@@ -48,6 +50,7 @@ class _Found:
     exclusions: tuple[Exclusion, ...]
     gains: list[Measurement]
     again_tables: tuple[Table, ...]
+    study_tables: tuple[Table, ...]
     gate_tables: tuple[Table, ...]
     """What the gate is scorecard, and whether its success probability can be relied on."""
     stage_tables: tuple[Table, ...]
@@ -62,6 +65,7 @@ def compare_rows(
     stand_in: bool | None,
     method: str = "wilson",
     goal: float | None = None,
+    void_causes: Sequence[str] = VOID_CAUSES,
 ) -> Comparison:
     """Measure everything that follows from trial rows alone, wherever they came from.
 
@@ -72,6 +76,7 @@ def compare_rows(
         stand_in: Whether the recorded side is a simulated laboratory.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: Success rate to stop or continue for.
+        void_causes: How outcomes of a study begin that make a start void in all arms.
 
     Raises:
         AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
@@ -81,7 +86,7 @@ def compare_rows(
         return empty
     for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(row, kind), row.episode or "streamed") for row in rows))
-    found = _measure(rows, method)
+    found = _measure(rows, method, void_causes)
     return replace(
         empty,
         rows=tuple(rows),
@@ -93,7 +98,7 @@ def compare_rows(
     )
 
 
-def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
+def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) -> _Found:
     rates = side_rates(rows, method=method)
     groups = rate_groups(rows, rates, method=method)
     gains = replanning_gains(groups, method=method)
@@ -104,6 +109,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
     chosen, decision_tables = decisions(groups)
+    study, study_tables, void = study_results(rows, void_causes, method=method)
     measurements = (
         *rates,
         *(rate for group in groups for rate in group.pair),
@@ -113,6 +119,7 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
         *gains,
         *gain_tests(groups),
         *again,
+        *study,
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
@@ -127,9 +134,10 @@ def _measure(rows: Sequence[TrialRow], method: str) -> _Found:
     return _Found(
         groups=groups,
         measurements=measurements,
-        exclusions=(*unpaired, *other_stages),
+        exclusions=(*unpaired, *void, *other_stages),
         gains=gains,
         again_tables=again_tables,
+        study_tables=study_tables,
         gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
         decision_tables=decision_tables,
@@ -145,6 +153,7 @@ def _tables(
         success_table(groups, word),
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
+        *found.study_tables,
         *found.again_tables,
         *notes_table(notes(groups, measurements)),
         *agreement_intervals(groups),

@@ -66,11 +66,14 @@ def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusi
     conditions = {row.condition for row in rows}
     if not {WITHOUT, WITH} <= conditions:
         return [], []
+    replanned = {(row.task, row.policy) for row in rows if row.condition == WITH}
     groups: dict[tuple[str, str, str], list[TrialRow]] = {}
     left_out = []
     for row in rows:
         if row.condition not in (WITHOUT, WITH):
             continue
+        if row.study_arm and (row.task, row.policy) not in replanned:
+            continue  # a policy that the study tries without replanning alone
         if row.start_id is None:
             left_out.append(_out(row, "no start_id"))
         else:

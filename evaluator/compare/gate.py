@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from bridge.episode.metadata import CONTROL
 from evaluator.compare.measure import ends, measured, proportion, vouched_rate
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
@@ -217,7 +218,7 @@ def unheeded_verdict(row: TrialRow) -> bool | None:
 
     Only these trials can show a false refusal, and only they are not selected by the gate.
     """
-    return row.verdict if row.condition == WITHOUT else None
+    return row.verdict if row.condition in (WITHOUT, CONTROL) else None
 
 
 def heeded_verdict(row: TrialRow) -> bool | None:

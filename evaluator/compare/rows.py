@@ -80,6 +80,10 @@ class TrialRow:
     executed_replay: str | None = None
     failing_cause: str | None = None
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
+    study_arm: str = ""
+    """without, with or control; empty outside a study."""
+    why_unknown: str = ""
+    """What was said of an outcome that is not known."""
     stages: tuple[tuple[str, bool | None], ...] = ()
     """How each stage ended as labelled, in order; empty where nobody said."""
     clauses: tuple[tuple[str, bool], ...] = ()

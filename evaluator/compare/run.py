@@ -8,6 +8,7 @@ from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import trials_path
+from bridge.task.protocol import VOID_CAUSES, read_protocol
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.bands import BandReport, compare_bands
@@ -82,6 +83,7 @@ def compare_run(
         methods,
         bands,
     )
+    protocol = read_protocol(run.path)
     base = compare_rows(
         rows,
         run=run.path.resolve().name,
@@ -89,6 +91,7 @@ def compare_run(
         stand_in=_stand_in(contents, imported),
         method=method,
         goal=goal,
+        void_causes=VOID_CAUSES if protocol is None else protocol.void_causes,
     )
     base = replace(
         base,

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.metadata import Outcome
+from bridge.episode.catalogue_store import UNLABELLED
+from bridge.episode.metadata import Outcome, treatment_of
 from bridge.episode.reader import Episode
 from bridge.episode.streams import pose_track
 from bridge.episode.topics import TCP_POSE
@@ -117,6 +118,12 @@ def _unlabelled(outcome: Outcome | None) -> list[str]:
     return []
 
 
+def _why_unknown(outcome: Outcome | None) -> str:
+    if outcome is None:
+        return UNLABELLED
+    return (outcome.detail or UNLABELLED) if outcome.result == "unknown" else ""
+
+
 def _impossible_count(outcome: Outcome | None) -> str:
     """Say what is wrong with a count of objects or sub-tasks; nothing where it can be."""
     if outcome is None or outcome.unit == "trial":
@@ -142,7 +149,9 @@ def _row(
     return TrialRow(
         episode=info.id,
         task=info.task,
-        condition=info.condition,
+        condition=treatment_of(info.condition, info.study_arm),
+        study_arm=info.study_arm,
+        why_unknown=_why_unknown(outcome),
         policy=info.policy,
         start_id=info.start_id,
         cell=info.cell,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from bridge.episode.catalogue_store import Entry
-from bridge.episode.metadata import WITH, WITHOUT
+from bridge.episode.metadata import WITH, WITHOUT, study_arm_of, treatment_of
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.sequential import (
     Advice,
@@ -64,7 +64,7 @@ def trial_of(entry: Entry) -> LiveTrial | None:
     return LiveTrial(
         episode=entry.id,
         task=entry.task,
-        condition=entry.condition,
+        condition=treatment_of(entry.condition, study_arm_of(entry.tags)),
         policy=entry.policy,
         start_id=entry.start_id,
         recorded=OUTCOMES.get(entry.outcome),

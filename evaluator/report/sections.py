@@ -80,8 +80,9 @@ SECTIONS: tuple[Section, ...] = (
             ("unpaired.boschloo_p.recorded.pooled", "Boschloo's p over pooled trials"),
             ("paired.start_distance_max_m", "Largest distance of paired starts"),
             ("sequence.replanning_evidence.recorded", "Evidence, valid at any time"),
+            ("study.*", ""),
         ),
-        tables=("gains",),
+        tables=("study_arms", "study_gains", "gains"),
         figures=("gains",),
     ),
     Section(

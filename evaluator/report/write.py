@@ -19,7 +19,17 @@ from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
-SHOWN = ("published", "success", "layout", "gains", "image_methods", "stopping", "notes")
+SHOWN = (
+    "published",
+    "success",
+    "layout",
+    "study_arms",
+    "study_gains",
+    "gains",
+    "image_methods",
+    "stopping",
+    "notes",
+)
 """Tables a terminal shows; the others are in the report."""
 
 GROUPS = "success"

@@ -75,7 +75,7 @@ def without_commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         return [sys.executable, "-c", "print('ready', flush=True); import time; time.sleep(0.2)"]
 
     monkeypatch.setattr(demo, "_command", command)
-    monkeypatch.setattr(demo, "_answers", lambda *_: True)
+    monkeypatch.setattr(demo, "answers", lambda *_: True)
     monkeypatch.setattr(demo.Background, "check", lambda _: None)
     return asked
 
@@ -211,7 +211,7 @@ def test_a_trial_without_outcome_stands_in_the_end_with_its_cause(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record_all(run)
-    monkeypatch.setattr(demo, "_step", lambda *_, **__: None)
+    monkeypatch.setattr(demo, "step", lambda *_, **__: None)
     monkeypatch.setattr(demo, "_record", lambda run, config, _: look(run, config))
     monkeypatch.setattr(demo, "_refuse_nothing", lambda *_: None)
     (run.episodes_dir / "trial_0002.mcap").unlink()

@@ -121,8 +121,8 @@ def test_a_terminated_demo_ends_what_it_started(
 
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
-        monkeypatch.setattr(demo, "_start", start)
-        monkeypatch.setattr(demo, "_answers", answers)
+        monkeypatch.setattr(demo, "start_command", start)
+        monkeypatch.setattr(demo, "answers", answers)
         assert robot_gst.run(["demo", str(tmp_path / "run"), "--quiet"]) == 130
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
     finally:

@@ -23,9 +23,9 @@ class GateConfig:
     """zenoh configuration (JSON5), for example with certificates."""
     cell: str = "standin"
     """Whose plans are judged: topics and the service are below this name."""
-    task: str = "cube_into_box"
-    """The task whose objects and success predicate count: a name of the run's tasks/ or of
-    datasets/tasks, or a file."""
+    task: str = ""
+    """The only task that is judged: a name of the run's tasks/ or of datasets/tasks, or a file;
+    empty: whichever of those a plan names with the hash of its file (task, task_sha256)."""
     robot: str = ""
     """Robot file, by name or path, whose description takes the place of the published one; none:
     the robot that the cell describes (docs/robots.md)."""

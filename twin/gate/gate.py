@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,8 +20,9 @@ from jaxtyping import Float
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION, cell_topic
 from bridge.errors import GstError
 from bridge.robots.robot import Robot, robot_name, robot_of
+from bridge.task.find import Attached, find_task_file
 from bridge.task.plan import Plan
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import ObjectModel, Task, TaskFile
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
@@ -164,12 +166,61 @@ class Perception(Protocol):
         """
 
 
+@dataclass(frozen=True, kw_only=True)
+class JudgedTasks:
+    """Which task files a gate judges by: one alone, or whichever a plan names with its hash."""
+
+    only: TaskFile | None = None
+    """The one alone; None: any of the run's ``tasks/`` and of those that ship."""
+    tasks_dir: Path | None = None
+    """The run's folder of task files."""
+
+    def find(self, name: str, sha256: str) -> Task:
+        """Return the task that somebody names.
+
+        Args:
+            name: Of the task; "" for the gate's only one.
+            sha256: Of its file; "" where the asker does not know, which the only one forgives.
+
+        Raises:
+            UndecidedError: When it is not one that this gate judges.
+            MissingTaskError: When there is no such file.
+        """
+        if self.only is None:
+            if not name or not sha256:
+                raise UndecidedError(
+                    f"task {name!r} is named {'with' if sha256 else 'without'} the hash of its "
+                    "file; a gate that judges any task needs both (task, task_sha256), or its "
+                    "--task"
+                )
+            return find_task_file(
+                name, tasks_dir=self.tasks_dir, attached=Attached(sha256=sha256)
+            ).task()
+        task = self.only.task()
+        if name not in ("", task.name):
+            raise UndecidedError(
+                f"task {name!r} is asked for; this gate judges {task.name!r} alone. Start it "
+                "without --task, or with another one."
+            )
+        if sha256 not in ("", self.only.sha256):
+            raise UndecidedError(
+                f"the file of task {task.name!r} that is asked for has sha256 {sha256[:12]}; this "
+                f"gate judges by {self.only.origin}, sha256 {self.only.sha256[:12]}"
+            )
+        return task
+
+    @property
+    def words(self) -> str:
+        """For a person."""
+        return "any task" if self.only is None else self.only.task().name
+
+
 Localise = Callable[[Any, Task, float], Mapping[str, Any]]
 """Frames, the task and when to be done, on the monotonic clock [s]; objects as localised."""
 Joints = Float[np.ndarray, " num_joints"]
-Replay = Callable[[Plan, Mapping[str, Any], str, Joints, float], Verdict]
-"""A plan, the objects as localised, the URDF, where the arm's joints are [rad] and when to be done,
-on the monotonic clock [s]."""
+Replay = Callable[[Plan, Task, Mapping[str, Any], str, Joints, float], Verdict]
+"""A plan, what it is judged by, the objects as localised, the URDF, where the arm's joints are
+[rad] and when to be done, on the monotonic clock [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +244,7 @@ class Gate:
     def __init__(
         self,
         *,
-        task: Task,
+        tasks: JudgedTasks,
         config: GateConfig,
         perception: Perception,
         localise: Localise,
@@ -201,7 +252,7 @@ class Gate:
         now_ns: Callable[[], int],
     ) -> None:
         """Put together what sees, what finds objects and what replays."""
-        self._task = task
+        self._tasks = tasks
         self._config = config
         self._perception = perception
         self._localise = localise
@@ -211,8 +262,8 @@ class Gate:
         self._counting = threading.Lock()
         self._inside = 0
         self._contact_ns = 0
-        self._seen: tuple[object, Mapping[str, Any]] | None = None
-        """The frames that were looked at last, and what was found in them."""
+        self._seen: tuple[Task, object, Mapping[str, Any]] | None = None
+        """The frames that were looked at last, for which task, and what was found in them."""
 
     def judge(self, payload: bytes) -> Verdict:
         """Judge one plan; the wall-clock limit counts from here, reading it included.
@@ -236,21 +287,23 @@ class Gate:
             with self._counting:
                 self._inside -= 1
 
-    def localise(self, task_name: str) -> Located:
+    def localise(self, task_name: str, task_sha256: str = "") -> Located:
         """Say where the objects are now, seen and found as for a verdict; for the planner.
 
         Bounded like a verdict. What hinders a verdict hinders this: the answer is then undecided.
 
         Args:
-            task_name: Of the task whose objects are asked for; "" for the gate's own.
+            task_name: Of the task whose objects are asked for; "" for the gate's only one.
+            task_sha256: Of its file; "" where the asker does not know.
         """
         ends_s = time.monotonic() + self._config.deadline_s
         if not self._turn.acquire(timeout=self._config.deadline_s):
             return Located(found=None, reason="a plan was being judged up to --deadline")
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
-            self._refuse_to_look(task_name, silent_ns)
-            found = self._look(self._wait_for_frames(), ends_s)
+            task = self._tasks.find(task_name, task_sha256)
+            self._refuse_to_look(silent_ns)
+            found = self._look(task, self._wait_for_frames(), ends_s)
             missing = _missing(found)
             return Located(
                 found=not missing, reason=with_reasons(missing) if missing else None, objects=found
@@ -261,12 +314,7 @@ class Gate:
             self._contact_ns = self._now_ns() - silent_ns
             self._turn.release()
 
-    def _refuse_to_look(self, task_name: str, silent_ns: int) -> None:
-        if task_name not in ("", self._task.name):
-            raise UndecidedError(
-                f"task {task_name!r} is asked for; this gate judges {self._task.name!r}. "
-                "Start it with --task."
-            )
+    def _refuse_to_look(self, silent_ns: int) -> None:
         running = self._perception.executing()
         if running is not None:
             raise UndecidedError(f"{running} is being executed; objects are localised at rest")
@@ -307,10 +355,11 @@ class Gate:
     def _decide(self, plan: Plan, arrived_ns: int, ends_s: float) -> Verdict:
         silent_ns = self._now_ns() - max(self._perception.heard_ns(), self._contact_ns)
         try:
+            task = self._tasks.find(plan.task, plan.task_sha256)
             urdf = self._check(plan)
             self._refuse_silence(silent_ns)
             start_rad = self._where_the_arm_is(arrived_ns, robot_of(urdf))
-            verdict = self._judged(plan, urdf, start_rad, ends_s)
+            verdict = self._judged(plan, task, urdf, start_rad, ends_s)
             # A cell that waits for the verdict may stand still meanwhile: not counted as silence.
             self._contact_ns = self._now_ns() - silent_ns
             return verdict
@@ -354,28 +403,25 @@ class Gate:
             raise UndecidedError(f"the joint states on {topic} hold no numbers for every joint")
         return values[order]
 
-    def _judged(self, plan: Plan, urdf: str, start_rad: Joints, ends_s: float) -> Verdict:
+    def _judged(
+        self, plan: Plan, task: Task, urdf: str, start_rad: Joints, ends_s: float
+    ) -> Verdict:
         frames = self._wait_for_frames()
-        found = self._find_objects(frames, ends_s)
-        elsewhere = of_another_scene(plan, found, self._task, self._config.other_scene_m)
+        found = self._find_objects(task, frames, ends_s)
+        elsewhere = of_another_scene(plan, found, task, self._config.other_scene_m)
         if elsewhere:
             raise UndecidedError(f"plan {plan.id} was made for another scene: {elsewhere}")
-        verdict = self._replay(plan, found, urdf, start_rad, ends_s)
+        verdict = self._replay(plan, task, found, urdf, start_rad, ends_s)
         if verdict.accepted is not True:
             return verdict
         verdict = self._likely(verdict)
         if verdict.accepted is True:
-            self._look_again(found, frames, ends_s)
+            self._look_again(task, found, frames, ends_s)
             self._feel_again(start_rad, robot_of(urdf))
         return verdict
 
     def _check(self, plan: Plan) -> str:
         """Refuse plans this gate cannot judge; return the robot description."""
-        if plan.task and plan.task != self._task.name:
-            raise UndecidedError(
-                f"plan {plan.id} is for task {plan.task!r}; this gate judges {self._task.name!r}. "
-                "Start it with --task."
-            )
         urdf = self._perception.urdf()
         if urdf is None:
             raise UndecidedError(f"no robot description has arrived on {ROBOT_DESCRIPTION}")
@@ -395,15 +441,15 @@ class Gate:
             raise UndecidedError(f"{running} is being executed; objects are judged at rest")
         return urdf
 
-    def _look(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
+    def _look(self, task: Task, frames: Any, ends_s: float) -> Mapping[str, Any]:
         """Localise; the same frames are not searched twice: planners ask again from one start."""
-        looked_at = [(getattr(frame, "camera_id", ""), int(frame.stamp_ns)) for frame in frames]
-        if self._seen is None or self._seen[0] != looked_at:
-            self._seen = looked_at, self._localise(frames, self._task, ends_s)
-        return self._seen[1]
+        stamps = [(getattr(frame, "camera_id", ""), int(frame.stamp_ns)) for frame in frames]
+        if self._seen is None or self._seen[:2] != (task, stamps):
+            self._seen = task, stamps, self._localise(frames, task, ends_s)
+        return self._seen[2]
 
-    def _find_objects(self, frames: Any, ends_s: float) -> Mapping[str, Any]:
-        found = self._look(frames, ends_s)
+    def _find_objects(self, task: Task, frames: Any, ends_s: float) -> Mapping[str, Any]:
+        found = self._look(task, frames, ends_s)
         missing = _missing(found)
         if missing:
             raise UndecidedError(f"not every object was found: {with_reasons(missing)}")
@@ -445,7 +491,7 @@ class Gate:
         unlikely = Factor(value=False, cause="probability", detail=detail)
         return replace(verdict, terminal=unlikely, reason=f"terminal: probability: {detail}")
 
-    def _look_again(self, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
+    def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
         """Before a yes: the cell must still be as it was judged.
 
         Raises:
@@ -463,8 +509,8 @@ class Gate:
             return
         moved = who_moved(
             found,
-            self._find_objects(live.frames, ends_s),
-            self._task,
+            self._find_objects(task, live.frames, ends_s),
+            task,
             moved_m=self._config.moved_m,
             moved_rad=self._config.moved_rad,
         )

@@ -26,12 +26,11 @@ from bridge.episode.topics import (
 from bridge.errors import UsageError
 from bridge.robots.robot import read_robot
 from bridge.task.find import chosen_task_file
-from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate, Perception
+from twin.gate.gate import Gate, JudgedTasks, Perception
 from twin.gate.twin_process import TwinProcess
 
 CELL_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
@@ -43,7 +42,7 @@ class GateError(TwinError):
 
 
 def make_gate(
-    task: Task,
+    tasks: JudgedTasks,
     config: GateConfig,
     perception: Perception,
     now_ns: Callable[[], int],
@@ -52,14 +51,14 @@ def make_gate(
     """Put the real localisation and replay behind the gate.
 
     Args:
-        task: What plans are judged by.
+        tasks: What plans are judged by.
         config: Limits and deadline.
         perception: What the cell shows now.
         now_ns: The clock on which messages arrive; says how long the cell has been silent.
         twin: The process that localises and replays.
     """
     return Gate(
-        task=task,
+        tasks=tasks,
         config=config,
         perception=perception,
         localise=twin.localise,
@@ -122,7 +121,7 @@ def serve_localisation(
 
     def answer(payload: bytes) -> bytes:
         request = _request(payload)
-        located = gate.localise(str(request.get("task", "")))
+        located = gate.localise(str(request.get("task", "")), str(request.get("task_sha256", "")))
         records, stamp_ns = located.records(), perception.newest_ns() or session.now_ns()
         for record in records:
             publisher.put(json.dumps(record).encode(), source_ns=stamp_ns)
@@ -135,13 +134,15 @@ def serve_localisation(
 
 
 def _request(payload: bytes) -> dict[str, Any]:
-    """Read ``{"task": NAME}``; nothing at all asks for the gate's own task."""
+    """Read ``{"task": NAME, "task_sha256": HASH}``; nothing asks for the gate's only task."""
     try:
         request = json.loads(payload or b"{}")
     except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict):
-        raise GateError('what is asked of /gate/localise is JSON: {"task": "its name"}')
+        raise GateError(
+            'what is asked of /gate/localise is JSON: {"task": "its name", "task_sha256": "..."}'
+        )
     return request
 
 
@@ -206,22 +207,27 @@ def run_gate(path: Path, config: GateConfig, output: Output) -> int:
         message = f"cell name {config.cell!r} is not usable: letters, digits, '_' and '-'."
         raise UsageError(message)
     run = RunFolder.open(path)
-    task = chosen_task_file(config.task, tasks_dir=run.tasks_dir).task()
+    tasks = JudgedTasks(
+        only=chosen_task_file(config.task, tasks_dir=run.tasks_dir) if config.task else None,
+        tasks_dir=run.tasks_dir,
+    )
+    if tasks.only is not None:
+        config.replay.refuse_soft(tasks.only.task().soft_objects)
     urdf = read_robot(config.robot).description() if config.robot else None
     perception = LiveView(config.cell, read_calibration(run), urdf)
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with (
         stop_signals() as stopped,
         open_session(wire) as session,
-        TwinProcess(run.path, task, config, output) as twin,
+        TwinProcess(run.path, config, output) as twin,
     ):
         claim_gate(session, config.cell)
         watch_cell(session, config.cell, perception.take)
-        gate = make_gate(task, config, perception, session.now_ns, twin)
+        gate = make_gate(tasks, config, perception, session.now_ns, twin)
         serve_gate(session, gate, perception, config, output)
         serve_localisation(session, gate, perception, config, output)
         output.say(
-            f"gate ready: {task.name} of cell {config.cell}, service {config.cell}{GATE}, "
+            f"gate ready: {tasks.words} of cell {config.cell}, service {config.cell}{GATE}, "
             f"{perception.cameras_from()}. Stop with Ctrl-C."
         )
         while not stopped.wait(0.2):

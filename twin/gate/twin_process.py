@@ -103,6 +103,11 @@ def answer(question: Question) -> Verdict:
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
     )
     scene = replace(scene, start_rad=question.start_rad)
+    if plan.scene_hash not in (None, scene.scene_hash):
+        raise UndecidedError(
+            f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
+            f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
+        )
     config = for_task(calibrated(question.config, read_calibration(run)), question.task)
     # Of a plan with impossible times the replay says what is wrong.
     end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
@@ -155,10 +160,9 @@ def _with_notes(verdict: Verdict, notes: tuple[str, ...]) -> Verdict:
 class TwinProcess:
     """Localises and replays for a gate. A context manager; for one caller at a time."""
 
-    def __init__(self, run_path: Path, task: Task, config: GateConfig, output: Output) -> None:
+    def __init__(self, run_path: Path, config: GateConfig, output: Output) -> None:
         """Start it; it imports what it needs while the gate connects."""
-        config.replay.refuse_soft(task.soft_objects)
-        self._run_path, self._task, self._output = run_path, task, output
+        self._run_path, self._output = run_path, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps
         self._max_audit_distances = config.max_audit_distances
@@ -197,6 +201,7 @@ class TwinProcess:
     def replay(
         self,
         plan: Plan,
+        task: Task,
         found: Mapping[str, Any],
         urdf: str,
         start_rad: Float[np.ndarray, " num_joints"],
@@ -206,6 +211,7 @@ class TwinProcess:
 
         Args:
             plan: What is to be judged.
+            task: What it is judged by.
             found: The task's objects as localised, by name.
             urdf: Description of the robot.
             start_rad: Joints as the robot reports them.
@@ -213,11 +219,13 @@ class TwinProcess:
 
         Raises:
             UndecidedError: When there is no answer in time, or none at all.
+            UsageError: When this replay cannot move the task's soft objects.
         """
+        self._config.refuse_soft(task.soft_objects)
         question = Question(
             run_path=self._run_path,
             plan=plan,
-            task=self._task,
+            task=task,
             Ts_base_object={name: item.T_base_object for name, item in found.items()},
             covariances={
                 name: item.covariance for name, item in found.items() if item.covariance is not None

@@ -80,6 +80,38 @@ def _grasped(plan: Plan, t_ns: int) -> str | None:
     return max(begun, key=lambda stage: stage.t_start_ns).grasp if begun else None
 
 
+def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict[str, object], ...]:
+    """What became of each grasp of a plan, for whoever plans again; as verdicts keep it.
+
+    Args:
+        plan: Which object each stage grasps, and when the gripper is to be closed.
+        path: The plan's, with the gripper as late as it is replayed.
+        result: Where hand and objects were.
+    """
+    held = {hold.object_id for hold in grasped_objects(plan, path, result)}
+    seen = []
+    for first, end in _closed(plan, path, result.stamps_ns):
+        name = _grasped(plan, int(result.stamps_ns[first]))
+        if name is None or name not in result.finger_contact:
+            continue
+        contact = result.finger_contact[name][first:end]
+        p_object_m = None
+        if contact.any():
+            when = first + int(contact.argmax())
+            T_object_base = se3.invert(result.Ts_base_object[name][when])
+            tool_m = se3.apply(T_object_base, result.Ts_base_tcp[when][None, :3, 3])[0]
+            p_object_m = tool_m.round(6).tolist()
+        seen.append(
+            {
+                "object": name,
+                "touched": bool(contact.any()),
+                "held": name in held,
+                "p_object_m": p_object_m,
+            }
+        )
+    return tuple(seen)
+
+
 def slips(holds: Sequence[GraspedObject], limit_m: float) -> list[Failure]:
     """The holds in which an object moves farther than a limit, from when it does.
 

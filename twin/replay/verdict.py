@@ -39,7 +39,7 @@ from twin.replay.failure import Failure, factor_from
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.slip import grasped_objects, slips, unless_slipped
+from twin.replay.slip import grasped_objects, grasps_seen, slips, unless_slipped
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
@@ -306,7 +306,8 @@ def _replay(
     )
     # What was executed is judged by where things end: it is known whether they were dropped.
     slipped: list[Failure] = []
-    if physics and commanded.trajectory == "planned" and config.max_slip_m is not None:
+    planned = physics and commanded.trajectory == "planned"
+    if planned and config.max_slip_m is not None:
         slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
     terminal = terminal_factor(
         result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
@@ -326,6 +327,7 @@ def _replay(
         warnings=warnings_of(scene, result),
         findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if physics else (),
         checks={name: factor_from(found) for name, found in checks.items()},
+        grasps=grasps_seen(plan, path, result) if planned else (),
     )
     return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
 

@@ -98,6 +98,7 @@ class StandinCell:
         config: CellConfig,
         seed: int,
         start_ns: int,
+        first_start: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
         sleep: Callable[[float], None] = time.sleep,
         monotonic: Callable[[], float] = time.monotonic,
@@ -123,7 +124,9 @@ class StandinCell:
             }
         self._seed = seed
         self._backdrops: dict[str, Layer] = {}
-        self._rng = np.random.default_rng([SENSOR_STREAM, seed])
+        # A session that begins at a later start has other noise than one that begins at the first.
+        begins = [first_start] if first_start else []
+        self._rng = np.random.default_rng([SENSOR_STREAM, seed, *begins])
         self._should_stop = should_stop
         self._sleep, self._monotonic = sleep, monotonic
         self._wall_start_s = monotonic()

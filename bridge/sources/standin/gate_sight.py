@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode.topics import LOCALISE, cell_topic
 from bridge.errors import BridgeError
 from bridge.geometry import se3
+from bridge.sources.standin.streams import Session
 from bridge.task.record import check_record
 from bridge.task.task_file import Task
 
@@ -27,6 +29,8 @@ class GateSight:
     """Whether every object of the task was found; None: nobody looked."""
     reason: str = ""
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
+    records: tuple[dict[str, Any], ...] = ()
+    """The gst localisation v1 records they are from, in the order of the task's objects."""
 
     @property
     def problem(self) -> str:
@@ -58,14 +62,40 @@ class GateSight:
             found, reason = record["found"], str(record["reason"] or "")
             if found is not True:
                 return GateSight(found=False if found is False else None, reason=reason)
-            poses = dict(_pose(item) for item in record["objects"])
+            records = {str(item["object"]): item for item in record["objects"]}
+            poses = dict(_pose(item) for item in records.values())
         except (BridgeError, ValueError, KeyError, TypeError, RecursionError) as error:
             return GateSight(found=None, reason=f"the gate's answer cannot be read: {error}")
         missing = [key for key in task.objects if key not in poses]
         if missing:
             reason = f"the gate's answer says nothing of {', '.join(missing)}"
             return GateSight(found=None, reason=reason)
-        return GateSight(found=True, Ts_base_object={key: poses[key] for key in task.objects})
+        return GateSight(
+            found=True,
+            Ts_base_object={key: poses[key] for key in task.objects},
+            records=tuple(records[key] for key in task.objects),
+        )
+
+
+def ask_where(
+    session: Session, cell: str, task: Task, task_sha256: str, *, timeout_s: float
+) -> GateSight:
+    """Ask a cell's gate where a task's objects are.
+
+    Args:
+        session: Where the gate answers.
+        cell: Name the gate was started with.
+        task: All of whose objects must be found.
+        task_sha256: Of its file; "" where it is not known.
+        timeout_s: How long to wait [s].
+    """
+    key = cell_topic(cell, LOCALISE)[1:]
+    payload = json.dumps({"task": task.name, "task_sha256": task_sha256}).encode()
+    try:
+        answer = session.query(key, payload, timeout_s=timeout_s)
+        return GateSight.from_json(answer, task)
+    except BridgeError as error:
+        return GateSight(found=None, reason=str(error))
 
 
 def _pose(record: dict[str, Any]) -> tuple[str, Float[np.ndarray, "4 4"]]:

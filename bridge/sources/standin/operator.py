@@ -3,7 +3,6 @@
 import contextlib
 import json
 import re
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -12,25 +11,25 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode.metadata import EpisodeInfo, Outcome
-from bridge.episode.topics import GATE, LOCALISE, cell_topic
-from bridge.errors import BridgeError, UsageError
+from bridge.episode.metadata import (
+    STUDY_ARM_TAG,
+    WITH,
+    WITHOUT,
+    EpisodeInfo,
+    Outcome,
+    study_arm_of,
+)
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
-from bridge.sources.standin.gate_sight import GateSight, NotSeenError
-from bridge.sources.standin.kinematics import UnreachablePoseError
-from bridge.sources.standin.planner import (
-    GROUNDING,
-    GROUNDING_GATE,
-    POLICY_NAME,
-    draw_errors,
-    perceive,
-    plan_pick_and_place,
-)
+from bridge.sources.standin.decisions import Decider
+from bridge.sources.standin.gate_sight import NotSeenError
+from bridge.sources.standin.planner import perceive
 from bridge.sources.standin.probes import PROBES, NoSpaceForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import (
+    CONDITION_OF,
     CONDITIONS,
     INTERRUPTED,
     SEEDS_PER_SESSION,
@@ -40,7 +39,6 @@ from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
 from bridge.task.task_file import Task, TaskFile
-from bridge.task.verdict import Verdict
 from bridge.terminal import Output
 
 OPERATOR = "stand-in operator"
@@ -193,6 +191,9 @@ def _pieces(plan: Plan) -> list[tuple[int, int]]:
 
 
 RESET_STREAM = 404
+RESETS = {WITHOUT: 0, WITH: 1, "without": 0, "with": 1, "control": 3}
+RESET_OF_A_SCAN = 2
+ORDER_STREAM = 606
 PROBE_STREAM = 505
 PROBE_TRIES = 100
 """The object is put elsewhere until there is space for the probe."""
@@ -208,13 +209,22 @@ LISTED = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Decision:
-    """What will be executed, and why nothing when nothing is."""
+class Treatment:
+    """What is done with a start."""
 
-    plan: Plan | None
-    void: bool
-    """Nobody judged the plan: the trial says nothing about the planner."""
-    remark: str
+    condition: str
+    study_arm: str = ""
+    """Empty outside a study."""
+
+    @property
+    def name(self) -> str:
+        """The study arm, or the condition where there is none."""
+        return self.study_arm or self.condition
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """Of its episode."""
+        return (f"{STUDY_ARM_TAG}{self.study_arm}",) if self.study_arm else ()
 
 
 class Operator:
@@ -244,6 +254,8 @@ class Operator:
         self._cell, self._session, self._config = cell, session, config
         self._output = output or Output(quiet=True)
         self._sent = {} if task_file is None else {"task_file": task_file.data.decode()}
+        sha256 = "" if task_file is None else task_file.sha256
+        self._decider = Decider(cell, session, config, sha256)
         self._open = False
         self.scanned = False
         self.num_probes = 0
@@ -251,7 +263,7 @@ class Operator:
 
     def start_seeds(self, count: int) -> list[int]:
         """One seed per start; both conditions share them."""
-        first = self._config.seed * SEEDS_PER_SESSION
+        first = self._config.seed * SEEDS_PER_SESSION + self._config.first_start
         return [first + k for k in range(count)]
 
     def _recorded(self) -> list[dict[str, Any]]:
@@ -271,25 +283,42 @@ class Operator:
         names = [re.fullmatch(rf"{kind}_(\d+)", item["id"]) for item in self._recorded()]
         return 1 + max((int(found[1]) for found in names if found), default=0)
 
-    def _wanted(self) -> list[tuple[int, str]]:
-        """Start seed and condition of each trial to record."""
-        config, task = self._config, self._cell.task.name
-        all_ = [(s, c) for s in self.start_seeds(config.trials) for c in config.conditions]
+    def _treatments(self, start_seed: int) -> list[Treatment]:
+        """How a start is to be tried, in order; a study draws the order of its arms per start."""
+        config = self._config
+        if not config.study_arms:
+            return [Treatment(condition=condition) for condition in config.conditions]
+        rng = np.random.default_rng([ORDER_STREAM, config.study_seed, start_seed])
+        order = rng.permutation(len(config.study_arms))
+        arms = [config.study_arms[index] for index in order]
+        return [Treatment(condition=CONDITION_OF[arm], study_arm=arm) for arm in arms]
+
+    def _wanted(self) -> list[tuple[int, Treatment]]:
+        """Start seed and treatment of each trial to record."""
+        config, task, policy = self._config, self._cell.task.name, self._decider.policy
+        all_ = [(s, t) for s in self.start_seeds(config.trials) for t in self._treatments(s)]
         if not config.missing:
             return all_
-        there = {(item["start_id"], item["condition"]) for item in self._recorded()}
-        return [(s, c) for s, c in all_ if (f"{task}/{s}", c) not in there]
+        if not config.study_arms:
+            there = {(item["start_id"], item["condition"]) for item in self._recorded()}
+            return [(s, t) for s, t in all_ if (f"{task}/{s}", t.condition) not in there]
+        tried = {
+            (item["start_id"], study_arm_of(item["tags"]), item["policy"])
+            for item in self._recorded()
+        }
+        return [(s, t) for s, t in all_ if (f"{task}/{s}", t.study_arm, policy) not in tried]
 
-    def start_poses(self, start_seed: int, condition: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+    def start_poses(self, start_seed: int, treatment: str) -> dict[str, Float[np.ndarray, "4 4"]]:
         """The declared start as a person puts it down: a little off, differently each time.
 
         Args:
             start_seed: Number of the start; the same one declares the same poses.
-            condition: Which trial of that start it is; the deviations differ between conditions.
+            treatment: Which trial of that start it is, by its condition or study arm; the
+                deviations differ between them.
         """
         noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))
-        index = CONDITIONS.index(condition) if condition in CONDITIONS else len(CONDITIONS)
+        index = RESETS.get(treatment, RESET_OF_A_SCAN)
         rng = np.random.default_rng([RESET_STREAM, start_seed, index])
         for T in poses.values():
             turn = rng.normal(0.0, noise.reset_rad)
@@ -331,33 +360,36 @@ class Operator:
         if wanted and first is None:
             first = self._next_number("trial")
         with self._output.progress("trials", len(wanted)) as advance:
-            for number, (start_seed, condition) in enumerate(wanted, start=first or 0):
-                info, outcome = self._trial(number, start_seed, condition)
+            for number, (start_seed, treatment) in enumerate(wanted, start=first or 0):
+                info, outcome = self._trial(number, start_seed, treatment)
                 self.results.append((info, outcome))
-                self._output.detail(f"{info.id} {condition}: {outcome.result}")
+                self._output.detail(f"{info.id} {treatment.name}: {outcome.result}")
                 advance(len(self.results), f"{info.id} {outcome.result}")
 
-    def _trial(self, number: int, start_seed: int, condition: str) -> tuple[EpisodeInfo, Outcome]:
+    def _trial(
+        self, number: int, start_seed: int, treatment: Treatment
+    ) -> tuple[EpisodeInfo, Outcome]:
         cell = self._cell
-        cell.reset(self.start_poses(start_seed, condition))
+        cell.reset(self.start_poses(start_seed, treatment.name))
         info = self._info(
             f"trial_{number:04d}",
             kind="trial",
-            condition=condition,
-            policy=POLICY_NAME,
+            condition=treatment.condition,
+            policy=self._decider.policy,
             trial=number,
             start_id=f"{cell.task.name}/{start_seed}",
             start_seed=start_seed,
+            tags=treatment.tags,
         )
         self._begin(info)
         cell.cameras_running = True
         cell.wait(LOOK_S)
-        decision = self._decide(info, start_seed)
+        decision = self._decider.decide(info, start_seed)
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:
             cell.wait(LOOK_S)
-        if decision.void:
+        if decision.void and not treatment.study_arm:
             outcome = void_trial(cell.task, decision.remark)
         else:
             executed = decision.plan is not None
@@ -394,8 +426,8 @@ class Operator:
         cell.wait(LOOK_S)
         said = f"recorded from seed {config.seed}"
         try:
-            if self._sees_by_gate:  # the start was chosen by where things were declared
-                plan = self._plan_probe(number, kind, self._look().needed())
+            if self._decider.sees_by_gate:  # the start was chosen by where things were declared
+                plan = self._plan_probe(number, kind, self._decider.look().needed())
             cell.streams.plan(plan, cell.now_ns)
             execute_plan(cell, plan)
         except (NotSeenError, NoSpaceForProbeError) as error:
@@ -435,119 +467,6 @@ class Operator:
             start_id=f"{cell.task.name}/probe/{self._config.seed}/{number}",
             turn=1 if (number - 1) // len(PROBES) % 2 else -1,
         )
-
-    @property
-    def _sees_by_gate(self) -> bool:
-        return self._cell.file.noise_for(self._cell.task.name).perception == "gate"
-
-    def _look(self) -> GateSight:
-        """Ask the gate where the objects are; what it says is all that is known of them."""
-        key = cell_topic(self._config.gate_cell or self._config.cell, LOCALISE)[1:]
-        payload = json.dumps({"task": self._cell.task.name}).encode()
-        try:
-            answer = self._session.query(key, payload, timeout_s=self._config.gate_timeout_s)
-            return GateSight.from_json(answer, self._cell.task)
-        except BridgeError as error:
-            return GateSight(found=None, reason=str(error))
-
-    def _decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
-        """Plan, and with replanning ask the gate until it accepts or the rounds are used up."""
-        sight = self._look() if self._sees_by_gate else None
-        if sight is not None and not sight.found:
-            why = f"nothing executed, {sight.problem}"
-            self._cell.streams.event("note", self._cell.now_ns, text=why)
-            return Decision(plan=None, void=sight.found is None, remark=why)
-        rounds = self._config.rounds if info.condition == "with_replanning" else 1
-        parent: Plan | None = None
-        refused, why = 0, ""
-        for round_ in range(rounds):
-            try:
-                plan = self._candidate(info, start_seed, round_, parent, sight)
-            except UnreachablePoseError as error:
-                why = f"the planner found no plan: {error}"
-                self._cell.streams.event("note", self._cell.now_ns, text=why)
-                continue
-            self._cell.streams.plan(plan, self._cell.now_ns)
-            if info.condition != "with_replanning":
-                if self._config.ask_always:
-                    self._ask_gate(plan)  # the gate publishes its verdict; nobody obeys it
-                return Decision(plan=plan, void=False, remark="")
-            verdict, reason = self._ask_gate(plan)
-            accepted = None if verdict is None else verdict.accepted
-            if accepted is True:
-                return Decision(plan=plan, void=False, remark="")
-            if accepted is None:
-                return self._unverified(plan, reason)
-            self._note_refusal(plan, reason, last=round_ == rounds - 1)
-            parent = plan
-            refused += 1
-            why = f"the gate refused {refused} plans, the last because {reason}"
-        return Decision(plan=None, void=False, remark=f"nothing executed, {why}")
-
-    def _unverified(self, plan: Plan, reason: str) -> Decision:
-        streams, now_ns = self._cell.streams, self._cell.now_ns
-        if self._config.execute_unverified:
-            remark = f"executed without a verdict ({reason})"
-            streams.event("note", now_ns, plan_id=plan.id, text=remark)
-            return Decision(plan=plan, void=False, remark=remark)
-        remark = f"nothing executed, no verdict ({reason})"
-        streams.event("note", now_ns, plan_id=plan.id, text=remark)
-        return Decision(plan=None, void=True, remark=remark)
-
-    def _note_refusal(self, plan: Plan, reason: str, *, last: bool) -> None:
-        kind = "note" if last else "replan"
-        self._cell.streams.event(
-            kind,
-            self._cell.now_ns,
-            plan_id=plan.id,
-            text=f"refused: {reason}",
-            data={"round": plan.round},
-        )
-
-    def _candidate(
-        self,
-        info: EpisodeInfo,
-        start_seed: int,
-        round_: int,
-        parent: Plan | None,
-        sight: GateSight | None,
-    ) -> Plan:
-        cell = self._cell
-        noise = cell.file.noise_for(cell.task.name)
-        if sight is None:
-            seen = perceive(cell.world.Ts_base_object(), noise, start_seed=start_seed)
-        else:
-            seen = sight.needed()
-        return plan_pick_and_place(
-            cell.task,
-            seen,
-            draw_errors(noise, len(cell.task.manipulated), start_seed=start_seed, round_=round_),
-            kinematics=cell.kinematics,
-            joints_start_rad=cell.home_rad,
-            max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
-            plan_id=f"{info.id}.plan_{round_}",
-            condition=info.condition,
-            start_id=info.start_id or "",
-            parent_id=None if parent is None else parent.id,
-            round_=round_,
-            grounding=GROUNDING if sight is None else GROUNDING_GATE,
-        )
-
-    def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
-        """Return the verdict, None when there is none, and why it is not a yes."""
-        key = cell_topic(self._config.gate_cell or self._config.cell, GATE)[1:]
-        self._cell.streams.joints_again()  # a planner may have thought for seconds
-        limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
-        try:
-            answer = self._session.query(key, plan.to_json(), timeout_s=limit_s)
-            verdict = Verdict.from_json(answer)
-        except BridgeError as error:
-            if time.monotonic() - asked_s < limit_s:  # at once: there is no gate, or it refused
-                return None, str(error)
-            return None, f"the wall-clock limit of {limit_s:g} s (--gate-timeout-s) struck first"
-        if verdict.plan_id != plan.id:
-            return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
-        return verdict, _reason(verdict)
 
     def _info(self, episode_id: str, *, kind: str, **fields: Any) -> EpisodeInfo:
         task = self._cell.task
@@ -593,12 +512,3 @@ class Operator:
         payload = json.dumps(request).encode()
         answer = self._session.query(key, payload, timeout_s=CONTROL_TIMEOUT_S)
         return dict(json.loads(answer))
-
-
-def _reason(verdict: Verdict) -> str:
-    name = verdict.first_failing
-    if name is None:
-        return verdict.reason or "the verdict is undecided"
-    factor = verdict.factors()[name]
-    parts = [name, factor.cause or "", factor.detail or ""]
-    return " ".join(part for part in parts if part)

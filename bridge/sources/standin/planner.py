@@ -201,7 +201,7 @@ def _predicted(
 
 
 PLANNER_NAME = "standin_scripted"
-POLICY_NAME = "scripted"
+POLICY_NAME = "perturbed"
 GROUNDING = "stand-in: true poses with seeded noise"
 GROUNDING_GATE = "gst localisation v1 of the gate"
 PLANNER_STREAM = 202

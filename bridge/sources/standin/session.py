@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.clock import AnchoredClock
 from bridge.episode import topics
+from bridge.episode.metadata import EpisodeInfo
 from bridge.errors import BridgeError
 from bridge.sources.standin.cell import CellConfig, StandinCell, StoppedError
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
@@ -54,6 +55,7 @@ def run_session(
             rate_hz=config.rate_hz, scale=config.image_scale, real_time=config.real_time
         ),
         seed=config.seed,
+        first_start=config.first_start,
         start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
         should_stop=should_stop,
     )
@@ -133,9 +135,9 @@ def _summary(
     counts: dict[str, Counter[str]] = {}
     objects: dict[str, dict[str, int]] = {}
     for info, outcome in operator.results:
-        counts.setdefault(info.condition, Counter())[outcome.result] += 1
+        counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
         if outcome.unit == "object":
-            sums = objects.setdefault(info.condition, {"k": 0, "n": 0})
+            sums = objects.setdefault(_treatment(info), {"k": 0, "n": 0})
             sums["k"], sums["n"] = sums["k"] + outcome.k, sums["n"] + outcome.n
     return {
         "stand_in": True,
@@ -149,6 +151,10 @@ def _summary(
         "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
+
+
+def _treatment(info: EpisodeInfo) -> str:
+    return info.study_arm or info.condition
 
 
 def describe(summary: dict[str, Any]) -> str:

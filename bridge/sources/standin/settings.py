@@ -2,9 +2,14 @@
 
 from dataclasses import dataclass
 
-from bridge.errors import refuse_outside
+from bridge.episode.metadata import WITH, WITHOUT
+from bridge.errors import UsageError, refuse_outside
 
-CONDITIONS = ("without_replanning", "with_replanning")
+CONDITIONS = (WITHOUT, WITH)
+CONDITION_OF = {"without": WITHOUT, "with": WITH, "control": WITHOUT}
+"""Of each study arm."""
+BUILT_IN, WIRE = "built_in", "wire"
+PLANNERS = (BUILT_IN, WIRE)
 SEEDS_PER_SESSION = 1000
 """Session 7 starts at start seed 7000; sessions never share a start."""
 INTERRUPTED = "interrupted"
@@ -30,6 +35,8 @@ class SessionConfig:
     """Name of the scan's episode; empty: scan_ and the run's next number."""
     trials: int = 3
     """Starts to try, each once per condition; 0 records the scan only."""
+    first_start: int = 0
+    """Leave out so many starts of the session: one that is tried alone is the same start."""
     conditions: tuple[str, ...] = CONDITIONS
     """without_replanning, with_replanning or both."""
     first_trial: int | None = None
@@ -42,6 +49,22 @@ class SessionConfig:
     slides, squeezes and drops the first object."""
     first_probe: int | None = None
     """Number of the first probe's episode; without it the run's numbering goes on."""
+    planner: str = BUILT_IN
+    """Who plans: built_in (scripted, careless) or wire, whoever answers on <cell>/plan (robot-gst
+    plan RUN --live)."""
+    policy: str = ""
+    """How it plans; empty: perturbed for the built-in planner, nominal for one on the wire."""
+    planner_timeout_s: float = 600.0
+    """Last resort on the wall clock against a planner that hangs."""
+    study_arms: tuple[str, ...] = ()
+    """A study instead of the conditions: without, with, control. Each start once per arm, in an
+    order of its own; the gate is asked in every arm and obeyed in one, and what is not executed is
+    a failure."""
+    study_seed: int = 0
+    """Draws the order of the arms and the coins."""
+    coin: float | None = None
+    """In the arm control, the chance of yes to each plan: the gate's share of yes on development
+    seeds."""
     rounds: int = 5
     """Plans the gate may see per trial."""
     gate_cell: str = ""
@@ -65,17 +88,31 @@ class SessionConfig:
     """Keep pace with the wall clock instead of running as fast as possible."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no session can have."""
+        """Refuse numbers and words that no session can have."""
+        _refuse_other("--planner", (self.planner,), PLANNERS)
+        _refuse_other("--study-arms", self.study_arms, tuple(CONDITION_OF))
+        if "control" in self.study_arms and self.coin is None:
+            raise UsageError("the arm control needs --coin, the chance of yes to each plan.")
         most = float("inf")
         allowed: dict[str, tuple[int | float, int | float]] = {
             "seed": (0, 2**31),
             "trials": (0, 8_000),
+            "first_start": (0, SEEDS_PER_SESSION - 1),
             "first_trial": (0, 9_999),
             "probes": (0, 1_000),
             "first_probe": (1, 9_999),
             "rounds": (1, 1_000),
+            "planner_timeout_s": (0.1, most),
+            "study_seed": (0, 2**31),
+            "coin": (0, 1),
             "gate_timeout_s": (0.1, most),
             "rate_hz": (0, 60),
             "image_scale": (0.05, 8),
         }
         refuse_outside(self, allowed)
+
+
+def _refuse_other(option: str, given: tuple[str, ...], known: tuple[str, ...]) -> None:
+    for name in given:
+        if name not in known:
+            raise UsageError(f"{option} {name!r} is unknown. There are: {', '.join(known)}.")

@@ -21,10 +21,10 @@ from bridge.episode.cdr.messages import (
 from bridge.episode.topics import is_truth, type_of_topic
 from bridge.errors import UsageError
 from bridge.media.color import decode_color
-from bridge.sources.standin import operator
+from bridge.sources.standin import decisions, operator
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.kinematics import UnreachablePoseError
-from bridge.sources.standin.operator import Operator
+from bridge.sources.standin.operator import Operator, Treatment
 from bridge.sources.standin.scan import ScanConfig, scan_joints
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
@@ -168,7 +168,7 @@ def test_a_start_that_the_planner_cannot_plan_is_a_failed_trial_and_the_session_
     def out_of_reach(*_: Any, start_id: str, **__: Any) -> Plan:
         raise UnreachablePoseError(p_m=(0.4, 0.1, 0.2), residual_m=0.012)
 
-    monkeypatch.setattr(operator, "plan_pick_and_place", out_of_reach)
+    monkeypatch.setattr(decisions, "plan_pick_and_place", out_of_reach)
     session, summary = with_replanning(make_session, None, rounds=2, trials=2)
     assert summary["outcomes"] == {"with_replanning": {"failure": 2}}
     assert not session.of("/plan")
@@ -254,7 +254,7 @@ def test_missing_records_only_what_the_recorder_does_not_have(
     ]
     session = make_session(there=there)
     operator = Operator(make_cell(session), session, settings(trials=2, missing=True))
-    assert operator._wanted() == [(9_000_001, "without_replanning")]
+    assert operator._wanted() == [(9_000_001, Treatment(condition="without_replanning"))]
     operator = Operator(make_cell(session), session, settings(trials=2))
     assert len(operator._wanted()) == 4
 
@@ -263,7 +263,7 @@ def test_the_limit_of_waiting_for_the_gate_is_named_when_it_strikes(
     make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ticks = iter(range(0, 10_000, 100))
-    monkeypatch.setattr(operator.time, "monotonic", lambda: float(next(ticks)))
+    monkeypatch.setattr(decisions.time, "monotonic", lambda: float(next(ticks)))
     session, summary = with_replanning(make_session, None, gate_timeout_s=100.0)
     assert summary["outcomes"] == {"with_replanning": {"unknown": 1}}
     assert "wall-clock limit of 100 s (--gate-timeout-s)" in session.events()[0]["text"]

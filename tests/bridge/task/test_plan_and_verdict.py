@@ -1,5 +1,6 @@
 """Plans and verdicts: round trips, refusals, and the three-valued product."""
 
+import hashlib
 import json
 
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.errors import InvalidRecordError
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan, Ranking, Stage, SteeredBy, Waypoint
 from bridge.task.verdict import Factor, Verdict
 
 number = st.floats(-2, 2, allow_nan=False)
@@ -45,6 +46,29 @@ def plan(**changes: object) -> Plan:
 def test_a_plan_survives_the_round_trip(tau: list[Waypoint]) -> None:
     original = plan(tau=tuple(tau))
     assert Plan.from_json(original.to_json()) == original
+
+
+def test_what_plans_had_not_from_the_beginning_is_written_only_where_it_says_something() -> None:
+    old = json.loads(plan().to_json())
+    later = {"task_sha256", "scene_hash", "candidate", "steered_by", "study_arm"}
+    assert not later & set(old)
+    digest = hashlib.sha256(plan().to_json()).hexdigest()
+    assert (
+        digest == "7fcd81beb0179381843e84d7424ba2e1325c448725e79ade890c82a34c22df7f"
+    )  # of what was written before there were such fields
+    new = plan(
+        task_sha256="0" * 64,
+        scene_hash="abc",
+        candidate=Ranking(rank=1, cost=0.25, seed=7),
+        steered_by=SteeredBy(clause="terminal.inside", bodies=("cube", "box")),
+        study_arm="control",
+    )
+    record = json.loads(new.to_json())
+    assert later <= set(record)
+    assert Plan.from_json(new.to_json()) == new
+    record["study_arm"] = "right"
+    with pytest.raises(InvalidRecordError, match="study_arm"):
+        Plan.from_json(json.dumps(record).encode())
 
 
 def test_a_plan_without_waypoints_is_refused() -> None:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from bridge.robots.default import ARM_JOINTS
+from bridge.task.find import chosen_task_file
 from bridge.task.plan import Plan, Stage, Waypoint
-from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.gate.config import GateConfig
-from twin.gate.gate import Gate
+from twin.gate.gate import Gate, JudgedTasks
 
-TASK = load_task("cube_into_box")
+TASK_FILE = chosen_task_file("cube_into_box")
+TASK = TASK_FILE.task()
 URDF = '<?xml version="1.0"?><robot xmlns:x="y" name="ur5_parallel_gripper"><link/></robot>'
 PLAN = Plan(
     id="plan_1",
@@ -30,6 +31,7 @@ PLAN = Plan(
 )
 
 
+JUDGED = JudgedTasks(only=TASK_FILE)
 HOME = SimpleNamespace(names=ARM_JOINTS, position_rad=np.zeros(6), stamp_ns=42, received_ns=1)
 
 
@@ -89,11 +91,12 @@ def gate_with(
     localise: Callable[..., Any] = lambda *_: found(),
     replay: Callable[..., Verdict] = accept,
     now_ns: Callable[[], int] = lambda: 0,
+    tasks: JudgedTasks = JUDGED,
     **settings: Any,
 ) -> Gate:
     config = GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings})
     return Gate(
-        task=TASK,
+        tasks=tasks,
         config=config,
         perception=perception or FakePerception(),
         localise=localise,

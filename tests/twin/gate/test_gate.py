@@ -2,22 +2,35 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import HOME, PLAN, URDF, FakePerception, accept, found, gate_with, raising
+from gate_fakes import (
+    HOME,
+    PLAN,
+    TASK_FILE,
+    URDF,
+    FakePerception,
+    accept,
+    found,
+    gate_with,
+    raising,
+)
 
 from bridge.errors import InvalidRecordError
 from bridge.robots.robot import read_robot
+from bridge.task.find import chosen_task_file, find_task_file
 from bridge.task.plan import Plan
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task, load_task
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.gate import (
     Gate,
+    JudgedTasks,
     PlanTooLargeError,
     no_verdict,
     of_another_scene,
@@ -36,9 +49,9 @@ def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
     seen: dict[str, Any] = {}
 
     def replay(
-        plan: Plan, poses: dict[str, Any], urdf: str, start_rad: np.ndarray, ends_s: float
+        plan: Plan, task: Task, poses: dict[str, Any], urdf: str, start_rad: np.ndarray, _: float
     ) -> Verdict:
-        seen.update(plan=plan, poses=poses, urdf=urdf, start_rad=start_rad)
+        seen.update(plan=plan, task=task, poses=poses, urdf=urdf, start_rad=start_rad)
         return replace(accept(plan, poses, urdf), terminal=Factor(value=False, cause="inside"))
 
     verdict = gate_with(replay=replay).judge(PLAN.to_json())
@@ -51,13 +64,13 @@ def test_the_verdict_is_the_replays_from_the_localised_poses() -> None:
 
 
 def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
-    task = load_task("sloth_into_basket")
+    file = chosen_task_file("sloth_into_basket")
     there = {
         name: SimpleNamespace(found=True, reason=None, T_base_object=np.eye(4))
-        for name in task.objects
+        for name in file.task().objects
     }
     gate = Gate(
-        task=task,
+        tasks=JudgedTasks(only=file),
         config=GateConfig(deadline_s=5.0, frame_wait_s=0.0),
         perception=FakePerception(),
         localise=lambda *_: there,
@@ -138,7 +151,7 @@ def test_an_accepted_plan_is_accepted() -> None:
             "carries a record that is not a robot: robot lacks name",
         ),
         ({}, replace(PLAN, robot="panda"), "for robot 'panda'; the cell's robot is 'ur5"),
-        ({}, replace(PLAN, task="fold_towel"), "for task 'fold_towel'; this gate judges"),
+        ({}, replace(PLAN, task="fold_towel"), "task 'fold_towel' is asked for; this gate judges"),
     ],
 )
 def test_what_cannot_be_decided_is_null_with_a_reason(
@@ -255,3 +268,68 @@ def test_no_verdict_is_never_a_yes() -> None:
     verdict = no_verdict(PLAN, "because")
     assert verdict.accepted is None
     assert verdict.reason == "because"
+
+
+@pytest.fixture
+def any_task(tmp_path: Path) -> JudgedTasks:
+    """What a gate without --task judges by, in a run that has a task of its own."""
+    own = chosen_task_file("cube_into_box").data.replace(b'"cube_into_box"', b'"my_task"')
+    (tmp_path / "my_task.toml").write_bytes(own)
+    return JudgedTasks(tasks_dir=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cube_into_box", "my_task"])
+def test_a_gate_without_a_task_judges_by_the_file_that_a_plan_names_and_hashes(
+    any_task: JudgedTasks, name: str
+) -> None:
+    file = find_task_file(name, tasks_dir=any_task.tasks_dir)
+    judged: list[str] = []
+
+    def replay(plan: Plan, task: Task, *_: Any) -> Verdict:
+        judged.append(task.name)
+        return accept(plan)
+
+    gate = gate_with(replay=replay, tasks=any_task)
+    plan = replace(PLAN, task=name, task_sha256=file.sha256)
+    assert gate.judge(plan.to_json()).accepted is True
+    assert gate.localise(name, file.sha256).found is True
+    assert judged == [name]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({}, "named without the hash of its file"),
+        ({"task": "", "task_sha256": "0" * 64}, "task '' is named with the hash"),
+        ({"task_sha256": "0" * 64}, "no task named 'cube_into_box' with sha256 000000000000"),
+        ({"task": "no_such_task", "task_sha256": "0" * 64}, "no task named 'no_such_task'"),
+        ({"task": "../my_task", "task_sha256": "0" * 64}, "no task named '../my_task'"),
+    ],
+)
+def test_a_task_that_is_not_known_by_name_and_hash_is_never_a_yes(
+    any_task: JudgedTasks, changes: dict[str, str], reason: str
+) -> None:
+    verdict = gate_with(tasks=any_task).judge(replace(PLAN, **changes).to_json())
+    assert verdict.accepted is None
+    assert reason in (verdict.reason or "")
+
+
+def test_a_gate_of_one_task_wants_that_very_file() -> None:
+    other = gate_with().judge(replace(PLAN, task_sha256="0" * 64).to_json())
+    assert other.accepted is None
+    assert "that is asked for has sha256 000000000000" in (other.reason or "")
+    same = replace(PLAN, task_sha256=TASK_FILE.sha256)
+    assert gate_with().judge(same.to_json()).accepted is True
+
+
+def test_the_same_frames_are_searched_again_for_another_task(any_task: JudgedTasks) -> None:
+    searched: list[str] = []
+
+    def localise(frames: Any, task: Task, ends_s: float) -> dict[str, Any]:
+        searched.append(task.name)
+        return found()
+
+    gate = gate_with(localise=localise, tasks=any_task)
+    for name in ("cube_into_box", "cube_into_box", "my_task"):
+        gate.localise(name, find_task_file(name, tasks_dir=any_task.tasks_dir).sha256)
+    assert searched == ["cube_into_box", "my_task"]

@@ -11,7 +11,7 @@ from typing import Any
 import gate_fakes
 import numpy as np
 import pytest
-from gate_fakes import HOME, TASK, accept
+from gate_fakes import HOME, JUDGED, TASK, accept
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
@@ -89,7 +89,7 @@ def judged(
 ) -> Verdict:
     answers = found or [seen(pose())]
     gate = Gate(
-        task=TASK,
+        tasks=JUDGED,
         config=GateConfig(**{"deadline_s": 5.0, "frame_wait_s": 0.0, **settings}),
         perception=perception or ChangingPerception(),
         localise=lambda *_: answers.pop(0) if len(answers) > 1 else answers[0],
@@ -227,7 +227,7 @@ def twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwinProces
     """A process that imports nothing, and does what it is told instead of replaying."""
     monkeypatch.setattr(twin_process, "get_ready", id)
     run = RunFolder.create(tmp_path / "run")
-    with TwinProcess(run.path, TASK, GateConfig(), Output(quiet=True)) as process:
+    with TwinProcess(run.path, GateConfig(), Output(quiet=True)) as process:
         yield process
 
 

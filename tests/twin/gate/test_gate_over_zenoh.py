@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gate_fakes import accept
+from gate_fakes import JUDGED, accept
 from loopback import free_endpoint
 from own_process import ROOT
 
@@ -136,7 +136,7 @@ def test_a_plan_goes_in_and_a_verdict_comes_out_and_is_published(
         return replace(accept(plan), terminal=Factor(value=False, cause="inside"))
 
     gate = Gate(
-        task=load_task("cube_into_box"),
+        tasks=JUDGED,
         config=config,
         perception=perception,
         localise=localise,
@@ -174,7 +174,7 @@ def a_gate(
     """Serve a gate whose cell has shown itself."""
     config = GateConfig(**{"cell": "lab", "frame_wait_s": 3.0, "deadline_s": 10.0, **settings})
     gate = Gate(
-        task=load_task("cube_into_box"),
+        tasks=JUDGED,
         config=config,
         perception=perception,
         localise=found,

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from bridge.process_pool import Worker, WorkerDiedError
-from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
@@ -21,8 +20,7 @@ from twin.gate.twin_process import TwinProcess
 def twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwinProcess]:
     """A process that imports nothing, and does what it is told instead of replaying."""
     monkeypatch.setattr(twin_process, "get_ready", id)
-    task = load_task("cube_into_box")
-    with TwinProcess(tmp_path, task, GateConfig(), Output(quiet=True)) as process:
+    with TwinProcess(tmp_path, GateConfig(), Output(quiet=True)) as process:
         yield process
 
 

@@ -45,9 +45,9 @@ def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
     plan, found = script.plan(scene), as_localised(scene)
     config = GateConfig(samples=1, replay=ReplayConfig())
     run = RunFolder.create(tmp_path / "run")
-    with TwinProcess(run.path, scene.task, config, Output(quiet=True)) as twin:
+    with TwinProcess(run.path, config, Output(quiet=True)) as twin:
         start_rad = good.joints_rad[0]
-        first = twin.replay(plan, found, scene.urdf, start_rad, soon(120))
+        first = twin.replay(plan, scene.task, found, scene.urdf, start_rad, soon(120))
         assert first.p_success is not None
         assert (first.p_success["k"], first.p_success["n"]) == (1, 1)
         # Beside what a replay checks, the gate knows where the arm is, and audits its yes.
@@ -58,7 +58,7 @@ def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
         nowhere = replace(plan.tau[3], p_m=(math.nan, 0.0, 0.2))
         lost = replace(plan, tau=(*plan.tau[:3], nowhere, *plan.tau[4:]))
         with pytest.raises(UndecidedError, match="not finite"):
-            twin.replay(lost, found, scene.urdf, start_rad, soon(60))
+            twin.replay(lost, scene.task, found, scene.urdf, start_rad, soon(60))
 
 
 @contextmanager
@@ -90,12 +90,12 @@ def test_a_loaded_machine_gives_the_same_verdict(
     plan, found = script.plan(scene), as_localised(scene)
     run = RunFolder.create(tmp_path / "run")
     config = GateConfig(samples=9, max_steps=5500, replay=ReplayConfig())
-    with TwinProcess(run.path, scene.task, config, Output(quiet=True)) as twin:
+    with TwinProcess(run.path, config, Output(quiet=True)) as twin:
         start_rad = good.joints_rad[0]
-        idle = twin.replay(plan, found, scene.urdf, start_rad, soon(300))
+        idle = twin.replay(plan, scene.task, found, scene.urdf, start_rad, soon(300))
         assert twin._worker is not None
         with slowed(twin._worker.pid):
-            loaded = twin.replay(plan, found, scene.urdf, start_rad, soon(300))
+            loaded = twin.replay(plan, scene.task, found, scene.urdf, start_rad, soon(300))
     assert idle.p_success is not None
     assert idle.p_success["n"] == 2
     assert loaded.to_json() == idle.to_json()

@@ -1,0 +1,310 @@
+"""Which plan of a trial is executed: a planner proposes, the gate judges, the arm decides.
+
+Whoever moves the robot asks the gate itself: what a planner says of its plan counts for nothing.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from bridge.episode.metadata import WITH, WITHOUT, EpisodeInfo
+from bridge.episode.topics import GATE, PLAN, cell_topic
+from bridge.errors import BridgeError, UsageError
+from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, ROBOT_NAME
+from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.gate_sight import GateSight, ask_where
+from bridge.sources.standin.kinematics import UnreachablePoseError
+from bridge.sources.standin.planner import (
+    GROUNDING,
+    GROUNDING_GATE,
+    POLICY_NAME,
+    draw_errors,
+    perceive,
+    plan_pick_and_place,
+)
+from bridge.sources.standin.settings import BUILT_IN, SessionConfig
+from bridge.sources.standin.streams import Session
+from bridge.task.plan import Plan
+from bridge.task.plan_request import PlanAnswer, PlanRequest, Refusal
+from bridge.task.verdict import Verdict
+
+COIN_STREAM = 707
+WIRE_POLICY = "nominal"
+ARM_OF = {WITHOUT: "without", WITH: "with"}
+"""What a condition means outside a study."""
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """Who plans: built into the cell, or somebody on the wire."""
+
+    def ask(self, request: PlanRequest) -> PlanAnswer:
+        """Answer one request."""
+
+
+class BuiltInPlanner:
+    """The cell's own scripted planner behind the protocol that every planner has."""
+
+    def __init__(self, cell: StandinCell, grounding: str) -> None:
+        """Plan for a cell; ``grounding`` says in words where the poses are from."""
+        self._cell, self._grounding = cell, grounding
+
+    def ask(self, request: PlanRequest) -> PlanAnswer:
+        """Draw the candidate of this start and round."""
+        cell = self._cell
+        noise = cell.file.noise_for(cell.task.name)
+        count = len(cell.task.manipulated)
+        try:
+            plan = plan_pick_and_place(
+                cell.task,
+                request.Ts_base_object(),
+                draw_errors(noise, count, start_seed=request.seed, round_=request.round),
+                kinematics=cell.kinematics,
+                joints_start_rad=np.array(request.joints_rad),
+                max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
+                plan_id=f"plan_{request.round}",
+                condition=WITHOUT,
+                start_id=request.start_id,
+                round_=request.round,
+                grounding=self._grounding,
+            )
+        except UnreachablePoseError as error:
+            return PlanAnswer(reason=str(error))
+        return PlanAnswer(plan=replace(plan, task_sha256=request.task_sha256))
+
+
+class WirePlanner:
+    """A planner that answers on ``<cell>/plan``."""
+
+    def __init__(self, session: Session, cell: str, timeout_s: float) -> None:
+        """Ask the planner of a cell; silent longer than ``timeout_s``, it is not there."""
+        self._session, self._timeout_s = session, timeout_s
+        self._key = cell_topic(cell, PLAN)[1:]
+
+    def ask(self, request: PlanRequest) -> PlanAnswer:
+        """Send the request; what comes back is believed only where it fits."""
+        try:
+            data = self._session.query(self._key, request.to_json(), timeout_s=self._timeout_s)
+            return PlanAnswer.from_json(data)
+        except BridgeError as error:
+            return PlanAnswer(reason=f"no planner answers on {self._key}: {error}", heard=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """What will be executed, and why nothing when nothing is."""
+
+    plan: Plan | None
+    void: bool
+    """Nobody judged the plan, or nobody planned: the trial says nothing about the planner."""
+    remark: str
+
+
+class Decider:
+    """Chooses what one cell executes in each trial."""
+
+    def __init__(
+        self, cell: StandinCell, session: Session, config: SessionConfig, task_sha256: str
+    ) -> None:
+        """Prepare; nothing is asked before ``decide``.
+
+        Args:
+            cell: The laboratory.
+            session: Where planner and gate answer.
+            config: Who plans, and how often.
+            task_sha256: Of the task file; "" where it is not known.
+
+        Raises:
+            UsageError: When the built-in planner is asked for another policy than its own.
+        """
+        self._cell, self._session, self._config = cell, session, config
+        self._task_sha256 = task_sha256
+        built_in = config.planner == BUILT_IN
+        self.policy = config.policy or (POLICY_NAME if built_in else WIRE_POLICY)
+        if built_in and self.policy != POLICY_NAME:
+            message = (
+                f"the built-in planner has the policy {POLICY_NAME!r} alone, not {self.policy!r}. "
+                "Start a planner (robot-gst plan RUN --live) and add --planner wire."
+            )
+            raise UsageError(message)
+        noise = cell.file.noise_for(cell.task.name)
+        self.sees_by_gate = not built_in or noise.perception == "gate"
+        self._planner: Planner = (
+            BuiltInPlanner(cell, GROUNDING_GATE if self.sees_by_gate else GROUNDING)
+            if built_in
+            else WirePlanner(session, config_cell(config), config.planner_timeout_s)
+        )
+
+    def look(self) -> GateSight:
+        """Ask the gate where the objects are; what it says is all that is known of them."""
+        return ask_where(
+            self._session,
+            config_cell(self._config),
+            self._cell.task,
+            self._task_sha256,
+            timeout_s=self._config.gate_timeout_s,
+        )
+
+    def decide(self, info: EpisodeInfo, start_seed: int) -> Decision:
+        """Propose, ask the gate and draw again, as the trial's condition or study arm says.
+
+        In the arm *without* the first plan is executed; in *with* the first that the gate accepts;
+        in *control* the first for which a coin says yes, whose planner hears of no verdict. Outside
+        a study the conditions mean the first two.
+        """
+        sight = self.look() if self.sees_by_gate else None
+        if sight is not None and not sight.found:
+            return self._nothing(sight.problem, void=sight.found is None)
+        arm = info.study_arm or ARM_OF[info.condition]
+        request = self._request(info, start_seed, sight)
+        coin = np.random.default_rng([COIN_STREAM, self._config.study_seed, start_seed])
+        refusals: list[Refusal] = []
+        parent: Plan | None = None
+        why = ""
+        for round_ in range(1 if arm == "without" else self._config.rounds):
+            steering = tuple(refusals) if arm == "with" else ()
+            answer = self._ask(replace(request, round=round_, refused=steering))
+            if answer.plan is None:
+                if not answer.heard:
+                    return self._nothing(answer.reason, void=True)
+                why = f"the planner found no plan: {answer.reason}"
+                self._note(why)
+                continue
+            plan = _stamped(answer.plan, info, round_, parent)
+            self._cell.streams.plan(plan, self._cell.now_ns)
+            verdict, reason = self._judged(plan, arm, bool(info.study_arm))
+            if arm == "without":
+                return Decision(plan=plan, void=False, remark="")
+            last = round_ == self._config.rounds - 1
+            if arm == "control":
+                if coin.random() < (self._config.coin or 0.0):
+                    return Decision(plan=plan, void=False, remark="")
+                self._note_refusal(plan, "the coin says no", last=last)
+                parent, why = plan, f"the coin said no to {round_ + 1} plans"
+                continue
+            if verdict is not None and verdict.accepted is True:
+                return Decision(plan=plan, void=False, remark="")
+            if verdict is None or verdict.accepted is None:
+                return self._unverified(plan, reason)
+            self._note_refusal(plan, reason, last=last)
+            refusals.append(Refusal(plan=plan, verdict=verdict))
+            parent = plan
+            why = f"the gate refused {len(refusals)} plans, the last because {reason}"
+        return Decision(plan=None, void=False, remark=f"nothing executed, {why}")
+
+    def _request(self, info: EpisodeInfo, start_seed: int, sight: GateSight | None) -> PlanRequest:
+        cell = self._cell
+        if sight is None:
+            noise = cell.file.noise_for(cell.task.name)
+            seen = perceive(cell.world.Ts_base_object(), noise, start_seed=start_seed)
+            records = tuple(_record(name, T, cell.now_ns) for name, T in seen.items())
+        else:
+            records = sight.records
+        return PlanRequest(
+            task=cell.task.name,
+            task_sha256=self._task_sha256,
+            policy=self.policy,
+            start_id=info.start_id or "",
+            seed=start_seed,
+            round=0,
+            robot=ROBOT_NAME,
+            joint_names=ARM_JOINTS,
+            joints_rad=tuple(cell.home_rad.tolist()),
+            objects=records,
+            stamp_ns=cell.now_ns,
+        )
+
+    def _ask(self, request: PlanRequest) -> PlanAnswer:
+        answer = self._planner.ask(request)
+        unfit = "" if answer.plan is None else request.why_unfit(answer.plan)
+        return PlanAnswer(reason=f"its answer is refused: {unfit}") if unfit else answer
+
+    def _judged(self, plan: Plan, arm: str, in_study: bool) -> tuple[Verdict | None, str]:
+        """The gate's verdict; it is asked in every arm of a study and obeyed in one."""
+        if arm == "with" or in_study or self._config.ask_always:
+            return self._ask_gate(plan)
+        return None, ""
+
+    def _nothing(self, why: str, *, void: bool) -> Decision:
+        remark = f"nothing executed, {why}"
+        self._note(remark)
+        return Decision(plan=None, void=void, remark=remark)
+
+    def _note(self, text: str) -> None:
+        self._cell.streams.event("note", self._cell.now_ns, text=text)
+
+    def _unverified(self, plan: Plan, reason: str) -> Decision:
+        streams, now_ns = self._cell.streams, self._cell.now_ns
+        if self._config.execute_unverified:
+            remark = f"executed without a verdict ({reason})"
+            streams.event("note", now_ns, plan_id=plan.id, text=remark)
+            return Decision(plan=plan, void=False, remark=remark)
+        remark = f"nothing executed, no verdict ({reason})"
+        streams.event("note", now_ns, plan_id=plan.id, text=remark)
+        return Decision(plan=None, void=True, remark=remark)
+
+    def _note_refusal(self, plan: Plan, reason: str, *, last: bool) -> None:
+        self._cell.streams.event(
+            "note" if last else "replan",
+            self._cell.now_ns,
+            plan_id=plan.id,
+            text=f"refused: {reason}",
+            data={"round": plan.round},
+        )
+
+    def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
+        """Return the verdict, None when there is none, and why it is not a yes."""
+        key = cell_topic(config_cell(self._config), GATE)[1:]
+        self._cell.streams.joints_again()  # a planner may have thought for seconds
+        limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
+        try:
+            answer = self._session.query(key, plan.to_json(), timeout_s=limit_s)
+            verdict = Verdict.from_json(answer)
+        except BridgeError as error:
+            if time.monotonic() - asked_s < limit_s:  # at once: there is no gate, or it refused
+                return None, str(error)
+            return None, f"the wall-clock limit of {limit_s:g} s (--gate-timeout-s) struck first"
+        if verdict.plan_id != plan.id:
+            return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
+        return verdict, _reason(verdict)
+
+
+def config_cell(config: SessionConfig) -> str:
+    """Name under which gate and planner of a session answer."""
+    return config.gate_cell or config.cell
+
+
+def _record(object_id: str, T: np.ndarray, stamp_ns: int) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "stamp_ns": stamp_ns,
+        "object": object_id,
+        "found": True,
+        "T_base_object": se3.pose_record(T),
+        "method": GROUNDING,
+    }
+
+
+def _stamped(plan: Plan, info: EpisodeInfo, round_: int, parent: Plan | None) -> Plan:
+    """Write into a planner's answer what the cell alone knows: whose plan it is, and which."""
+    return replace(
+        plan,
+        id=f"{info.id}.plan_{round_}",
+        parent_id=None if parent is None else parent.id,
+        round=round_,
+        condition=info.condition,
+        study_arm=info.study_arm,
+        start_id=info.start_id or "",
+    )
+
+
+def _reason(verdict: Verdict) -> str:
+    name = verdict.first_failing
+    if name is None:
+        return verdict.reason or "the verdict is undecided"
+    factor = verdict.factors()[name]
+    parts = [name, factor.cause or "", factor.detail or ""]
+    return " ".join(part for part in parts if part)

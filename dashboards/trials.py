@@ -1,0 +1,390 @@
+"""A study: policies on the same starts, in every study arm, by the real commands.
+
+Each start is one job that a stand-in cell of its own does, with recorder, gate and planner as
+separate processes. What comes out of a job follows from its seeds alone, so order, interruptions
+and the number of workers change nothing. A start that was interrupted is begun anew in all arms.
+"""
+
+import os
+import queue
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.data_files import datasets_folder
+from bridge.episode.catalogue import outcome_of
+from bridge.episode.mcap.part_file import lock_dead
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import verdicts
+from bridge.errors import GstError, UsageError
+from bridge.process_pool import cores
+from bridge.sources.standin.settings import CONDITION_OF, SEEDS_PER_SESSION
+from bridge.task.find import chosen_task_file
+from bridge.task.plan import STUDY_ARMS
+from bridge.task.protocol import PolicyArms, Protocol, StudyTask, keep_protocol, with_coins
+from bridge.terminal import Output
+from dashboards.config import TrialsConfig
+from dashboards.demo import (
+    Background,
+    StepFailedError,
+    answers,
+    cut_short,
+    ending_on_signals,
+    free_port,
+    running,
+    set_aside,
+    start_command,
+    step,
+    stop_command,
+)
+
+EVERY_TASK = "all"
+BUILT_IN_POLICY = "perturbed"
+ORDER_STREAM = 808
+POLL_S = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One start of one task under one policy, in all its arms."""
+
+    number: int
+    """Of the job; its episodes are numbered by it."""
+    task: str
+    chosen: str
+    """The task as it was asked for: its name or its file."""
+    policy: str
+    arms: tuple[str, ...]
+    session_seed: int
+    start: int
+    coin: float | None
+
+    @property
+    def start_seed(self) -> int:
+        """Of its start."""
+        return self.session_seed * SEEDS_PER_SESSION + self.start
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """What tells it from others."""
+        return self.task, self.policy, self.start_seed
+
+    @property
+    def first_trial(self) -> int:
+        """Number of its first episode."""
+        return 1 + self.number * len(STUDY_ARMS)
+
+
+def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
+    """Write the protocol, do every job that is not done, replay and evaluate.
+
+    Args:
+        path: The run folder; made, or continued.
+        config: What the study does.
+        output: Told of each step and of the result.
+
+    Raises:
+        DashboardError: When a command failed.
+    """
+    protocol, chosen = protocol_of(config)
+    run = RunFolder.create(path)
+    jobs = jobs_of(protocol, chosen)
+    with ending_on_signals():
+        keep_protocol(run.path, protocol, has_trials=bool(run.episodes()))
+        left = _clear(run, jobs, output)
+        if left:
+            _do(run, config, left, output)
+        step(
+            output, "replaying every plan", ["replay", str(path), "--samples", f"{config.samples}"]
+        )
+        step(output, "evaluating", ["evaluate", str(path)], show_result=True)
+    return 0
+
+
+def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
+    """What the study will do, and by name how each of its tasks was asked for.
+
+    Raises:
+        UsageError: When a task or an arm is unknown, or the arm control has no coin.
+    """
+    names = list(config.task)
+    if EVERY_TASK in names:
+        names = sorted(each.stem for each in (datasets_folder() / "tasks").glob("*.toml"))
+    files = {name: chosen_task_file(name) for name in names}
+    chosen = {file.task().name: name for name, file in files.items()}
+    for arm in config.arms:
+        if arm not in CONDITION_OF:
+            raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
+    tasks = tuple(
+        StudyTask(
+            task=file.task().name,
+            task_sha256=file.sha256,
+            session_seed=config.seed,
+            starts=config.trials,
+        )
+        for file in files.values()
+    )
+    first, *others = dict.fromkeys(config.policies)
+    policies = (
+        PolicyArms(policy=first, arms=config.arms),
+        *(PolicyArms(policy=each, arms=("without",)) for each in others),
+    )
+    protocol = Protocol(
+        tasks=tasks, policies=policies, rounds=config.rounds, study_seed=config.study_seed
+    )
+    if "control" not in config.arms:
+        return protocol, chosen
+    return _with_coins(protocol, config), chosen
+
+
+def _with_coins(protocol: Protocol, config: TrialsConfig) -> Protocol:
+    names = [each.task for each in protocol.tasks]
+    if config.coin is not None:
+        return with_coins(protocol, dict.fromkeys(names, config.coin), "given by --coin")
+    if config.development is None:
+        raise UsageError(
+            "the arm control needs the chance of yes to each plan: --coin, or --development RUN "
+            "with a run of development seeds."
+        )
+    shares = yes_shares(RunFolder.open(config.development))
+    if missing := [name for name in names if name not in shares]:
+        raise UsageError(
+            f"the gate judged no plan of {', '.join(missing)} in {config.development}: record "
+            "some there, or give --coin."
+        )
+    words = ", ".join(f"{name} {k} of {n}" for name, (k, n) in sorted(shares.items()))
+    coins = {name: round(k / n, 6) for name, (k, n) in shares.items()}
+    return with_coins(protocol, coins, f"the gate's share of yes on development seeds: {words}")
+
+
+def yes_shares(run: RunFolder) -> dict[str, tuple[int, int]]:
+    """By task: plans that the gate accepted, and those that it decided, in a run's recordings."""
+    counts: dict[str, tuple[int, int]] = {}
+    for path in run.episodes():
+        episode = Episode.open(path)
+        if episode.info.kind != "trial":
+            continue
+        for _, verdict in verdicts(episode):
+            if verdict.accepted is not None and verdict.trajectory == "planned":
+                k, n = counts.get(episode.info.task, (0, 0))
+                counts[episode.info.task] = (k + int(verdict.accepted), n + 1)
+    return counts
+
+
+def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
+    """Every start under every policy, numbered in the protocol's order.
+
+    Args:
+        protocol: What the study does.
+        chosen: How each task was asked for, by its name.
+    """
+    jobs: list[Job] = []
+    for task in protocol.tasks:
+        for policy in protocol.policies:
+            for start in range(task.starts):
+                jobs.append(
+                    Job(
+                        number=len(jobs),
+                        task=task.task,
+                        chosen=chosen[task.task],
+                        policy=policy.policy,
+                        arms=policy.arms,
+                        session_seed=task.session_seed,
+                        start=start,
+                        coin=task.coin if "control" in policy.arms else None,
+                    )
+                )
+    order = np.random.default_rng([ORDER_STREAM, protocol.study_seed]).permutation(len(jobs))
+    return [jobs[index] for index in order]
+
+
+def _clear(run: RunFolder, jobs: Sequence[Job], output: Output) -> list[Job]:
+    """Set aside every start that is there in part, and return the jobs that are to be done."""
+    found: dict[tuple[str, str, int], dict[str, Path]] = {job.key: {} for job in jobs}
+    numbers = {job.first_trial + k: job.key for job in jobs for k in range(len(STUDY_ARMS))}
+    broken: dict[tuple[str, str, int], list[Path]] = {}
+    for path in sorted(run.episodes_dir.glob("*.part")):
+        descriptor = lock_dead(path)
+        if descriptor is None:
+            message = f"{path} is being written: another recorder works in {run.path}."
+            raise UsageError(message)
+        os.close(descriptor)
+        key = numbers.get(_number(path))
+        if key is not None:
+            broken.setdefault(key, []).append(path)
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            why = cut_short(episode, outcome_of(run, episode))
+        except GstError:
+            key = numbers.get(_number(path))
+            if key is not None:
+                broken.setdefault(key, []).append(path)
+            continue
+        info = episode.info
+        key = (info.task, info.policy, info.start_seed or 0)
+        if key not in found:
+            continue
+        found[key][info.study_arm] = path
+        if why:
+            broken.setdefault(key, []).append(path)
+    left = []
+    for job in jobs:
+        there = found[job.key]
+        if job.key not in broken and set(there) == set(job.arms):
+            continue
+        for path in {*there.values(), *broken.get(job.key, [])}:
+            set_aside(run, path, "its start was interrupted", output)
+        left.append(job)
+    return left
+
+
+def _number(path: Path) -> int:
+    digits = path.name.split(".")[0].rpartition("_")[2]
+    return int(digits) if digits.isdigit() else -1
+
+
+def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:
+    """Let as many cells work at once as there are cores, each start with one of them."""
+    left: queue.SimpleQueue[Job] = queue.SimpleQueue()
+    for job in jobs:
+        left.put(job)
+    workers = min(config.workers or cores(), len(jobs))
+    stop, failures = threading.Event(), list[BaseException]()
+    done = 0
+    counting = threading.Lock()
+    output.say(f"{len(jobs)} starts to try, {workers} at a time")
+    with output.progress("starts", len(jobs)) as advance:
+
+        def work(index: int) -> None:
+            nonlocal done
+            try:
+                with _laboratory(run, config, jobs, index) as (endpoint, background):
+                    while not stop.is_set() and (job := _next(left)) is not None:
+                        _try(job, config, endpoint, background, stop, run)
+                        if stop.is_set():
+                            break
+                        with counting:
+                            done += 1
+                            advance(done, f"{job.task} {job.policy} start {job.start}")
+            except BaseException as error:  # noqa: BLE001  # told by the thread that waits
+                failures.append(error)
+                stop.set()
+            finally:
+                ended.release()
+
+        # Ctrl-C within Thread.join() makes Python take a running thread for ended.
+        ended = threading.Semaphore(0)
+        threads = [threading.Thread(target=work, args=(index,)) for index in range(workers)]
+        running_threads = workers
+        for thread in threads:
+            thread.start()
+        try:
+            while running_threads:
+                running_threads -= ended.acquire(timeout=POLL_S)
+        finally:
+            stop.set()
+            while running_threads:
+                running_threads -= ended.acquire(timeout=POLL_S)
+    if failures:
+        raise failures[0]
+
+
+def _next(left: "queue.SimpleQueue[Job]") -> Job | None:
+    try:
+        return left.get_nowait()
+    except queue.Empty:
+        return None
+
+
+@contextmanager
+def _laboratory(
+    run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], index: int
+) -> Iterator[tuple[str, list[Background]]]:
+    """Recorder, gate and planner of one worker, on an endpoint of their own."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    logs = run.notes_dir / "logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    connect = ["--connect", endpoint]
+    with ExitStack() as stack:
+
+        def start(name: str, arguments: list[str]) -> tuple[Background, Path]:
+            log = logs / f"{name}_{index}.log"
+            return stack.enter_context(running(arguments, log)), log
+
+        recorder, _ = start("record", ["record", str(run.path), "--listen", endpoint])
+        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+        there = [recorder]
+        gate, gate_log = start("gate", ["gate", str(run.path), *connect])
+        gate.wait_until(lambda: "gate ready" in gate_log.read_text(errors="replace"))
+        there.append(gate)
+        if any(job.policy != BUILT_IN_POLICY for job in jobs):
+            planner, log = start("plan", ["plan", str(run.path), "--live", *connect])
+            planner.wait_until(lambda: "planner ready" in log.read_text(errors="replace"))
+            there.append(planner)
+        yield endpoint, there
+
+
+def _try(
+    job: Job,
+    config: TrialsConfig,
+    endpoint: str,
+    background: Sequence[Background],
+    stop: threading.Event,
+    run: RunFolder,
+) -> None:
+    """Let a cell try one start in all its arms, unless it is told to stop."""
+    arguments = command_of(job, config, endpoint)
+    log = run.notes_dir / "logs" / f"start_{job.number:04d}.log"
+    with log.open("wb") as stream:
+        process = start_command(arguments, stdout=stream, stderr=subprocess.STDOUT)
+        try:
+            while process.poll() is None and not stop.is_set():
+                time.sleep(POLL_S / 4)
+        finally:
+            stop_command(process)
+    for each in background:
+        each.check()
+    if process.returncode != 0 and not stop.is_set():
+        command = f"robot-gst {' '.join(arguments)}"
+        raise StepFailedError(command=command, code=process.returncode, log=log)
+
+
+def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
+    """The command that tries one start.
+
+    Args:
+        job: Which start, and how.
+        config: What all have in common.
+        endpoint: Where recorder, gate and planner are.
+    """
+    options: dict[str, Any] = {
+        "--connect": endpoint,
+        "--task": job.chosen,
+        "--seed": job.session_seed,
+        "--first-start": job.start,
+        "--first-trial": job.first_trial,
+        "--trials": 1,
+        "--planner": "built_in" if job.policy == BUILT_IN_POLICY else "wire",
+        "--policy": job.policy,
+        "--rounds": config.rounds,
+        "--study-seed": config.study_seed,
+        "--rate-hz": config.rate_hz,
+        "--image-scale": config.image_scale,
+    }
+    if job.coin is not None:
+        options["--coin"] = job.coin
+    words = ["publish", "standin", "--no-scan"]
+    for name, value in options.items():
+        words += [name, str(value)]
+    for arm in job.arms:
+        words += ["--study-arms", arm]
+    return words

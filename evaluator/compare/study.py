@@ -1,0 +1,278 @@
+"""A study of replanning: the same starts without, with, and with a coin in the gate's place.
+
+Every declared start is tried once in each arm. Whatever was not executed (all plans refused, no
+plan, no verdict, object not found) is a failure of its arm, for otherwise an arm that refuses hard
+starts would look better. A start is left out only for a cause that was named before, and then in
+all arms.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from bridge.task.protocol import VOID_CAUSES
+from evaluator.compare.measure import ends, measured, proportion
+from evaluator.compare.rows import TrialRow, is_streamed
+from evaluator.measurements import (
+    STUDY_GAIN,
+    STUDY_GAIN_EXECUTED,
+    STUDY_GAIN_POOLED,
+    STUDY_NOT_EXECUTED,
+    STUDY_P,
+    STUDY_P_EXECUTED,
+    Defined,
+)
+from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.statistics.differences import mcnemar, tango_points
+
+WITH = "with"
+AGAINST = ("without", "control")
+SCOPE = "study of replanning"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyStart:
+    """One declared start and its trials by arm."""
+
+    task: str
+    policy: str
+    start_id: str
+    trials: dict[str, TrialRow]
+
+    def succeeded(self, arm: str) -> bool:
+        """Whether the task was done; what is unknown or was not executed was not."""
+        return self.trials[arm].recorded is True
+
+    def executed(self, *arms: str) -> bool:
+        """Whether something was executed in all of these arms."""
+        return all(self.trials[arm].plan_id is not None for arm in arms)
+
+
+def study_starts(
+    rows: Sequence[TrialRow], void_causes: Sequence[str] = VOID_CAUSES
+) -> tuple[list[StudyStart], list[Exclusion]]:
+    """Gather the trials of a study by start; whole starts are left out, never single trials.
+
+    Args:
+        rows: Trials; those outside a study are passed over.
+        void_causes: How outcomes begin that make a trial void, as the protocol named them.
+    """
+    if is_streamed(rows):
+        return [], []
+    mine = [row for row in rows if row.study_arm]
+    gathered: dict[tuple[str, str, str], list[TrialRow]] = {}
+    for row in mine:
+        gathered.setdefault((row.task, row.policy, row.start_id or ""), []).append(row)
+    planned = {
+        (task, policy): {row.study_arm for row in mine if (row.task, row.policy) == (task, policy)}
+        for task, policy, _ in gathered
+    }
+    starts, left_out = [], []
+    for (task, policy, start_id), members in gathered.items():
+        why = _why_out(start_id, members, planned[task, policy], void_causes)
+        if why:
+            left_out += [Exclusion(episode=row.episode, scope=SCOPE, reason=why) for row in members]
+            continue
+        trials = {row.study_arm: row for row in members}
+        starts.append(StudyStart(task=task, policy=policy, start_id=start_id, trials=trials))
+    return starts, left_out
+
+
+def _why_out(
+    start_id: str, members: Sequence[TrialRow], arms: set[str], void_causes: Sequence[str]
+) -> str:
+    found = [row.study_arm for row in members]
+    if not start_id:
+        return "no start_id"
+    if len(found) != len(set(found)):
+        return f"start {start_id} was tried more than once in one arm"
+    if missing := sorted(arms - set(found)):
+        return f"start {start_id} was not tried in the arms {', '.join(missing)}"
+    for row in members:
+        if row.recorded is None and row.why_unknown.startswith(tuple(void_causes)):
+            return f"start {start_id} is void in all arms: {row.episode}: {row.why_unknown}"
+        if row.recorded is None and row.plan_id is not None:
+            return f"start {start_id}: {row.episode} was executed, and nobody knows how it ended"
+    return ""
+
+
+def study_results(
+    rows: Sequence[TrialRow],
+    void_causes: Sequence[str] = VOID_CAUSES,
+    *,
+    method: str = "wilson",
+) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
+    """Measure the gain of *with* over the other arms: pooled test, and each task's interval.
+
+    Args:
+        rows: Trials of a run.
+        void_causes: As for ``study_starts``.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+
+    Returns:
+        Measurements ``study.*``, the table of the arms and that of the gains, and what was left
+        out; nothing without a study.
+    """
+    starts, left_out = study_starts(rows, void_causes)
+    measurements: list[Measurement] = []
+    lines: list[tuple[Cell, ...]] = []
+    gains: list[tuple[Cell, ...]] = []
+    for policy in dict.fromkeys(start.policy for start in starts):
+        mine = [start for start in starts if start.policy == policy]
+        tasks = list(dict.fromkeys(start.task for start in mine))
+        for task in tasks:
+            of_task = [start for start in mine if start.task == task]
+            for arm in of_task[0].trials:
+                measurements.append(_not_executed(of_task, arm, method))
+                lines.append(_arm_line(of_task, arm))
+        for against in AGAINST:
+            paired = [start for start in mine if {WITH, against} <= start.trials.keys()]
+            if not paired:
+                continue
+            found, told = _gains(paired, against, policy)
+            measurements += found
+            gains += told
+    if not starts:
+        return [], (), left_out
+    return measurements, (_arms_table(lines), *_gains_table(gains)), left_out
+
+
+def _not_executed(starts: Sequence[StudyStart], arm: str, method: str) -> Measurement:
+    left = sum(not start.executed(arm) for start in starts)
+    first = starts[0]
+    return proportion(
+        STUDY_NOT_EXECUTED.of(
+            arm=arm,
+            task=first.task,
+            policy=first.policy,
+            words=f"{left} of {len(starts)}, all counted as failures",
+        ),
+        left,
+        len(starts),
+        counted="start",
+        reason_if_undefined="there are no starts",
+        episodes=[start.trials[arm].episode for start in starts],
+        method=method,
+    )
+
+
+def _arm_line(starts: Sequence[StudyStart], arm: str) -> tuple[Cell, ...]:
+    executed = [start for start in starts if start.executed(arm)]
+    return (
+        starts[0].task,
+        starts[0].policy,
+        arm,
+        sum(start.succeeded(arm) for start in starts),
+        len(starts),
+        sum(start.succeeded(arm) for start in executed),
+        len(executed),
+    )
+
+
+def _gains(
+    starts: Sequence[StudyStart], against: str, policy: str
+) -> tuple[list[Measurement], list[tuple[Cell, ...]]]:
+    """Pooled over tasks first, then each task alone; per protocol beside each."""
+    tasks = list(dict.fromkeys(start.task for start in starts))
+    executed = [start for start in starts if start.executed(WITH, against)]
+    parts = {"against": against, "policy": policy}
+    count = len(tasks)
+    pooled = _gain(partial(STUDY_GAIN_POOLED.of, **parts, count=count), starts, against)
+    test = _test(partial(STUDY_P.of, **parts, count=count), starts, against)
+    test_executed = _test(partial(STUDY_P_EXECUTED.of, **parts, count=count), executed, against)
+    measurements = [pooled, test, test_executed]
+    lines = [_gain_line("all tasks", policy, against, pooled, test, test_executed)]
+    for task in tasks:
+        all_ = [start for start in starts if start.task == task]
+        both = [start for start in executed if start.task == task]
+        gain = _gain(partial(STUDY_GAIN.of, **parts, task=task), all_, against)
+        alone = _gain(partial(STUDY_GAIN_EXECUTED.of, **parts, task=task), both, against)
+        measurements += [gain, alone]
+        lines.append(_gain_line(task, policy, against, gain, None, alone))
+    return measurements, lines
+
+
+Named = Callable[..., Defined]
+
+
+def _gain(name: Named, starts: Sequence[StudyStart], against: str) -> Measurement:
+    improved, worsened, words = _counted(starts, against)
+    return measured(
+        name(words=words),
+        partial(tango_points, improved, worsened, len(starts)),
+        n=len(starts),
+        counted="pair",
+        episodes=_episodes(starts, against),
+    )
+
+
+def _test(name: Named, starts: Sequence[StudyStart], against: str) -> Measurement:
+    _, _, words = _counted(starts, against)
+    pairs = [(start.succeeded(against), start.succeeded(WITH)) for start in starts]
+    return measured(
+        name(words=words),
+        lambda: mcnemar(pairs).p_mid,
+        n=len(starts),
+        counted="pair",
+        reason_without_interval="a p-value",
+        episodes=_episodes(starts, against),
+    )
+
+
+def _counted(starts: Sequence[StudyStart], against: str) -> tuple[int, int, str]:
+    improved = sum(start.succeeded(WITH) and not start.succeeded(against) for start in starts)
+    worsened = sum(start.succeeded(against) and not start.succeeded(WITH) for start in starts)
+    return improved, worsened, f"{improved} improved, {worsened} worsened of {len(starts)} starts"
+
+
+def _episodes(starts: Sequence[StudyStart], against: str) -> list[str]:
+    return [start.trials[arm].episode for start in starts for arm in (against, WITH)]
+
+
+def _gain_line(
+    task: str,
+    policy: str,
+    against: str,
+    gain: Measurement,
+    test: Measurement | None,
+    alone: Measurement,
+) -> tuple[Cell, ...]:
+    p_mid = None if test is None else test.value
+    executed = alone.value if test is None else None
+    executed_p = alone.value if test is not None else None
+    low, high = ends(gain.interval)
+    return (
+        *(task, policy, against, gain.n, gain.value, low, high, p_mid),
+        *(alone.n, executed, executed_p),
+    )
+
+
+def _arms_table(lines: Sequence[tuple[Cell, ...]]) -> Table:
+    return Table(
+        id="study_arms",
+        title="Study of replanning: successes by arm",
+        columns=("task", "policy", "arm", "k", "starts", "k of executed", "executed"),
+        rows=tuple(lines),
+        note="without: the planner's first plan. with: the first of at most K plans that the gate "
+        "accepts. control: plans chosen by a coin with the gate's share of yes. Every start was "
+        "tried in each arm; what was not executed is a failure.",
+    )
+
+
+def _gains_table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
+    if not lines:
+        return ()
+    return (
+        Table(
+            id="study_gains",
+            title="Study of replanning: gain of the arm with",
+            columns=(
+                *("task", "policy", "against", "starts", "gain (pp)", "low", "high", "mid-p"),
+                *("executed in both", "gain of these (pp)", "mid-p of these"),
+            ),
+            rows=tuple(lines),
+            note="Whatever was not executed is a failure of its arm; beside it, per protocol, only "
+            "the starts executed in both arms. Tango intervals; McNemar's exact mid-p over all "
+            "tasks.",
+        ),
+    )

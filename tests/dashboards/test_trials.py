@@ -1,0 +1,115 @@
+"""The study command: jobs, their order and numbers, what is kept, and what is begun anew."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.terminal import Output
+from dashboards import trials
+from dashboards.config import TrialsConfig
+from dashboards.trials import Job, command_of, jobs_of, protocol_of, run_trials
+
+QUIET = Output(quiet=True)
+ARMS = ("without", "with", "control")
+STUDY = TrialsConfig(trials=2, policies=("nominal", "single"), arms=ARMS, coin=0.4, seed=9000)
+
+
+def jobs() -> list[Job]:
+    return jobs_of(*protocol_of(STUDY))
+
+
+def test_every_start_is_a_job_of_each_policy_with_numbers_of_its_own() -> None:
+    made = jobs()
+    assert len({job.key for job in made}) == len(made) == 4
+    assert {job.arms for job in made if job.policy == "nominal"} == {ARMS}
+    assert {job.arms for job in made if job.policy == "single"} == {("without",)}
+    taken = [job.first_trial + k for job in made for k in range(len(job.arms))]
+    assert len(set(taken)) == len(taken)
+    assert [job.number for job in made] != sorted(job.number for job in made)
+    assert made == jobs()
+    other = jobs_of(*protocol_of(replace(STUDY, study_seed=3)))
+    assert [job.number for job in other] != [job.number for job in made]
+
+
+def test_all_means_every_task_that_ships() -> None:
+    protocol, _ = protocol_of(replace(STUDY, task=("all",)))
+    names = [each.task for each in protocol.tasks]
+    assert {"cube_into_box", "stack_two_cubes", "sloth_into_basket"} <= set(names)
+    assert all(each.coin == 0.4 for each in protocol.tasks)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"coin": None}, "--coin, or --development RUN"),
+        ({"arms": ("both",)}, "There are: without, with, control"),
+        ({"task": ("fold_towel",)}, "no task named 'fold_towel'"),
+    ],
+)
+def test_what_no_study_can_be_is_refused_before_anything_is_made(
+    tmp_path: Path, change: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        run_trials(tmp_path / "run", replace(STUDY, **change), QUIET)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_of_a_job_names_its_start_policy_and_arms() -> None:
+    job = next(job for job in jobs() if job.policy == "nominal" and job.start == 1)
+    words = command_of(job, STUDY, "tcp/127.0.0.1:7447")
+    options = dict(zip(words[3::2], words[4::2], strict=False))
+    assert options["--first-start"] == "1"
+    assert options["--planner"] == "wire"
+    assert options["--coin"] == "0.4"
+    assert [words[k + 1] for k, word in enumerate(words) if word == "--study-arms"] == list(ARMS)
+    built_in = replace(job, policy="perturbed", arms=("without",), coin=None)
+    words = command_of(built_in, STUDY, "tcp/127.0.0.1:7447")
+    assert words[words.index("--planner") + 1] == "built_in"
+    assert "--coin" not in words
+
+
+def record(run: RunFolder, job: Job, arm: str, detail: str | None = None) -> Path:
+    number = job.first_trial + job.arms.index(arm)
+    info = EpisodeInfo(
+        id=f"trial_{number:04d}",
+        kind="trial",
+        task=job.task,
+        condition="without_replanning",
+        policy=job.policy,
+        start_id=f"{job.task}/{job.start_seed}",
+        start_seed=job.start_seed,
+        tags=(f"study_arm:{arm}",),
+        stand_in=True,
+    )
+    path = run.episodes_dir / f"{info.id}.mcap"
+    result = "unknown" if detail else "success"
+    with EpisodeWriter(path) as writer:
+        writer.describe(info)
+        writer.add_metadata("recorder", {"stopped_by": json.dumps("command")})
+        outcome = Outcome(result=result, k=1, detail=detail)
+        writer.add_metadata("outcome", to_strings(outcome))
+    return path
+
+
+def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    nominal = [job for job in jobs() if job.policy == "nominal"]
+    single = [job for job in jobs() if job.policy == "single"]
+    whole = [record(run, nominal[0], arm) for arm in ARMS]
+    part = [record(run, nominal[1], "without")]
+    cut = [record(run, single[0], "without", "interrupted")]
+    left = trials._clear(run, jobs(), QUIET)
+    assert {job.key for job in left} == {nominal[1].key, single[0].key, single[1].key}
+    assert all(path.exists() for path in whole)
+    assert not any(path.exists() for path in [*part, *cut])
+    assert {path.name for path in run.notes_dir.rglob("*.mcap")} == {
+        path.name for path in [*part, *cut]
+    }
+    assert trials._clear(run, left, QUIET) == left

@@ -1,0 +1,140 @@
+"""A study of replanning: starts by arm, what is not executed, what is void, and the pooled test."""
+
+from dataclasses import replace
+
+import pytest
+
+from bridge.episode.metadata import treatment_of
+from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.study import study_results, study_starts
+from evaluator.result import Measurement
+from evaluator.statistics.differences import sign_test, tango_difference
+
+ARMS = ("without", "with", "control")
+CONDITION = {
+    "without": "without_replanning",
+    "with": "with_replanning",
+    "control": "without_replanning",
+}
+
+
+def row(start: int, arm: str, success: bool | None, **more: object) -> TrialRow:
+    task = str(more.pop("task", "stack"))
+    values: dict[str, object] = {
+        "episode": f"{task}_{start}_{arm}",
+        "task": task,
+        "condition": treatment_of(CONDITION[arm], arm),
+        "study_arm": arm,
+        "policy": "nominal",
+        "start_id": f"{task}/{start}",
+        "cell": "standin",
+        "stand_in": True,
+        "recorded": success,
+        "plan_id": "p",
+        "num_plans": 1,
+        "num_plans_sent": 1,
+    }
+    return TrialRow(**{**values, **more})  # type: ignore[arg-type]
+
+
+def study(outcomes: list[tuple[bool, bool, bool]], task: str = "stack") -> list[TrialRow]:
+    return [
+        row(start, arm, success, task=task)
+        for start, results in enumerate(outcomes)
+        for arm, success in zip(ARMS, results, strict=True)
+    ]
+
+
+def by_id(rows: list[TrialRow]) -> dict[str, Measurement]:
+    return {each.id: each for each in study_results(rows)[0]}
+
+
+FIRST = study([(False, True, False)] * 6 + [(True, False, True)] * 1 + [(True, True, True)] * 3)
+SECOND = study([(False, True, True)] * 3 + [(False, False, False)] * 2, task="push")
+
+
+def test_the_pooled_test_counts_the_starts_that_differ_over_all_tasks() -> None:
+    found = by_id(FIRST + SECOND)
+    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(9, 1)[1]
+    assert found["study.mcnemar_p_mid.control.nominal"].value == sign_test(6, 1)[1]
+    assert found["study.gain_pp.without.nominal"].value == pytest.approx(100 * (9 - 1) / 15)
+
+
+def test_each_task_has_its_gain_with_tangos_interval_also_where_it_holds_zero() -> None:
+    found = by_id(FIRST + SECOND)
+    for task, counts in (("stack", (6, 1, 10)), ("push", (3, 0, 5))):
+        gain = found[f"study.gain_pp.without.{task}.nominal"]
+        expected = tango_difference(*counts)
+        assert gain.interval is None or gain.interval.low == pytest.approx(100 * expected.low)
+        assert gain.value == pytest.approx(100 * (counts[0] - counts[1]) / counts[2])
+        assert gain.interval is not None or gain.reason_without_interval
+    zero = found["study.gain_pp.control.push.nominal"]
+    assert zero.value == 0.0
+
+
+def test_what_was_not_executed_is_a_failure_and_per_protocol_it_is_left_out() -> None:
+    rows = [
+        replace(each, recorded=None, plan_id=None, why_unknown="nothing executed, no verdict")
+        if each.study_arm == "with" and each.start_id == "stack/0"
+        else each
+        for each in FIRST
+    ]
+    found, full = by_id(rows), by_id(FIRST)
+    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(5, 1)[1]
+    alone = found["study.executed_gain_pp.without.stack.nominal"]
+    assert (alone.n, alone.value) == (9, pytest.approx(100 * (5 - 1) / 9))
+    assert found["study.not_executed.with.stack.nominal"].value == pytest.approx(0.1)
+    assert full["study.not_executed.with.stack.nominal"].value == 0.0
+
+
+def test_a_void_trial_takes_its_start_out_of_all_arms() -> None:
+    void = replace(FIRST[1], recorded=None, plan_id=None, why_unknown="interrupted")
+    starts, left_out = study_starts([FIRST[0], void, *FIRST[2:]])
+    assert len(starts) == 9
+    assert {each.episode for each in left_out} == {f"stack_0_{arm}" for arm in ARMS}
+    assert all("void in all arms" in each.reason for each in left_out)
+    starts, _ = study_starts([FIRST[0], void, *FIRST[2:]], void_causes=("power cut",))
+    assert len(starts) == 10  # not a cause that was named: a failure of its arm
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda rows: rows[1:], "was not tried in the arms without"),
+        (lambda rows: [*rows, rows[0]], "more than once in one arm"),
+        (lambda rows: [replace(rows[0], start_id=None), *rows[1:]], "no start_id"),
+        (
+            lambda rows: [
+                replace(rows[0], recorded=None, why_unknown="nobody labelled it"),
+                *rows[1:],
+            ],
+            "was executed, and nobody knows how it ended",
+        ),
+    ],
+)
+def test_a_start_that_is_not_whole_is_left_out_with_the_reason(change: object, why: str) -> None:
+    _, left_out = study_starts(change(list(FIRST)))  # type: ignore[operator]
+    assert why in " ".join(each.reason for each in left_out)
+
+
+def test_the_control_is_a_group_of_its_own_and_pairs_only_in_the_study() -> None:
+    found = compare_rows(FIRST, run="r", source="run", stand_in=True)
+    groups = {group.condition: group for group in found.groups}
+    assert set(groups) == {"without_replanning", "with_replanning", "control"}
+    assert groups["without_replanning"].recorded.n == 10
+    ids = [each.id for each in found.measurements]
+    assert any(each.startswith("rate.recorded.stack.control") for each in ids)
+    assert {"study_arms", "study_gains"} <= {table.id for table in found.tables}
+
+
+def test_without_a_study_there_is_nothing_of_it() -> None:
+    rows = [replace(each, study_arm="") for each in FIRST if each.study_arm != "control"]
+    assert study_results(rows) == ([], (), [])
+
+
+def test_without_a_control_only_the_other_arm_is_compared() -> None:
+    two = [each for each in FIRST if each.study_arm != "control"]
+    found = by_id(two)
+    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(6, 1)[1]
+    assert not [name for name in found if "control" in name]

@@ -1,0 +1,226 @@
+"""A planner on the wire: what it answers, that it remembers nothing, and that there is one."""
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loopback import free_endpoint
+from own_process import ROOT
+from scripted_plans import scene_of_test
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import InvalidRecordError
+from bridge.geometry import se3
+from bridge.robots.default import ARM_JOINTS, ROBOT, ROBOT_NAME
+from bridge.sources.standin.decisions import WirePlanner
+from bridge.task.find import chosen_task_file
+from bridge.task.plan_request import PlanRequest, Refusal
+from bridge.task.verdict import Factor, Verdict
+from bridge.terminal import Output
+from bridge.wire.config import WireConfig
+from bridge.wire.session import WireSession, open_session
+from twin.plan.config import LivePlanConfig
+from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
+from twin.plan.loop.straight import GeometricProposer
+
+FILE = chosen_task_file("cube_into_box")
+HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
+QUIET = Output(quiet=True)
+
+
+def request(**changes: Any) -> PlanRequest:
+    records = tuple(
+        {
+            "schema_version": 1,
+            "stamp_ns": 5,
+            "object": name,
+            "found": True,
+            "T_base_object": se3.pose_record(T),
+            "covariance": (1e-6 * np.eye(6)).ravel().tolist(),
+            "method": "test",
+        }
+        for name, T in scene_of_test().Ts_base_object.items()
+    )
+    made = PlanRequest(
+        task="cube_into_box",
+        task_sha256=FILE.sha256,
+        policy="geometric",
+        start_id="cube_into_box/7",
+        seed=7,
+        round=0,
+        robot=ROBOT_NAME,
+        joint_names=ARM_JOINTS,
+        joints_rad=HOME,
+        objects=records,
+    )
+    return replace(made, **changes)
+
+
+@pytest.fixture
+def planner(tmp_path: Path) -> LivePlanner:
+    run = RunFolder.create(tmp_path / "run")
+    return LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text)
+
+
+def test_a_request_is_answered_with_a_plan_that_fits_it(planner: LivePlanner) -> None:
+    asked = request()
+    answer = planner.answer(asked.to_json())
+    assert answer.plan is not None, answer.reason
+    assert asked.why_unfit(answer.plan) == ""
+    assert (answer.plan.planner, answer.plan.policy) == ("gst_geometric", "geometric")
+    assert answer.plan.candidate is not None
+    assert answer.plan.candidate.rank == 0
+    assert answer.plan.tau[0].joints_rad == pytest.approx(HOME)
+
+
+def test_it_remembers_nothing(planner: LivePlanner) -> None:
+    """Asked in any order, the same request has the same answer to the byte."""
+    first = planner.answer(request().to_json())
+    assert first.plan is not None
+    no = Verdict(
+        plan_id=first.plan.id,
+        trajectory="planned",
+        mode="dynamic",
+        ik=Factor(value=True),
+        clearance=Factor(value=True),
+        terminal=Factor(value=False, cause="slipped", bodies=("cube",)),
+        engine="test",
+        seed=0,
+    )
+    steered = request(round=1, refused=(Refusal(plan=first.plan, verdict=no),)).to_json()
+    second = planner.answer(steered)
+    assert second.plan is not None
+    assert second.plan.steered_by is not None
+    assert second.plan.steered_by.clause == "terminal.slipped"
+    assert planner.answer(request().to_json()).to_json() == first.to_json()
+    assert planner.answer(steered).to_json() == second.to_json()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"policy": "best"}, "policy 'best' is unknown. There are: geometric"),
+        ({"task_sha256": "0" * 64}, "no task named 'cube_into_box' with sha256 000000000000"),
+        ({"robot": "panda"}, "for robot 'panda'; the cell describes"),
+        ({"objects": request().objects[:1]}, "differ in objects"),
+    ],
+)
+def test_what_cannot_be_planned_has_a_reason(
+    planner: LivePlanner, changes: dict[str, Any], words: str
+) -> None:
+    answer = planner.answer(request(**changes).to_json())
+    assert answer.plan is None
+    assert words in answer.reason
+
+
+def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path: Path) -> None:
+    class Few(GeometricProposer):
+        def propose(self, problem: Any, *, count: int, **more: Any) -> Any:
+            return super().propose(problem, count=1, **more)
+
+    run = RunFolder.create(tmp_path / "run")
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"geometric": Few})
+    reason = planner.answer(request(round=2).to_json()).reason
+    assert "there are 1 candidates, and 2 were tried" in reason
+
+
+def test_before_the_cell_describes_its_robot_there_is_no_plan(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    answer = LivePlanner(run, LivePlanConfig(), lambda: None).answer(request().to_json())
+    assert "no robot description has arrived" in answer.reason
+
+
+def test_a_bug_is_a_reason_and_no_silence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Broken:
+        def propose(self, *_: Any, **__: Any) -> Any:
+            raise ZeroDivisionError("oops")
+
+    run = RunFolder.create(tmp_path / "run")
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"geometric": Broken})
+    assert "ZeroDivisionError: oops" in planner.answer(request().to_json()).reason
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_what_is_no_request_is_refused(planner: LivePlanner) -> None:
+    with pytest.raises(InvalidRecordError):
+        planner.answer(b"nonsense")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[WireSession]:
+    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
+        yield session
+
+
+def test_a_second_planner_of_a_cell_is_refused(router: WireSession, endpoint: str) -> None:
+    with open_session(WireConfig(connect=(endpoint,))) as other:
+        claim_planner(router, "lab")
+        with pytest.raises(PlannerError, match="a planner answers on lab/plan already"):
+            claim_planner(other, "lab")
+        claim_planner(other, "lab2")
+
+
+def test_a_cell_asks_over_the_wire_and_hears_plans_and_reasons(
+    router: WireSession, endpoint: str, planner: LivePlanner
+) -> None:
+    serve_planner(router, planner, "lab", QUIET)
+    with open_session(WireConfig(connect=(endpoint,))) as cell:
+        asking = WirePlanner(cell, "lab", 60.0)
+        assert asking.ask(request()).plan is not None
+        refusal = asking.ask(request(policy="best"))
+        assert (refusal.plan, refusal.heard) == (None, True)
+        nobody = WirePlanner(cell, "lab2", 5.0).ask(request())
+        assert (nobody.plan, nobody.heard) == (None, False)
+        assert "no planner answers on lab2/plan" in nobody.reason
+
+
+HANGS = """
+import sys, threading
+from bridge.wire.config import WireConfig
+from bridge.wire.session import open_session
+def hang(payload):
+    print("asked", flush=True)
+    threading.Event().wait()
+with open_session(WireConfig(connect=(sys.argv[1],))) as session:
+    session.serve("lab/plan", hang)
+    print("ready", flush=True)
+    threading.Event().wait()
+"""
+
+
+def test_a_planner_killed_in_the_middle_leaves_the_cell_with_a_reason(
+    router: WireSession, endpoint: str
+) -> None:
+    answers: list[Any] = []
+    process = subprocess.Popen(
+        [sys.executable, "-c", HANGS, endpoint], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        asking = WirePlanner(router, "lab", 300.0)
+        thread = threading.Thread(target=lambda: answers.append(asking.ask(request())))
+        thread.start()
+        assert process.stdout.readline() == "asked\n"
+        process.kill()
+        thread.join(60.0)
+        assert not thread.is_alive()
+    finally:
+        process.kill()
+        process.communicate()
+    (answer,) = answers
+    assert (answer.plan, answer.heard) == (None, False)
+    assert "no planner answers on lab/plan" in answer.reason

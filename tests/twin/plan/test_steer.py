@@ -1,0 +1,117 @@
+"""The failing clause chooses the change."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scripted_plans import pick_and_place, scene_of_test
+
+from bridge.geometry import se3
+from bridge.task.plan_request import Refusal
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
+from twin.plan.loop.steer import steer_by, tried_in
+
+TASK = load_task("cube_into_box")
+FINGERS = ("gripper", "gripper_left_finger")
+YES = Factor(value=True)
+
+
+def verdict(name: str, cause: str, *bodies: str, grasps: tuple[dict, ...] = ()) -> Verdict:
+    no = Factor(value=False, cause=cause, bodies=bodies)
+    three = dict.fromkeys(("ik", "clearance", "terminal"), YES)
+    checks = {"start": YES, "task": YES, "limits": YES, "audit": YES}
+    (three if name in three else checks)[name] = no
+    return Verdict(
+        plan_id="p",
+        trajectory="planned",
+        mode="dynamic",
+        engine="test",
+        seed=0,
+        checks=checks,
+        grasps=grasps,
+        **three,
+    )
+
+
+def grasp(*, touched: bool, held: bool) -> tuple[dict, ...]:
+    where = [0.01, -0.02, 0.0] if touched else None
+    return ({"object": "cube", "touched": touched, "held": held, "p_object_m": where},)
+
+
+HELD, BESIDE = grasp(touched=True, held=True), grasp(touched=False, held=False)
+SLID = grasp(touched=True, held=False)
+
+
+@pytest.mark.parametrize(
+    ("refusal", "change", "object_id"),
+    [
+        (
+            verdict("clearance", "pre_grasp_penetration", "gripper_left_finger", "cube"),
+            "grasp",
+            "cube",
+        ),
+        (verdict("clearance", "deep_contact", "cube", "gripper_left_finger"), "grasp", "cube"),
+        (verdict("clearance", "too_close", "cube", "box"), "release", "cube"),
+        (verdict("clearance", "collision", "forearm_link", "box"), "path", None),
+        (verdict("clearance", "collision", "gripper_left_finger", "box"), "path", None),
+        (verdict("audit", "collision", "cube", "table"), "path", "cube"),
+        (verdict("terminal", "inside", "cube", "box", grasps=HELD), "release", "cube"),
+        (verdict("terminal", "inside", "cube", "box", grasps=SLID), "grasp_shift", "cube"),
+        (verdict("terminal", "inside", "cube", "box", grasps=BESIDE), "grasp", "cube"),
+        (verdict("terminal", "inside", "cube", "box"), "release", "cube"),
+        (verdict("terminal", "slipped", "cube", grasps=HELD), "grasp", "cube"),
+        (verdict("terminal", "exploded", "cube"), "grasp", "cube"),
+        (verdict("terminal", "allowed_contacts", "cube"), "path", "cube"),
+        (verdict("ik", "unreachable"), "branch", None),
+        (verdict("ik", "self_collision", "forearm_link", "wrist_3_link"), "branch", None),
+        (verdict("ik", "joint_speed"), "path", None),
+        (verdict("limits", "tool_speed"), "path", None),
+        (verdict("start", "start_elsewhere", "elbow_joint"), "any", None),
+    ],
+)
+def test_the_failing_clause_chooses_the_change(
+    refusal: Verdict, change: str, object_id: str | None
+) -> None:
+    plan = pick_and_place(scene_of_test())
+    steer = steer_by([Refusal(plan=plan, verdict=refusal)], TASK, FINGERS)
+    assert (steer.change, steer.object_id) == (change, object_id)
+    name = refusal.first_failing
+    assert name is not None
+    by = steer.steered_by()
+    assert by.clause == f"{name}.{refusal.factors()[name].cause}"
+    assert by.bodies == refusal.factors()[name].bodies
+    expected = (0.01, -0.02, 0.0) if change == "grasp_shift" else None
+    assert steer.toward_m == expected
+
+
+def test_what_was_tried_is_read_from_the_plan_in_the_objects_frame() -> None:
+    scene = scene_of_test()
+    entities = {name: se3.pose_record(T) for name, T in scene.Ts_base_object.items()}
+    plan = replace(pick_and_place(scene, grasp_offset_m=(0.0, 0.0, 0.01)), entities=entities)
+    (tried,) = tried_in(plan)
+    assert tried.object_id == "cube"
+    np.testing.assert_allclose(tried.T_object_tcp[:3, 3], [0.0, 0.0, 0.01], atol=1e-9)
+    assert tried.T_base_release is not None
+    np.testing.assert_allclose(tried.T_base_release[:3, 3], [0.5, 0.19, 0.12], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "turn_deg", "same"),
+    [(0.0, 0, True), (0.009, 9, True), (0.011, 0, False), (0, 11, False)],
+)
+def test_grasps_within_a_centimetre_and_ten_degrees_are_one(
+    shift_m: float, turn_deg: float, same: bool
+) -> None:
+    scene = scene_of_test()
+    entities = {name: se3.pose_record(T) for name, T in scene.Ts_base_object.items()}
+    plan = replace(pick_and_place(scene), entities=entities)
+    no = verdict("terminal", "slipped", "cube")
+    steer = steer_by([Refusal(plan=plan, verdict=no)], TASK, FINGERS)
+    T = tried_in(plan)[0].T_object_tcp.copy()
+    half = np.radians(turn_deg) / 2
+    R = se3.rotation_from_quaternion(np.array([np.cos(half), 0, 0, np.sin(half)]))
+    T[:3, :3] = R @ T[:3, :3]
+    T[0, 3] += shift_m
+    assert steer.has_grasp_like("cube", T) is same
+    assert steer.has_grasp_like("box", T) is False

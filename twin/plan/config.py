@@ -1,0 +1,32 @@
+"""Settings of the planner; imports nothing heavy."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from bridge.errors import refuse_outside
+from bridge.wire.config import DEFAULT_ENDPOINT
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class LivePlanConfig:
+    """Whom a live planner answers."""
+
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Endpoints of the recorder."""
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
+    """zenoh configuration (JSON5), for example with certificates."""
+    cell: str = "standin"
+    """Whose requests are answered: the service is below this name."""
+    robot: str = ""
+    """Robot file, by name or path, whose description takes the place of the published one; none:
+    the robot that the cell describes (docs/robots.md)."""
+    candidates: int = 5
+    """Plans that are made at once; a cell may ask for as many rounds."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which no planner can work."""
+        refuse_outside(self, {"candidates": (1, 1000)})

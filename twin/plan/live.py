@@ -1,0 +1,214 @@
+"""A planner on the wire: a cell asks how a task is done from here, a plan or a reason is answered.
+
+It remembers nothing between two requests: the same request has the same answer. It moves nothing
+and publishes nothing; the cell that asks publishes the plan, asks the gate, and executes it or not.
+"""
+
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.episode.cdr.messages import string_from_cdr
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import PLAN, ROBOT_DESCRIPTION, cell_topic, refuse_bad_name
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.robots.robot import read_robot
+from bridge.task.find import Attached, find_task_file
+from bridge.task.plan_request import PlanAnswer, PlanRequest
+from bridge.task.task_file import Task
+from bridge.terminal import Output, printable, stop_signals
+from bridge.wire.config import WireConfig
+from twin.errors import TwinError
+from twin.plan.config import LivePlanConfig
+from twin.plan.loop import straight
+from twin.plan.loop.propose import NoPlanError, Proposer, choose
+from twin.plan.problem import Problem
+from twin.replay.rebuilt_scene import read_rebuilt_scene
+from twin.robot.model import load_robot
+
+PROPOSERS: Mapping[str, Callable[[], Proposer]] = {straight.POLICY: straight.GeometricProposer}
+"""How a plan is made, by the policy it is called."""
+ALIVE = "/alive"
+"""Behind the service's key: the liveliness token of the planner that answers there."""
+
+
+class PlannerError(TwinError):
+    """The planner cannot be set up as asked."""
+
+
+class LivePlanner:
+    """Answers the requests of one cell from one run."""
+
+    def __init__(
+        self,
+        run: RunFolder,
+        config: LivePlanConfig,
+        urdf: Callable[[], str | None],
+        proposers: Mapping[str, Callable[[], Proposer]] = PROPOSERS,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            run: Its scene, calibration and task files are used.
+            config: How many candidates are made.
+            urdf: The robot's description, None before any.
+            proposers: How a plan is made, by the policy it is called.
+        """
+        self._run, self._config, self._urdf = run, config, urdf
+        self._proposers = proposers
+
+    def answer(self, payload: bytes) -> PlanAnswer:
+        """Plan as asked, or say why not.
+
+        Raises:
+            InvalidRecordError: When the payload is no gst plan request; nothing else is an error.
+        """
+        request = PlanRequest.from_json(payload)
+        try:
+            return PlanAnswer(plan=self._planned(request))
+        except GstError as error:
+            return PlanAnswer(reason=str(error))
+        except Exception as error:  # noqa: BLE001  # a bug must not leave a cell without an answer
+            traceback.print_exc()
+            return PlanAnswer(reason=f"internal error: {type(error).__name__}: {error}")
+
+    def _planned(self, request: PlanRequest) -> Any:
+        make = self._proposers.get(request.policy)
+        if make is None:
+            known = ", ".join(sorted(self._proposers))
+            raise NoPlanError(f"policy {request.policy!r} is unknown. There are: {known}.")
+        task = find_task_file(
+            request.task,
+            tasks_dir=self._run.tasks_dir,
+            attached=Attached(sha256=request.task_sha256),
+        ).task()
+        problem = self._problem(request, task)
+        candidate = choose(
+            make(),
+            problem,
+            plan_id=f"plan_{request.round}",
+            seed=request.seed,
+            round_=request.round,
+            refused=request.refused,
+            most=self._config.candidates,
+        )
+        return replace(
+            candidate.plan,
+            task_sha256=request.task_sha256,
+            start_id=request.start_id,
+            round=request.round,
+            entities={name: se3.pose_record(T) for name, T in request.Ts_base_object().items()},
+            grounding_source="gst localisation v1 of the request",
+        )
+
+    def _problem(self, request: PlanRequest, task: Task) -> Problem:
+        urdf = self._urdf()
+        if urdf is None:
+            raise NoPlanError(f"no robot description has arrived on {ROBOT_DESCRIPTION}.")
+        robot = load_robot(urdf)
+        if (robot.record.name, robot.joints) != (request.robot, request.joint_names):
+            raise NoPlanError(
+                f"the request is for robot {request.robot!r}; the cell describes "
+                f"{robot.record.name!r}."
+            )
+        covariances = {
+            str(record["object"]): np.array(record["covariance"], dtype=np.float64).reshape(6, 6)
+            for record in request.objects
+            if record.get("covariance") is not None
+        }
+        poses = request.Ts_base_object()
+        if unknown := sorted(poses.keys() ^ task.objects.keys()):
+            raise NoPlanError(
+                f"the request and task {task.name} differ in objects: {', '.join(unknown)}."
+            )
+        scene = read_rebuilt_scene(self._run, task).scene(
+            task, urdf, poses, covariances=covariances
+        )
+        start_rad = np.array(request.joints_rad, dtype=np.float64)
+        return Problem(scene=replace(scene, start_rad=start_rad), robot=robot, shapes={})
+
+
+def claim_planner(session: Any, cell: str) -> None:
+    """Let other planners of this cell see that there is one.
+
+    Args:
+        session: An open ``bridge.wire.session``; the claim lasts as long as it.
+        cell: Name of the cell.
+
+    Raises:
+        PlannerError: When there is one already.
+    """
+    key = cell_topic(cell, PLAN)[1:] + ALIVE
+    if session.query_alive(key):
+        raise PlannerError(
+            f"a planner answers on {cell}{PLAN} already, and of two only one would be heard. "
+            "Stop it first; one whose machine is gone is forgotten after ten seconds."
+        )
+    session.declare_alive(key)
+
+
+def serve_planner(session: Any, planner: LivePlanner, cell: str, output: Output) -> None:
+    """Answer on ``<cell>/plan``.
+
+    Args:
+        session: An open ``bridge.wire.session``.
+        planner: Makes the plans.
+        cell: Name of the cell.
+        output: Told each answer in a line.
+    """
+
+    def answer(payload: bytes) -> bytes:
+        found = planner.answer(payload)
+        data = found.to_json()
+        if found.plan is None:
+            output.say(printable(f"no plan: {found.reason}"))
+        else:
+            plan, by = found.plan, found.plan.steered_by
+            changed = f", steered by {by.clause}" if by is not None else ""
+            output.say(
+                printable(f"{plan.start_id}: plan of round {plan.round} by {plan.policy}{changed}")
+            )
+        return data
+
+    session.serve(cell_topic(cell, PLAN)[1:], answer)
+
+
+def run_planner(path: Path, config: LivePlanConfig, output: Output) -> int:
+    """Answer a cell's requests until SIGINT or SIGTERM; both end with exit code 0.
+
+    Args:
+        path: The run whose scene, calibration and task files are used.
+        config: Cell, connection and how many candidates are made.
+        output: Told when the planner is ready, and each answer.
+    """
+    from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
+
+    refuse_bad_name("cell", config.cell)
+    run = RunFolder.open(path)
+    heard: dict[str, str] = {}
+    if config.robot:
+        heard["urdf"] = read_robot(config.robot).description()
+
+    def hear(sample: Any) -> None:
+        if not config.robot:
+            heard["urdf"] = string_from_cdr(sample.data)
+
+    planner = LivePlanner(run, config, lambda: heard.get("urdf"))
+    wire = WireConfig(connect=config.connect, config=config.zenoh_config)
+    with stop_signals() as stopped, open_session(wire) as session:
+        claim_planner(session, config.cell)
+        session.subscribe(ROBOT_DESCRIPTION[1:], hear)
+        serve_planner(session, planner, config.cell, output)
+        output.say(
+            f"planner ready: cell {config.cell}, service {config.cell}{PLAN}, policies "
+            f"{', '.join(sorted(PROPOSERS))}. Stop with Ctrl-C."
+        )
+        while not stopped.wait(0.2):
+            pass
+    output.say("planner stopped")
+    return 0

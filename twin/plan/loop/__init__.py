@@ -1,0 +1,1 @@
+"""Propose, have it judged, and change what the failing clause asks for."""

@@ -1,0 +1,187 @@
+"""The loop: propose, have it judged, steer, propose again; nothing of it looks at a clock."""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+from bridge.task.plan import Plan, Ranking
+from bridge.task.plan_request import Refusal
+from bridge.task.verdict import Verdict
+from twin.errors import TwinError
+from twin.plan.loop.steer import Steer, steer_by
+from twin.plan.problem import Problem
+
+
+class NoPlanError(TwinError):
+    """The planner finds no plan; the message says why and what would help."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One plan that a proposer offers."""
+
+    plan: Plan
+    rank: int
+    """0 is the one it likes best."""
+    cost: float
+    remarks: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Proposer(Protocol):
+    """Makes plans for a problem."""
+
+    def propose(
+        self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
+    ) -> list[Candidate]:
+        """Offer plans, the best first; the same arguments give the same plans.
+
+        Args:
+            problem: What is to be done, and where.
+            plan_id: Name of the plans; whoever publishes one gives it its own.
+            seed: Of everything that is drawn.
+            count: At most so many.
+            steer: What a refusal asks to change; None: nothing was refused.
+
+        Raises:
+            NoPlanError: When there is none.
+        """
+
+
+def choose(
+    proposer: Proposer,
+    problem: Problem,
+    *,
+    plan_id: str,
+    seed: int,
+    round_: int,
+    refused: Sequence[Refusal],
+    most: int,
+) -> Candidate:
+    """Return the candidate of a round: by rank, or steered by what was refused.
+
+    Args:
+        proposer: Makes the candidates.
+        problem: What is to be done, and where.
+        plan_id: Name of the plan.
+        seed: Of the start; rounds that are steered draw from their own.
+        round_: How many candidates were not executed.
+        refused: Those of them that were judged, with their verdicts; none: candidates go by rank.
+        most: Candidates that are asked for at once.
+
+    Raises:
+        NoPlanError: When there is none left.
+    """
+    if not refused:
+        ranked = proposer.propose(
+            problem, plan_id=plan_id, seed=seed, count=max(most, round_ + 1), steer=None
+        )
+        if round_ >= len(ranked):
+            raise NoPlanError(f"there are {len(ranked)} candidates, and {round_} were tried.")
+        return named(ranked[round_], problem, seed=seed)
+    steer = steer_by(refused, problem.scene.task, fingers_of(problem))
+    known = [refusal.plan.tau for refusal in refused]
+    try:
+        steered = proposer.propose(problem, plan_id=plan_id, seed=seed, count=most, steer=steer)
+    except NoPlanError:
+        steered = []
+    if fresh := _fresh(steered, known):
+        return named(fresh, problem, seed=seed, steer=steer)
+    ranked = proposer.propose(
+        problem, plan_id=plan_id, seed=seed, count=most + len(refused), steer=None
+    )
+    if fresh := _fresh(ranked, known):
+        remark = f"nothing else answers {steer.clause}: the next by rank"
+        return named(replace(fresh, remarks=(*fresh.remarks, remark)), problem, seed=seed)
+    raise NoPlanError(f"every candidate was refused, the last by {steer.clause}.")
+
+
+def _fresh(candidates: Iterable[Candidate], known: Collection[object]) -> Candidate | None:
+    return next((each for each in candidates if each.plan.tau not in known), None)
+
+
+def named(
+    candidate: Candidate, problem: Problem, *, seed: int, steer: Steer | None = None
+) -> Candidate:
+    """Write into a plan which candidate it is, what steered it and in which scene it was made.
+
+    Args:
+        candidate: As proposed.
+        problem: Its scene names itself by its hash.
+        seed: What it was drawn with.
+        steer: What changed it; None: nothing.
+    """
+    plan = replace(
+        candidate.plan,
+        candidate=Ranking(rank=candidate.rank, cost=candidate.cost, seed=seed),
+        steered_by=None if steer is None else steer.steered_by(),
+        scene_hash=problem.scene.scene_hash,
+    )
+    return replace(candidate, plan=plan)
+
+
+def fingers_of(problem: Problem) -> tuple[str, ...]:
+    """Names by which failures call the hand."""
+    gripper = problem.robot.record.gripper
+    return ("gripper", gripper.name, *gripper.links)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One candidate and what was said of it."""
+
+    candidate: Candidate
+    verdict: Verdict
+
+
+def plan_and_verify(
+    proposer: Proposer,
+    problem: Problem,
+    judge: Callable[[Plan], Verdict],
+    *,
+    plan_id: str,
+    seed: int,
+    rounds: int,
+) -> list[Attempt]:
+    """Propose and have judged until one is accepted; the last attempt is the one that counts.
+
+    Ends at the first yes, at the first verdict that is neither yes nor no, when no candidate is
+    left, or after so many rounds.
+
+    Args:
+        proposer: Makes the candidates.
+        problem: What is to be done, and where.
+        judge: The twin, here or behind a gate.
+        plan_id: Plans are called this, a dot and their round.
+        seed: Of everything that is drawn.
+        rounds: Candidates that may be judged.
+
+    Raises:
+        NoPlanError: When there is not even a first candidate.
+    """
+    attempts: list[Attempt] = []
+    refused: list[Refusal] = []
+    for round_ in range(rounds):
+        try:
+            candidate = choose(
+                proposer,
+                problem,
+                plan_id=plan_id,
+                seed=seed,
+                round_=round_,
+                refused=refused,
+                most=rounds,
+            )
+        except NoPlanError:
+            if not attempts:
+                raise
+            break
+        parent = attempts[-1].candidate.plan.id if attempts else None
+        plan = replace(candidate.plan, id=f"{plan_id}.{round_}", parent_id=parent, round=round_)
+        candidate = replace(candidate, plan=plan)
+        verdict = judge(plan)
+        attempts.append(Attempt(candidate=candidate, verdict=verdict))
+        if verdict.accepted is not False:
+            break
+        refused.append(Refusal(plan=plan, verdict=verdict))
+    return attempts

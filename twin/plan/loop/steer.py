@@ -1,0 +1,191 @@
+"""What a refusal asks the planner to change: the failing clause chooses."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import InvalidRecordError
+from bridge.geometry import se3
+from bridge.task.plan import Plan, SteeredBy, Waypoint
+from bridge.task.plan_request import Refusal
+from bridge.task.task_file import Task
+from bridge.task.verdict import Factor, Verdict
+
+Change = Literal["grasp", "grasp_shift", "release", "path", "branch", "any"]
+ALIKE_M = 0.01
+ALIKE_RAD = np.radians(10.0)
+"""Two grasps or releases nearer than both are one."""
+
+_BRANCH = ("unreachable", "joints_disagree", "joint_limit", "joint_jump", "self_collision")
+_SQUEEZED = ("exploded", "shape", "slipped", "probability")
+_IN_OBJECT = ("deep_contact", "pre_grasp_penetration")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """How a plan took hold of an object and let it go."""
+
+    object_id: str
+    T_object_tcp: Float[np.ndarray, "4 4"]
+    """Tool where the gripper is told to close, in the object's frame at the start."""
+    width_m: float | None
+    """Commanded width; None where the plan does not say."""
+    T_base_release: Float[np.ndarray, "4 4"] | None = None
+    """Tool where the gripper is told to open; None where it never is."""
+    joints_rad: tuple[float, ...] | None = None
+    """Arm at the grasp."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steer:
+    """The change a refusal asks for, and everything that was refused before."""
+
+    change: Change
+    """``grasp``: another one, or another width; ``grasp_shift``: nearer to where a finger touched;
+    ``release``: another final state; ``path``: another way or approach; ``branch``: another posture
+    or order; ``any``: nothing in particular."""
+    clause: str
+    """Factor and cause: ``terminal.inside``."""
+    bodies: tuple[str, ...] = ()
+    object_id: str | None = None
+    """Whose grasp or release is meant; None: none in particular."""
+    toward_m: tuple[float, float, float] | None = None
+    """Where the tool was in the object's frame when a finger first touched it in the twin."""
+    refused: tuple[Tried, ...] = ()
+    """Of every refused plan, oldest first."""
+
+    def steered_by(self) -> SteeredBy:
+        """What a plan says of it."""
+        return SteeredBy(clause=self.clause, bodies=self.bodies)
+
+    def has_grasp_like(self, object_id: str, T_object_tcp: Float[np.ndarray, "4 4"]) -> bool:
+        """Whether a grasp was refused that is the same within 1 cm and 10 degrees.
+
+        Args:
+            object_id: What is grasped.
+            T_object_tcp: Tool at the grasp, in the object's frame.
+        """
+        mine = [tried for tried in self.refused if tried.object_id == object_id]
+        return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
+
+    def has_release_like(self, object_id: str, T_base_tcp: Float[np.ndarray, "4 4"]) -> bool:
+        """Whether a release was refused that is the same within 1 cm and 10 degrees.
+
+        Args:
+            object_id: What is let go.
+            T_base_tcp: Tool at the release.
+        """
+        mine = [tried.T_base_release for tried in self.refused if tried.object_id == object_id]
+        return any(T is not None and alike(T, T_base_tcp) for T in mine)
+
+
+def alike(T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether two poses are one within 1 cm and 10 degrees."""
+    near = float(np.linalg.norm(T_first[:3, 3] - T_second[:3, 3])) < ALIKE_M
+    turned_rad = float(se3.rotation_angle_rad(T_first[:3, :3].T @ T_second[:3, :3]))
+    return near and bool(turned_rad < ALIKE_RAD)
+
+
+def steer_by(refusals: Sequence[Refusal], task: Task, fingers: Collection[str]) -> Steer:
+    """Let the first failing clause of the newest refusal choose what changes.
+
+    Args:
+        refusals: Refused plans with their verdicts, oldest first; at least one.
+        task: Which objects are moved, and where they belong.
+        fingers: Names by which failures call the hand: the gripper's and those of its links.
+    """
+    verdict = refusals[-1].verdict
+    name = verdict.first_failing
+    factor = Factor(value=None) if name is None else verdict.factors()[name]
+    moved = [body for body in factor.bodies if body in task.manipulated]
+    object_id = moved[0] if moved else None
+    change = _change(name, factor, verdict, task, fingers)
+    return Steer(
+        change=change,
+        clause=f"{name}.{factor.cause}" if factor.cause else name or "undecided",
+        bodies=factor.bodies,
+        object_id=object_id,
+        toward_m=_touched_at(verdict, object_id) if change == "grasp_shift" else None,
+        refused=tuple(tried for refusal in refusals for tried in tried_in(refusal.plan)),
+    )
+
+
+def _change(
+    name: str | None, factor: Factor, verdict: Verdict, task: Task, fingers: Collection[str]
+) -> Change:
+    cause = factor.cause or ""
+    if name == "ik":
+        return "branch" if cause in _BRANCH else "path"
+    if name == "limits":
+        return "path"
+    if name in ("clearance", "audit"):
+        return _change_of_contact(cause, factor.bodies, task, fingers)
+    if name == "terminal":
+        return _change_of_outcome(cause, factor.bodies, verdict, task)
+    return "any"  # it starts elsewhere, or asks for what its task does not give
+
+
+def _change_of_contact(
+    cause: str, bodies: Sequence[str], task: Task, fingers: Collection[str]
+) -> Change:
+    moved = {body for body in bodies if body in task.manipulated}
+    others = set(bodies) - moved
+    if moved and (cause in _IN_OBJECT or others & set(fingers)):
+        return "grasp"
+    targets = {goal[1] for each in moved if (goal := task.goal_of(each)) is not None}
+    return "release" if others & (targets | set(task.containers)) and moved else "path"
+
+
+def _change_of_outcome(cause: str, bodies: Sequence[str], verdict: Verdict, task: Task) -> Change:
+    if cause in _SQUEEZED:
+        return "grasp"
+    if cause == "allowed_contacts":
+        return "path"
+    named = set(bodies) & set(task.manipulated)
+    missed = [item for item in verdict.grasps if item["object"] in named and not item["held"]]
+    if not missed:
+        return "release"
+    return "grasp_shift" if missed[0]["touched"] else "grasp"
+
+
+def _touched_at(verdict: Verdict, object_id: str | None) -> tuple[float, float, float] | None:
+    for item in verdict.grasps:
+        if item["object"] == object_id and item.get("p_object_m") is not None:
+            x, y, z = item["p_object_m"]
+            return float(x), float(y), float(z)
+    return None
+
+
+def tried_in(plan: Plan) -> tuple[Tried, ...]:
+    """Read from a plan how it grasps and releases each object; unreadable poses are left out."""
+    found = []
+    for stage in plan.stages:
+        closing = None if stage.grasp is None else _first(plan, stage.t_start_ns, g=1)
+        if stage.grasp is None or closing is None or stage.grasp not in plan.entities:
+            continue
+        try:
+            T_base_object = se3.pose_from_record(plan.entities[stage.grasp])
+        except InvalidRecordError:
+            continue
+        opening = _first(plan, closing.t_ns, g=0)
+        found.append(
+            Tried(
+                object_id=stage.grasp,
+                T_object_tcp=se3.invert(T_base_object) @ _pose(closing),
+                width_m=closing.width_m,
+                T_base_release=None if opening is None else _pose(opening),
+                joints_rad=closing.joints_rad,
+            )
+        )
+    return tuple(found)
+
+
+def _first(plan: Plan, from_ns: int, *, g: int) -> Waypoint | None:
+    return next((each for each in plan.tau if each.t_ns >= from_ns and each.g == g), None)
+
+
+def _pose(waypoint: Waypoint) -> Float[np.ndarray, "4 4"]:
+    return se3.transform_from(np.array(waypoint.q_wxyz), np.array(waypoint.p_m))
