@@ -105,7 +105,8 @@ def boxes_distance(points_m: Array, centres_m: Sequence[Array], halves_m: Sequen
     """
     xp = namespace(points_m)
     axes = [points_m[..., k] for k in range(points_m.shape[-1])]
-    outside2, inside = None, 0.0
+    outside2: Array = None
+    inside: Array = 0.0
     for centre, half in zip(centres_m, halves_m, strict=True):
         beyond = [abs(axis - centre[k]) - half[k] for k, axis in enumerate(axes)]
         deepest, ahead2 = beyond[0], 0.0
@@ -129,7 +130,8 @@ def grid_distance(grid: SdfGrid, points_m: Array) -> Array:
     counts = grid.values_m.shape
     where = (points_m - like(grid.origin_m, points_m)) / grid.voxel_m
     held = xp.stack([xp.clip(where[..., k], 0.0, float(counts[k] - 1)) for k in range(3)], axis=-1)
-    corner = [xp.clip(xp.floor(held[..., k]), 0.0, float(counts[k] - 2)) for k in range(3)]
+    known = xp.nan_to_num(held)  # what is no number still has no distance, by what it is beyond
+    corner = [xp.clip(xp.floor(known[..., k]), 0.0, float(counts[k] - 2)) for k in range(3)]
     share = [held[..., k] - corner[k] for k in range(3)]
     flat = (corner[0] * counts[1] + corner[1]) * counts[2] + corner[2]
     flat = flat.astype(np.int64) if xp is np else flat.long()

@@ -4,7 +4,7 @@ Here are points and directions, distances and regions, and what is asked of a pa
 between bodies, which predicates decide too, are beside this in ``relations``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -48,13 +48,31 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
     Raises:
         ConstraintError: When it does not fit, or names what is not there.
-        UsageError: When it asks for what the problem does not have, such as a rebuilt scene.
+        UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
+            an object that was not localised.
     """
     vocabulary = Vocabulary.of_task(
         problem.scene.task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
     )
     check_constraint(record, vocabulary)
+    for name in _named(record):
+        if name in problem.scene.missing():
+            reason = problem.scene.reasons.get(name, "not found")
+            message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
+            raise UsageError(message)
     return _KINDS[record["kind"]](record, problem)
+
+
+_ID_KEYS = ("obj", "container", "support", "reference", "against", "first", "second", "over")
+
+
+def _named(record: Record) -> Iterator[str]:
+    """Ids of the objects that a record names anywhere."""
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from _named(value)
+        elif key in (*_ID_KEYS, "frame"):
+            yield value
 
 
 def _distance(record: Record, problem: Problem) -> Constraint:

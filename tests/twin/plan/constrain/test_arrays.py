@@ -44,6 +44,8 @@ def test_distances_in_a_grid_are_those_of_the_grid(closed: bool) -> None:
     np.testing.assert_allclose(arrays.grid_distance(grid, points), wanted, atol=1e-12)
     found = arrays.grid_distance(grid, torch.tensor(points))
     np.testing.assert_allclose(found.numpy(), wanted, atol=1e-12)
+    points[0, 0, 1] = np.nan
+    assert np.isnan(arrays.grid_distance(grid, points)).sum() == 1
 
 
 def test_distances_to_a_box_are_those_to_its_nearest_point() -> None:
