@@ -6,6 +6,7 @@ a root of exactly nothing has no derivative.
 """
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -82,16 +83,40 @@ def seen_from(T: Array, points_m: Array) -> Array:
     return (points_m - T[:, None, :3, 3]) @ T[:, :3, :3]
 
 
-def box_distance(points_m: Array, half_m: Array) -> Array:
-    """Signed distances of points in a box's frame to its surface, negative inside [m].
+def box_distance(points_m: Array, half_m: Array, centre_m: Array | None = None) -> Array:
+    """Signed distances of points to the surface of a box along the axes, negative inside [m].
 
     Args:
-        points_m: ``(..., 3)``, the box around the origin.
-        half_m: Half its extents, ``(3,)``.
+        points_m: ``(..., 3)``, or seen from above ``(..., 2)``.
+        half_m: Half its extents.
+        centre_m: Its middle; None: the origin.
+    """
+    middles = [like((0.0,) * len(half_m), points_m) if centre_m is None else centre_m]
+    return boxes_distance(points_m, middles, [half_m])
+
+
+def boxes_distance(points_m: Array, centres_m: Sequence[Array], halves_m: Sequence[Array]) -> Array:
+    """Signed distances of points to the nearest of several boxes; inside one, its own depth [m].
+
+    Args:
+        points_m: ``(..., num_axes)``.
+        centres_m: Middles of the boxes, each ``(num_axes,)``.
+        halves_m: Half their extents.
     """
     xp = namespace(points_m)
-    beyond = abs(points_m) - half_m
-    return norm(xp.clip(beyond, 0.0, None)) + xp.clip(xp.amax(beyond, axis=-1), None, 0.0)
+    axes = [points_m[..., k] for k in range(points_m.shape[-1])]
+    outside2: Array = None
+    inside: Array = 0.0
+    for centre, half in zip(centres_m, halves_m, strict=True):
+        beyond = [abs(axis - centre[k]) - half[k] for k, axis in enumerate(axes)]
+        deepest, ahead2 = beyond[0], 0.0
+        for value in beyond:
+            deepest = xp.maximum(deepest, value)
+            clipped = xp.clip(value, 0.0, None)
+            ahead2 = ahead2 + clipped * clipped
+        inside = xp.clip(deepest, None, 0.0) if outside2 is None else xp.minimum(inside, deepest)
+        outside2 = ahead2 if outside2 is None else xp.minimum(outside2, ahead2)
+    return xp.sqrt(outside2 + _NOTHING_M2) + inside
 
 
 def grid_distance(grid: SdfGrid, points_m: Array) -> Array:
@@ -105,7 +130,8 @@ def grid_distance(grid: SdfGrid, points_m: Array) -> Array:
     counts = grid.values_m.shape
     where = (points_m - like(grid.origin_m, points_m)) / grid.voxel_m
     held = xp.stack([xp.clip(where[..., k], 0.0, float(counts[k] - 1)) for k in range(3)], axis=-1)
-    corner = [xp.clip(xp.floor(held[..., k]), 0.0, float(counts[k] - 2)) for k in range(3)]
+    known = xp.nan_to_num(held)  # what is no number still has no distance, by what it is beyond
+    corner = [xp.clip(xp.floor(known[..., k]), 0.0, float(counts[k] - 2)) for k in range(3)]
     share = [held[..., k] - corner[k] for k in range(3)]
     flat = (corner[0] * counts[1] + corner[1]) * counts[2] + corner[2]
     flat = flat.astype(np.int64) if xp is np else flat.long()
@@ -159,8 +185,8 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
         from_middle = -(centre + sign * to_middle)
         t = xp.maximum(xp.minimum((from_middle * along).sum(-1), lengths), -lengths)
         gaps.append(xp.where(flat, norm(from_middle - t[..., None] * along), _FAR_M))
-    apart = xp.amin(xp.concatenate(gaps, axis=1), axis=-1)
-    return xp.where(overlap <= 0, overlap, apart)
+    clear = xp.amin(xp.concatenate(gaps, axis=1), axis=-1)
+    return xp.where(overlap <= 0, overlap, clear)
 
 
 def blocked_length(

@@ -96,8 +96,8 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
         ]
         return sum(places) / len(places) + like(offset, state.T_base_tcp)
 
-    said = f"keypoint {ids[0]}" if "kp" in spec else f"the middle of keypoints {ids}"
-    return mean, said + aside
+    words = f"keypoint {ids[0]}" if "kp" in spec else f"the middle of keypoints {ids}"
+    return mean, words + aside
 
 
 def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
@@ -142,15 +142,23 @@ def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
     return lambda state: like(axis, state.T_base_tcp)[None, None], f"the base frame's {name} axis"
 
 
-def surface_points(problem: Problem, object_id: str) -> Float[np.ndarray, "num_points 3"]:
-    """Points of an object's surface in its frame: corners, and more spread evenly over it [m]."""
+def surface_points(
+    problem: Problem, object_id: str, count: int = NUM_POINTS
+) -> Float[np.ndarray, "num_points 3"]:
+    """Points of an object's surface in its frame: corners, and more spread evenly over it [m].
+
+    Args:
+        problem: With the object's shape.
+        object_id: Of the object.
+        count: How many points; at most half of them are corners.
+    """
     shape = problem.shapes[object_id]
     corners = shape.vertices_m[np.unique(shape.triangles)]
-    corners = corners[:: max(1, -(-2 * len(corners) // NUM_POINTS))]
+    corners = corners[:: max(1, -(-2 * len(corners) // count))]
     a, b, c = (shape.vertices_m[shape.triangles[:, k]] for k in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     rng = np.random.default_rng(0)
-    chosen, u, v = sample_triangles(areas, NUM_POINTS - len(corners), rng, in_order=True)
+    chosen, u, v = sample_triangles(areas, count - len(corners), rng, in_order=True)
     spread = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
     return np.concatenate([corners, spread])
 

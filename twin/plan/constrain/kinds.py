@@ -4,7 +4,7 @@ Here are points and directions, distances and regions, and what is asked of a pa
 between bodies, which predicates decide too, are beside this in ``relations``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +34,8 @@ from twin.plan.constrain.relations import RELATIONS
 from twin.plan.constrain.schema import BASE, SCENE, Vocabulary, check_constraint
 from twin.plan.problem import Problem, State
 
+NUM_SEEN = 50
+"""Points of a surface that are looked for."""
 HOLD_TOLERANCE_M, HOLD_TOLERANCE_DEG = 0.005, 5.0
 
 
@@ -46,13 +48,31 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
     Raises:
         ConstraintError: When it does not fit, or names what is not there.
-        UsageError: When it asks for what the problem does not have, such as a rebuilt scene.
+        UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
+            an object that was not localised.
     """
     vocabulary = Vocabulary.of_task(
         problem.scene.task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
     )
     check_constraint(record, vocabulary)
+    for name in _named(record):
+        if name in problem.scene.missing():
+            reason = problem.scene.reasons.get(name, "not found")
+            message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
+            raise UsageError(message)
     return _KINDS[record["kind"]](record, problem)
+
+
+_ID_KEYS = ("obj", "container", "support", "reference", "against", "first", "second", "over")
+
+
+def _named(record: Record) -> Iterator[str]:
+    """Ids of the objects that a record names anywhere."""
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from _named(value)
+        elif key in (*_ID_KEYS, "frame"):
+            yield value
 
 
 def _distance(record: Record, problem: Problem) -> Constraint:
@@ -177,7 +197,7 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
         return over_scene
     others = surface_points(problem, against)
 
-    def apart(state: State) -> Array:
+    def between(state: State) -> Array:
         T, T_other = pose_of(state, obj), pose_of(state, against)
         xp = namespace(state.T_base_tcp)
         there = arrays.seen_from(T_other, arrays.carried(T, like(points, T)))
@@ -187,17 +207,17 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
             xp.amin(_panel_distance(problem.model(obj), back), axis=-1),
         )
 
-    return apart
+    return between
 
 
 def _panel_distance(model: ObjectModel, points: Array) -> Array:
     """Signed distances of points in an object's frame to the boxes it is made of [m]."""
-    xp = namespace(points)
-    found = [
-        arrays.box_distance(points - like(centre, points), like(np.array(size) / 2, points))
-        for centre, size in model.panels()
-    ]
-    return xp.amin(xp.stack(found, axis=-1), axis=-1)
+    centres, sizes = zip(*model.panels(), strict=True)
+    return arrays.boxes_distance(
+        points,
+        [like(centre, points) for centre in centres],
+        [like(np.array(size) / 2, points) for size in sizes],
+    )
 
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
@@ -237,7 +257,7 @@ def _region(spec: Record, problem: Problem) -> tuple[Callable[[State, Array], Ar
 
         def of_box(state: State, points: Array) -> Array:
             centre, half = like((low + high) / 2, points), like((high - low) / 2, points)
-            return arrays.box_distance(points - centre, half)
+            return arrays.box_distance(points, half, centre)
 
         return of_box, f"the box from {millimetres(low)} to {millimetres(high)}"
     if "sphere" in spec:
@@ -370,7 +390,7 @@ def _visible(record: Record, problem: Problem) -> Constraint:
         message = f"visible {obj}: there is no camera {name!r} here. Cameras: {known}."
         raise UsageError(message)
     view = problem.cameras[name]
-    points = surface_points(problem, obj)
+    points = surface_points(problem, obj, NUM_SEEN)
     share = record.get("frac", 0.5)
     camera = view.camera
     # Planes through the eye and the edges of the image, pointing outwards.

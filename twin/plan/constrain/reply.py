@@ -1,6 +1,6 @@
 """Replies of a model: text that nobody trusts becomes stages, or a list of what is wrong with it.
 
-Nothing in a reply is executed, formatted or believed. What a plan may touch and what counts as
+Nothing in a reply is executed, formatted or trusted. What a plan may touch and what counts as
 success come from the task file; a reply that allows or asks for anything else is refused.
 """
 

@@ -185,7 +185,7 @@ def _laid_over(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 
 def told(problems: Problems) -> tuple[str, ...]:
     """One line for each of the first problems: place and what is wrong."""
-    lines = (f"{place(where)}: {said}" for where, said in islice(problems, MOST_PROBLEMS))
+    lines = (f"{place(where)}: {what}" for where, what in islice(problems, MOST_PROBLEMS))
     return tuple(dict.fromkeys(lines))
 
 
@@ -251,9 +251,9 @@ class _Fitting:
         elif "enum" in spec:
             yield from _enum(value, spec["enum"], where)
         else:
-            said, fits = _TYPES[spec["type"]]
+            named, fits = _TYPES[spec["type"]]
             if not fits(value):
-                yield where, f"{shown(value)} should be {said}"
+                yield where, f"{shown(value)} should be {named}"
             elif spec["type"] == "object":
                 yield from self._object(value, spec, where)
             elif spec["type"] == "array":
@@ -382,6 +382,8 @@ def _alike(record: Mapping[str, Any], where: Where) -> Problems:
     for key in _OTHERS:
         if "obj" in record and record.get(key) == record["obj"]:
             yield (*where, key), f"{record['obj']} cannot be related to itself"
+    if "obj" in record and record.get("region", {}).get("over") == record["obj"]:
+        yield (*where, "region", "over"), f"{record['obj']} is always over itself"
     if record["kind"] == "between" and record["first"] == record["second"]:
         yield (*where, "second"), f"{record['second']} is named twice"
     if record["kind"] in ("distance", "above", "align") and record["a"] == record["b"]:

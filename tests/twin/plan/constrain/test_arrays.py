@@ -44,6 +44,8 @@ def test_distances_in_a_grid_are_those_of_the_grid(closed: bool) -> None:
     np.testing.assert_allclose(arrays.grid_distance(grid, points), wanted, atol=1e-12)
     found = arrays.grid_distance(grid, torch.tensor(points))
     np.testing.assert_allclose(found.numpy(), wanted, atol=1e-12)
+    points[0, 0, 1] = np.nan
+    assert np.isnan(arrays.grid_distance(grid, points)).sum() == 1
 
 
 def test_distances_to_a_box_are_those_to_its_nearest_point() -> None:
@@ -55,6 +57,15 @@ def test_distances_to_a_box_are_those_to_its_nearest_point() -> None:
     inside = np.min(half - np.abs(points), axis=1)
     wanted = np.where(outside > 0, outside, -inside)
     np.testing.assert_allclose(found, wanted, atol=1e-11)
+
+
+def test_distances_to_several_boxes_are_to_the_nearest() -> None:
+    rng = np.random.default_rng(4)
+    centres, halves = rng.uniform(-0.2, 0.2, (4, 3)), rng.uniform(0.02, 0.2, (4, 3))
+    points = rng.uniform(-0.5, 0.5, size=(500, 3))
+    each = [arrays.box_distance(points, *box) for box in zip(halves, centres, strict=True)]
+    found = arrays.boxes_distance(points, list(centres), list(halves))
+    np.testing.assert_allclose(found, np.min(each, axis=0), atol=1e-11)
 
 
 def test_a_line_is_blocked_for_as_long_as_it_runs_inside() -> None:

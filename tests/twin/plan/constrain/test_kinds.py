@@ -1,15 +1,19 @@
 """Laws of every kind of constraint: sign, unit, derivative, invariance, both libraries."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from block_scene import EXAMPLES, IN_BOX, START, around, blocks, of_torch, pose, state
 
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from twin.plan.constrain.constraint import Constraint, violated, worst_along
 from twin.plan.constrain.kinds import KINDS, compile_constraint
 from twin.plan.problem import State
+from twin.scene.shape.sdf import SdfGrid
+from twin.scene.shape.static import StaticSdf
 
 PATH_KINDS = {"hold", "speed"}
 RIGID = ("distance at least", "inside", "inside share", "relpose", "clearance", "align bodies")
@@ -262,3 +266,42 @@ def test_what_is_hidden_behind_the_post_is_not_visible() -> None:
     assert (
         constraint.violation(state(cube=se3.transform_from(np.array([1.0, 0, 0, 0]), beside))) < 0
     )
+
+
+def test_what_was_not_localised_cannot_be_planned_with() -> None:
+    scene = blocks().scene
+    left = {key: T for key, T in scene.Ts_base_object.items() if key != "box"}
+    lost = replace(scene, Ts_base_object=left, reasons={"box": "hidden by the arm"})
+    problem = replace(blocks(), scene=lost)
+    for name in ("inside", "above", "keepout over"):
+        with pytest.raises(UsageError, match=r"box was not localised \(hidden by the arm\)"):
+            compile_constraint(EXAMPLES[name][0], problem)
+    compile_constraint(EXAMPLES["on"][0], problem)
+
+
+def test_a_scene_that_was_not_rebuilt_has_no_distances() -> None:
+    record = {"kind": "clearance", "obj": "cube", "against": "scene", "min": 0.02}
+    with pytest.raises(UsageError, match="there is no rebuilt scene"):
+        compile_constraint(record, blocks())
+
+
+def test_a_rebuilt_scene_says_how_far_it_is() -> None:
+    """A floor at 5 cm, as a grid: the cube's lowest corner counts."""
+    z = 0.02 * np.arange(40) - 0.2
+    values = np.broadcast_to((z - 0.05).astype(np.float32), (60, 60, 40)).copy()
+    grid = SdfGrid(values_m=values, origin_m=np.array([0.0, -0.6, -0.2]), voxel_m=0.02)
+    free = np.zeros(values.shape, dtype=np.uint8)
+    still = StaticSdf(
+        conservative=grid, observed=grid, state=free, truncation_m=0.1, table_z_m=None
+    )
+    problem = replace(blocks(), scene=replace(blocks().scene, static_sdf=still))
+    record = {"kind": "clearance", "obj": "cube", "against": "scene", "min": 0.03}
+    constraint = compile_constraint(record, problem)
+    found = constraint.violation(state(cube=pose(0.5, 0.0, 0.1, 0.3)))[0]
+    assert found == pytest.approx(0.03 - (0.1 - 0.02 - 0.05), abs=1e-6)
+
+
+def test_a_state_that_is_no_number_does_not_hold() -> None:
+    for name in EXAMPLES:
+        lost = {key: np.full((4, 4), np.nan) for key in ("cube", "brick", "tcp")}
+        assert not made(name).violation(state(**lost))[0] <= 0, name
