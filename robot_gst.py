@@ -85,6 +85,12 @@ COMMANDS: tuple[Command, ...] = (
         "runs/monday",
     ),
     (
+        "plan",
+        "twin.cli:plan",
+        "Turn an instruction into goals, stages and a task file.",
+        "runs/monday --task 'put the cube into the box' --dry",
+    ),
+    (
         "evaluate",
         "evaluator.cli:evaluate",
         "Compute success rates and agreement; write a report.",

@@ -62,6 +62,37 @@ def gate(
     return run_gate(run, config, output)
 
 
+def plan(
+    run: Path,
+    /,
+    *,
+    task: str,
+    dry: bool = False,
+    output: Output = OUTPUT,
+) -> int:
+    """Say what an instruction asks for: objects, goals, stages; keep it as a task of the run.
+
+    Exit code 2, with what could be meant, where the instruction is not understood whole.
+    Example: robot-gst plan runs/today --task "put the cube into the box" --dry
+
+    Args:
+        run: Run folder; its episodes and its scene say which objects there are.
+        task: The instruction in English, or the name or file of a task.
+        dry: Write nothing; otherwise the task goes into the run's tasks/.
+        output: How to talk.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from twin.plan.ground.run_tasks import keep, understand
+
+    folder = RunFolder.open(run)
+    understood = understand(folder, task)
+    path = None if dry else keep(folder, understood)
+    data = {**understood.to_json(), "file": None if path is None else str(path)}
+    wrote = [] if path is None else ["", f"wrote {path}"]
+    output.result(data, "\n".join([*understood.lines(), *wrote]))
+    return 0
+
+
 def rebuild(
     run: Path,
     /,

@@ -26,6 +26,7 @@ from twin.plan.ground.words import (
     WORD,
     Phrases,
     Token,
+    word_set,
 )
 from twin.scene.semantics.language import (
     ANY_THING,
@@ -37,10 +38,10 @@ from twin.scene.semantics.language import (
     singular,
 )
 
-BREAKS = frozenset(
-    "of with while without keeping keep staying stay until till avoiding avoid with but then before after "
-    "afterwards finally remain remaining never not do does to than where which that so such as "
-    "making holding during both once when if unless or except using".split()
+BREAKS = word_set(
+    "of with out while without keeping keep staying stay until till avoiding avoid but then "
+    "before after afterwards finally remain remaining never not do does to than where which that "
+    "so such as making holding during both once when if unless or except using"
 )
 """Words that no noun phrase goes on with."""
 TABLE_NAMES = frozenset({"table", "tabletop", "desk", "surface", "workbench", "worktop", "ground"})
@@ -63,9 +64,9 @@ MATCHING = Phrases(
         "matching",
     )
 )
-SAME_COLOURED = frozenset(
+SAME_COLOURED = word_set(
     "matching same-coloured same-colored like-coloured corresponding respective own "
-    "colour-matched same-colour same-color".split()
+    "colour-matched same-colour same-color"
 )
 SLOTS = ("theme", "container", "support", "reference")
 """What a phrase is asked for: what moves, what it goes into, onto, or what is named beside it."""
@@ -145,6 +146,8 @@ def begins_other(tokens: Sequence[Token], at: int, *, inside: bool) -> bool:
     if at >= len(tokens) or tokens[at].kind != WORD:
         return True
     word = tokens[at].text
+    if inside and word in ("the", "a", "an", "this", "these", "those", "my", "your", "it", "them"):
+        return True
     if word in BREAKS or word in ALTERNATIVES or word in NEGATIONS or word == "'s":
         return True
     if RELATIONS.match(tokens, at) or CONJUNCTIONS.match(tokens, at) or VIEWS.match(tokens, at):
@@ -176,6 +179,7 @@ def read(tokens: Sequence[Token], at: int) -> tuple[NounPhrase, int] | None:
     is_one = bool(words) and words[-1] in ("one", "ones")
     if is_one:
         plural = words.pop() == "ones" or plural
+        quantifier = quantifier or ("a" if not words and not plural else "")
     phrase = NounPhrase(
         text=_text(tokens, start, at),
         words=tuple(_plain(word) for word in words if word not in ("coloured", "colored")),
@@ -235,8 +239,8 @@ def _after(
     if at < len(tokens) and tokens[at].text in ("'s", "'"):
         owned = read(tokens, at + 1)
         if owned is not None and owned[0].words and part_of(owned[0].words[-1]):
-            part = part_of(owned[0].words[-1]) or ""
-            phrase = replace(phrase, part=part, text=_text(tokens, start, owned[1]))
+            named = part_of(owned[0].words[-1]) or ""
+            phrase = replace(phrase, part=named, text=_text(tokens, start, owned[1]))
             return phrase, owned[1]
     if (found := MATCHING.match(tokens, at)) is not None:
         phrase = replace(phrase, matching=True, text=_text(tokens, start, found[1]))
@@ -280,6 +284,21 @@ def _is_plural(word: str) -> bool:
     return singular(word) != word
 
 
+def with_shared_noun(phrases: Sequence[NounPhrase]) -> list[NounPhrase]:
+    """The red and the green cubes: the noun at the end belongs to all."""
+    shared = list(phrases)
+    for index in range(len(shared) - 2, -1, -1):
+        phrase, after = shared[index], shared[index + 1]
+        lacks = bool(phrase.words) and not phrase.has_noun
+        if lacks and not phrase.is_one and not phrase.pronoun and after.has_noun:
+            nouns = tuple(word for word in after.words if colour_of(word) is None)
+            plural = phrase.plural or after.plural
+            shared[index] = replace(phrase, words=(*phrase.words, *nouns), plural=plural)
+    if shared and shared[0].quantifier == "all":
+        shared = [p if p.quantifier else replace(p, quantifier="all") for p in shared]
+    return shared
+
+
 class Resolver:
     """Finds what noun phrases mean among the things of a vocabulary."""
 
@@ -294,9 +313,7 @@ class Resolver:
         self.memory = memory
         self._nouns = vocabulary.nouns() | TABLE_NAMES
 
-    def resolve(
-        self, phrase: NounPhrase, slot: str, *, besides: Sequence[str] = ()
-    ) -> Resolved:
+    def resolve(self, phrase: NounPhrase, slot: str, *, besides: Sequence[str] = ()) -> Resolved:
         """Say which things a phrase means.
 
         Args:
@@ -317,6 +334,11 @@ class Resolver:
         fitting = self._fitting(phrase)
         if not fitting:
             self._refuse_unfitting(phrase, slot)
+        if slot == "theme" and phrase.quantifier == "all" and phrase.words == ("object",):
+            fitting = tuple(key for key in fitting if self.vocabulary.things[key].movable)
+            if not fitting:
+                message = f"'{phrase.text}': nothing is left that can be moved."
+                raise GroundingError("too_few_objects", message, candidates=self._of(slot))
         fitting = self._suited(fitting, slot, besides)
         if phrase.has_noun:
             self.memory.nouns[slot] = tuple(
@@ -337,6 +359,8 @@ class Resolver:
             return same if self._fitting(same) else replace(same, words=nouns.get(slot, ()))
         slots = (slot,) if slot == "theme" else (slot, "theme") if slot == "container" else SLOTS
         tried = [replace(phrase, words=(*phrase.words, *nouns[s])) for s in slots if s in nouns]
+        if not tried and phrase.words:
+            return replace(phrase, words=(*phrase.words, "object"))
         if not tried:
             message = f"'{phrase.text}' stands for no noun that was said before."
             raise GroundingError("ambiguous_object", message, candidates=self._of(slot))
@@ -477,15 +501,13 @@ class Resolver:
     ) -> tuple[str, ...]:
         """Leave out what cannot be meant, as long as something is left."""
         things = self.vocabulary.things
-        rules = {
-            "theme": lambda key: things[key].movable,
-            "container": lambda key: things[key].container,
-            "support": lambda key: not things[key].container,
-            "reference": lambda key: True,
-        }
-        for rule in (lambda key: key not in besides, rules[slot]):
-            left = tuple(key for key in fitting if rule(key))
-            fitting = left or fitting
+        suited = {
+            "theme": {key for key in fitting if things[key].movable},
+            "container": {key for key in fitting if things[key].container},
+            "support": {key for key in fitting if not things[key].container},
+        }.get(slot, set(fitting))
+        for good in (set(fitting) - set(besides), suited):
+            fitting = tuple(key for key in fitting if key in good) or fitting
         return fitting
 
     def _counted(self, phrase: NounPhrase, fitting: tuple[str, ...], slot: str) -> Resolved:
@@ -507,7 +529,8 @@ class Resolver:
         if not loose or picks or slot != "theme":
             message = f"'{phrase.text}' fits {many} objects: {told}. Say which is meant."
             raise GroundingError("ambiguous_object", message, candidates=fitting)
-        chosen = fitting[: count or 1]
+        fresh = tuple(key for key in fitting if key not in self.memory.placed)
+        chosen = (fresh if len(fresh) >= (count or 1) else fitting)[: count or 1]
         choice = Choice(count=len(chosen), among=fitting, chosen=chosen)
         self.memory.choices.append(choice)
         return Resolved(ids=chosen, choice=choice)

@@ -1,7 +1,7 @@
 """Clauses about the way: keep it upright, not over something, so far away from something."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bridge.task.check import TABLE
@@ -9,7 +9,8 @@ from twin.plan.ground import noun_phrases
 from twin.plan.ground.goals import PathLimit
 from twin.plan.ground.noun_phrases import NounPhrase, Resolver
 from twin.plan.ground.vocabulary import GroundingError
-from twin.plan.ground.words import LENGTH, WORD, Phrases, Token
+from twin.plan.ground.words import LENGTH, WORD, Phrases, Token, word_set
+from twin.scene.semantics.language import part_of
 
 UPRIGHT_DEG = 15.0
 """Tilt on the way that counts as upright."""
@@ -99,10 +100,10 @@ HEIGHT = Phrases(
            "above the surface", "in height", "above ground", "above the tabletop")
 )  # fmt: skip
 UNTIL = Phrases(_table("until", "until", "till", "before", "up to when", "as long as"))
-OVER_IT = frozenset(
+OVER_IT = word_set(
     "you are it is the gripper hand above over at inside in it there release releasing box its "
     "them you're has reached reach reaches arrive arrives directly right just about to let go "
-    "letting container basket bin".split()
+    "letting container basket bin"
 )
 """Words of "until you are above it"."""
 
@@ -239,11 +240,11 @@ class PathReader:
         if height is None and not worded:
             return None
         length = tokens[limit[1]].value[0]
-        return self._height_limit(
-            limit[0], length, height[1] if height else limit[1] + 1, themes
-        )
+        return self._height_limit(limit[0], length, height[1] if height else limit[1] + 1, themes)
 
-    def _height_limit(self, side: str, length: float, at: int, themes: Sequence[str]) -> Read:
+    def _height_limit(
+        self, side: str, length: float, at: int, themes: Sequence[str]
+    ) -> Read | None:
         bound = "min" if side == "least" else "max"
         words = f"its lowest point at {side} {length * 100:g} cm over the table"
         return self._limits({"kind": "height", bound: round(length, 6)}, words, at, themes)
@@ -258,12 +259,12 @@ class PathReader:
         if found is None:
             return None
         phrase, behind = found
-        part = noun_phrases.part_of(phrase.words[-1]) if phrase.words else None
+        part = part_of(phrase.words[-1]) if phrase.words else None
         owner = phrase.words[:-1] if part and not its else ()
         if part and not phrase.part and not set(owner) & self.resolver.vocabulary.nouns():
             return (destination, behind) if destination not in ("", TABLE) else None
         if part and owner:  # the box walls
-            cut = noun_phrases.replace(phrase, words=owner, plural=False)
+            cut = replace(phrase, words=owner, plural=False)
             return self.resolver.resolve(cut, "reference", besides=themes).ids[0], behind
         if phrase.pronoun == "it" and destination not in ("", TABLE):
             return destination, behind
@@ -275,7 +276,7 @@ class PathReader:
 
     def _clearance(
         self, least_m: float, key: str, at: int, themes: Sequence[str], destination: str
-    ) -> Read:
+    ) -> Read | None:
         ends = UNTIL.match(self.tokens, at)
         if ends is not None:
             at = self._until(ends[1])

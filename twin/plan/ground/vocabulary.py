@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.task.check import TABLE
 from bridge.task.task_file import BASKET, Task
 from twin.errors import TwinError
 from twin.scene.semantics.colour import COLOUR_NAMES, colour_name
 from twin.scene.semantics.language import (
     ANY_THING,
-    PART_WORDS,
     colour_of,
     kind_of,
     known_words,
@@ -197,5 +195,3 @@ def vocabulary_of(
             size_m=model.size_m,
         )
     return Vocabulary(things=things, cameras=cameras or {})
-
-

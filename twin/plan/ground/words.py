@@ -10,6 +10,12 @@ from dataclasses import dataclass
 
 from twin.plan.ground.vocabulary import GroundingError
 
+
+def word_set(text: str) -> frozenset[str]:
+    """The words of a text, to ask whether one is among them."""
+    return frozenset(text.split())
+
+
 MAX_CHARACTERS = 2000
 """Of an instruction."""
 MAX_WORDS = 300
@@ -33,13 +39,17 @@ UNITS_M = {
     "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0,
     "inch": 0.0254, "inches": 0.0254,
 }  # fmt: skip
-NUMBERS = {
-    word: number
-    for number, word in enumerate(
-        "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen "
-        "fifteen sixteen seventeen eighteen nineteen twenty".split()
-    )
-} | {"thirty": 30, "forty": 40, "fifty": 50, "hundred": 100, "dozen": 12}
+_COUNTED = (
+    "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen "
+    "fifteen sixteen seventeen eighteen nineteen twenty"
+)
+NUMBERS = {word: number for number, word in enumerate(_COUNTED.split())} | {
+    "thirty": 30,
+    "forty": 40,
+    "fifty": 50,
+    "hundred": 100,
+    "dozen": 12,
+}
 _NUMBER = r"\d+(?:[.,]\d+)?"
 _TOKEN = re.compile(
     rf"(?P<range>({_NUMBER})\s*(?:-|–|to)\s*({_NUMBER})\s*(?P<range_unit>{'|'.join(UNITS_M)})\b)"
@@ -117,9 +127,11 @@ def _spelled_lengths(tokens: Sequence[Token]) -> list[Token]:
     for token in tokens:
         if token.kind == WORD and token.text in UNITS_M and joined:
             before = joined[-1]
-            number = NUMBERS.get(before.text, 1 if before.text in ("a", "an") else None)
+            number: float | None = NUMBERS.get(before.text)
             if before.kind == NUMBER:
                 number = before.value[0]
+            elif before.text in ("a", "an"):
+                number = 1.0
             if number is not None and (before.text not in ("a", "an") or token.text != "m"):
                 length = number * UNITS_M[token.text]
                 joined[-1] = Token(LENGTH, f"{before.text} {token.text}", (length, length))
@@ -185,7 +197,7 @@ VERBS = Phrases(
     | _forms(
         "take",
         "take, take out, grab, grab hold of, grasp, grip, pick, pick up, seize, remove, extract, "
-        "fetch, retrieve, lift, lift up, unload, get hold of, take hold of",
+        "fetch, retrieve, hold, lift, lift up, unload, get hold of, take hold of",
     )
     | _forms("pack", "pack, pack up, store, stow, stow away, put away, tidy up, tidy away, stash")
     | _forms("stack", "stack, stack up, pile, pile up")
@@ -198,13 +210,13 @@ VERBS = Phrases(
 """Verbs by what they ask for; only at the beginning of a clause."""
 THROWN = ("throw", "toss", "drop", "dump", "plop")
 PUSHED = ("push", "slide", "nudge", "shove", "drag", "pull")
-UNSUPPORTED_VERBS = frozenset(
-    "pour hand give pass show open close shut spin rotate turn flip twist tilt roll shake stir wipe "
+UNSUPPORTED_VERBS = word_set(
+    "pour hand give pass show open close shut spin rotate turn flip twist tilt roll shake stir "
     "clean wash cut slice fold unfold press squeeze poke hit kick point look watch find count "
-    "screw unscrew plug unplug fill water cook eat swap exchange switch wave dance hold hug "
+    "screw unscrew plug unplug fill water cook eat swap exchange switch wave dance hug "
     "balance juggle catch bend break crush smash paint draw write hang tie connect attach detach "
     "wipe sweep scan measure weigh touch knock tap tip raise lower hover feed sell buy throw-away "
-    "bounce mix assemble disassemble straighten cover wrap unwrap unpack clear scoop".split()
+    "bounce mix assemble disassemble straighten cover wrap unwrap unpack clear scoop"
 )
 """Verbs that are understood and that nobody here can do."""
 RELATIONS = Phrases(
@@ -241,8 +253,9 @@ RELATIONS = Phrases(
     | _all(
         "outside",
         ("out of", "outside", "outside of", "from out of", "from inside", "from inside of",
-         "from within", "off of", "off"),
+         "from within"),
     )
+    | _all("off", ("off of", "off"))
     | {"from": "from"}
     | _all("to", ("to", "towards", "toward", "over to", "up to"))
     | {
@@ -250,16 +263,16 @@ RELATIONS = Phrases(
         "aligned with": "aligned", "parallel to": "aligned", "in line with": "aligned",
         "parallel with": "aligned", "lined up with": "aligned",
     }
-    | {
-        word: "unsupported"
-        for word in (
+    | _all(
+        "unsupported",
+        (
             "under", "underneath", "below", "beneath", "above", "over", "around", "through",
             "against", "at", "across", "along", "past", "opposite", "in the middle of",
             "in the centre of", "in the center of", "in the corner of", "at the edge of",
             "on the edge of", "in the middle between", "among", "opposite of", "on the side of",
             "at the corner of", "on the corner of", "onto the side of", "via", "about", "behind of",
-        )
-    }
+        ),
+    )
 )  # fmt: skip
 """Prepositions by the relation they ask for."""
 WAYS = Phrases(
@@ -269,8 +282,8 @@ WAYS = Phrases(
         for before, behind in (
             ("to the ", ""), ("", ""), ("", "ward"), ("", "wards"), ("towards the ", ""),
             ("toward the ", ""), ("to your ", ""), ("to the ", " side"), ("to the robot's ", ""),
-            ("to the ", "-hand side"), ("further to the ", ""), ("further ", ""), ("over to the ", ""),
-            ("a bit to the ", ""), ("to the robot 's ", ""),
+            ("to the ", "-hand side"), ("further to the ", ""), ("further ", ""),
+            ("over to the ", ""), ("a bit to the ", ""), ("to the robot 's ", ""),
         )
     }
     | _all(
@@ -288,6 +301,7 @@ WAYS = Phrases(
     | _all(
         "vertical", ("up", "upward", "upwards", "down", "downward", "downwards", "higher", "lower")
     )
+    | {f"{to} its {side}": f"its {side}" for to in ("to", "on") for side in ("left", "right")}
     | _all(
         "mine",
         ("to my left", "to my right", "towards me", "toward me", "away from me", "closer to me",
@@ -318,18 +332,18 @@ QUANTIFIERS = Phrases(
     | _all("other", ("the other", "the others", "the remaining", "the rest of", "the rest",
                      "all other", "all others", "all the others", "the other one",
                      "all remaining", "all the other", "every other"))
-    | _all("the", ("the", "this", "that", "these", "those", "my", "your", "our"))
+    | _all("the", ("the", "this", "that", "these", "those", "my", "your", "our", "its", "their"))
 )  # fmt: skip
 PRONOUNS = frozenset({"it", "them", "they", "itself", "themselves"})
 EVERYTHING = frozenset({"everything", "everyone"})
-SELECTORS = frozenset(
+SELECTORS = word_set(
     "first second third fourth fifth last next left right leftmost rightmost nearest closest "
     "farthest furthest nearer front back middle central top bottom upper lower same smaller larger "
     "smallest largest biggest tallest shortest heaviest lightest other wrong remaining bigger "
-    "matching".split()
+    "matching"
 )
 """Adjectives that choose one of several: they are never passed over."""
-EXTRA_COLOURS = frozenset("transparent clear rainbow multicoloured multicolored".split())
+EXTRA_COLOURS = word_set("transparent clear rainbow multicoloured multicolored")
 LAYERS = Phrases(
     _all("bottom", ("on the bottom", "at the bottom", "at the base", "as the base", "lowest",
                     "on bottom", "as the bottom", "as base", "undermost", "first"))
@@ -370,12 +384,13 @@ BELONGS = Phrases(
         "goes",
         ("goes", "go", "belongs", "belong", "should go", "should be", "must be", "must go",
          "has to be", "has to go", "have to be", "have to go", "needs to be", "needs to go",
-         "need to be", "need to go", "should end up", "ends up", "end up", "ought to be", "shall be",
-         "shall go", "should sit", "should stand", "should lie", "to go", "to be", "is to be",
+         "need to be", "need to go", "should end up", "ends up", "end up", "ought to be",
+         "shall be", "shall go", "should sit", "should stand", "should lie", "to go", "to be",
+         "is to be",
          "are to be", "is to go", "are to go", "must end up", "should stay", "must stand",
          "should all be", "should all go", "must all be", "all go", "should come", "comes",
-         "is supposed to be", "are supposed to be", "should rest", "needs to end up", "has to end up",
-         "needs to sit", "should each be", "should each go"),
+         "is supposed to be", "are supposed to be", "should rest", "needs to end up",
+         "has to end up", "needs to sit", "should each be", "should each go"),
     )
     | _all("is", ("is", "are", "sits", "stands", "lies", "ends", "end", "be", "rests", "stand"))
 )  # fmt: skip
@@ -391,11 +406,13 @@ SEQUENCES = Phrases(
     | _all("before", ("before that", "but before that", "but first", "before doing so"))
 )  # fmt: skip
 """Words that put clauses into an order; at their beginning."""
-CONJUNCTIONS = Phrases(_all("and", ("and", "plus", "as well as", "along with", "together with", "&")))
-CONDITIONS = frozenset("if unless whenever when while-not provided whether otherwise except".split())
+CONJUNCTIONS = Phrases(
+    _all("and", ("and", "plus", "as well as", "along with", "together with", "&"))
+)
+CONDITIONS = word_set("if unless whenever when while-not provided whether otherwise except")
 ALTERNATIVES = frozenset({"or", "nor", "either-or", "maybe", "perhaps"})
 NEGATIONS = frozenset({"not", "never", "no", "none", "neither", "nothing", "nobody", "nowhere"})
-QUESTIONS = frozenset("what where who why how which whose is are does did was were has am".split())
+QUESTIONS = word_set("what where who why how which whose is are does did was were has am")
 ADVERBS = Phrases(
     _all("upright", ("upright", "standing upright", "standing up", "so that it stands upright",
                      "in an upright position", "so it stands upright", "right side up",
