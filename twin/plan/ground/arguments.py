@@ -154,8 +154,8 @@ class ArgumentReader:
         return printable(" ".join(token.text for token in self.tokens[start:end]))
 
     def _unknown(self, start: int, why: str = "is not understood") -> GroundingError:
-        said = self._rest(start)
-        return GroundingError("unknown_clause", f"'{said}' {why}.")
+        told = self._rest(start)
+        return GroundingError("unknown_clause", f"'{told}' {why}.")
 
     def _refuse_word(self) -> None:
         """Raise where a word is here that the grammar knows and does not take."""
@@ -219,8 +219,8 @@ class ArgumentReader:
             if wanted <= set(key.replace("-", "_").lower().split("_")) | {key.lower()}
         ]
         if len(fitting) != 1:
-            said = " ".join(token.text for token in self.tokens[at : self.at])
-            message = f"'{said}' is no camera whose place is known."
+            told = " ".join(token.text for token in self.tokens[at : self.at])
+            message = f"'{told}' is no camera whose place is known."
             known = self.vocabulary.cameras
             raise GroundingError("unknown_camera", message, candidates=known)
         clause.view = fitting[0]
@@ -363,8 +363,8 @@ class ArgumentReader:
             return True
         self.at = at
         if kind == "unsupported":
-            said = " ".join(token.text for token in self.tokens[at - 1 : at + 3])
-            message = f"'{said}': the relation '{word}' is not known here."
+            told = " ".join(token.text for token in self.tokens[at - 1 : at + 3])
+            message = f"'{told}': the relation '{word}' is not known here."
             raise GroundingError("unsupported_relation", message)
         self._relate(clause, kind)
         return True
@@ -404,7 +404,7 @@ class ArgumentReader:
         for key in clause.themes[:-1]:
             self.goals.steps.append((key,))
         self.goals.edges += [(first + n, first + n + 1) for n in range(len(clause.themes) - 1)]
-        self.goals.is_order_said = True
+        self.goals.is_order_given = True
 
     def _limit(self, clause: Clause) -> bool:
         start = self.at
@@ -527,7 +527,7 @@ class ArgumentReader:
             self.at = found[1]
             self._on(lower, found[0])
             clause.goals[:0] = lower.goals
-            self.goals.is_order_said = True
+            self.goals.is_order_given = True
         return None
 
     def _out(self, clause: Clause, phrase: NounPhrase, kind: str) -> None:
@@ -580,8 +580,8 @@ class ArgumentReader:
                 break
             self.at = joined[1]
         if len(ids) != 2:
-            said = self._rest(start - 1)
-            message = f"'{said}': it takes two things to be between, not {len(ids)}."
+            told = self._rest(start - 1)
+            message = f"'{told}': it takes two things to be between, not {len(ids)}."
             kind = "too_few_objects" if len(ids) < 2 else "ambiguous_object"
             raise GroundingError(kind, message, candidates=ids)
         clause.add("between", first=ids[0], second=ids[1])
@@ -619,8 +619,8 @@ class ArgumentReader:
             if len(fitting) != 1:
                 kind = "ambiguous_object" if fitting else "unknown_object"
                 many = "more than one" if fitting else "no"
-                said = colour or "of no known colour"
-                message = f"{key} is {said}, and there is {many} such container."
+                told = colour or "of no known colour"
+                message = f"{key} is {told}, and there is {many} such container."
                 raise GroundingError(kind, message, candidates=fitting or containers)
             clause.goals.append({"kind": "inside", "object": key, "container": fitting[0]})
 

@@ -197,5 +197,5 @@ class ArrangementReader(ArgumentReader):
             clause.goals.append({"kind": "on", "object": upper, "support": lower})
         why = "" if known or told else ": the planner's choice, for no order is said"
         self.memory.explanation.append(f"from the bottom up: {', '.join(tower)}{why}")
-        self.goals.is_order_said = self.goals.is_order_said or bool(known or told)
+        self.goals.is_order_given = self.goals.is_order_given or bool(known or told)
         self._close(clause, start)

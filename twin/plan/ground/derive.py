@@ -178,29 +178,29 @@ def _target(goals: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _where(goals: Sequence[Mapping[str, Any]]) -> str:
-    said = []
+    told = []
     for goal in goals:
         side = goal.get("direction", "")
         side = f" {side.replace('_', ' ')}" if isinstance(side, str) and side else ""
         match goal["kind"]:
             case "inside":
-                said.append(f"into {goal['container']}")
+                told.append(f"into {goal['container']}")
             case "on":
-                said.append(f"onto {goal['support']}")
+                told.append(f"onto {goal['support']}")
             case "outside":
-                said.append(f"out of {goal['container']}")
+                told.append(f"out of {goal['container']}")
             case "beside":
-                said.append(f"next to {goal['reference']}{f' ({side.strip()})' if side else ''}")
+                told.append(f"next to {goal['reference']}{f' ({side.strip()})' if side else ''}")
             case "between":
-                said.append(f"between {goal['first']} and {goal['second']}")
+                told.append(f"between {goal['first']} and {goal['second']}")
             case "aligned":
-                said.append(f"aligned with {goal['reference']}")
+                told.append(f"aligned with {goal['reference']}")
             case "upright":
-                said.append("upright")
+                told.append("upright")
             case "moved":
                 length = goal.get("by_m", goal.get("at_least_m", 0.0))
-                said.append(f"by {length * 100:g} cm{side}")
-    return ", ".join(said)
+                told.append(f"by {length * 100:g} cm{side}")
+    return ", ".join(told)
 
 
 def success_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -36,7 +36,7 @@ class Grounding:
     """Success predicates of a task file, in the order they were said."""
     order: tuple[str, ...]
     """Objects in the order in which they are moved."""
-    is_order_said: bool
+    is_order_given: bool
     """The instruction asks for that order, or its relations do; else another one is as good."""
     path: tuple[PathLimit, ...] = ()
     grasp_parts: Mapping[str, str] = field(default_factory=dict)
@@ -49,11 +49,11 @@ class Grounding:
     def lines(self) -> list[str]:
         """The goals, the order, the limits on the way and what they were made of, in words."""
         order = ", then ".join(self.order)
-        said = "" if self.is_order_said or len(self.order) < 2 else " (any order will do)"
+        told = "" if self.is_order_given or len(self.order) < 2 else " (any order will do)"
         return [
             "goals, when at the end",
             *(f"  {describe_predicate(goal)}" for goal in self.goals),
-            f"moved: {order}{said}",
+            f"moved: {order}{told}",
             *(f"on the way: {limit.words}" for limit in self.path),
             *(f"taken by: {key} by its {part}" for key, part in self.grasp_parts.items()),
             "understood",
@@ -67,7 +67,7 @@ class Grounding:
             "instruction": self.text,
             "goals": [dict(goal) for goal in self.goals],
             "order": list(self.order),
-            "is_order_said": self.is_order_said,
+            "is_order_given": self.is_order_given,
             "path": [
                 {
                     "object": limit.object_id,
@@ -101,7 +101,7 @@ class Goals:
         """Objects of each clause."""
         self.edges: list[tuple[int, int]] = []
         """Clauses that come before others."""
-        self.is_order_said = False
+        self.is_order_given = False
 
     def add_clause(self, goals: Sequence[dict[str, Any]]) -> None:
         """Take the goals of one clause.

@@ -72,7 +72,7 @@ class Reader(ArrangementReader):
                 if last is not None and (then or before):
                     edge = (last, known) if then else (known, last)
                     self.goals.edges.append(edge)
-                    self.goals.is_order_said = True
+                    self.goals.is_order_given = True
                 last, then, before = len(self.goals.steps) - 1, False, False
         return self._finish()
 
@@ -147,7 +147,7 @@ class Reader(ArrangementReader):
             text=self.text,
             goals=tuple(found),
             order=order,
-            is_order_said=self.goals.is_order_said,
+            is_order_given=self.goals.is_order_given,
             path=tuple(self._spread(order)),
             grasp_parts=dict(self.parts),
             choices=tuple(self.memory.choices),
@@ -210,7 +210,7 @@ class Reader(ArrangementReader):
         self._clause()
         if len(self.goals.steps) == known:
             raise self._unknown(start)
-        self.goals.is_order_said = True
+        self.goals.is_order_given = True
         if later:  # this was the second half of a sentence
             pair = (known - 1, known)
         else:
@@ -297,7 +297,7 @@ class Reader(ArrangementReader):
         for key in themes:
             clause.goals.append({"kind": "on", "object": key, "support": lower})
             lower = key
-        self.goals.is_order_said = True
+        self.goals.is_order_given = True
         self._close(clause, self.at)
 
     def _verb_clause(self) -> None:

@@ -174,8 +174,8 @@ def read(tokens: Sequence[Token], at: int) -> tuple[NounPhrase, int] | None:
         words.append(tokens[at].text)
         at += 1
     plural = bool(words) and _is_plural(words[-1])
-    said = {token.text for token in tokens[start:at]}
-    plural = plural or (quantifier == "other" and bool(said & {"others", "rest", "remaining"}))
+    spoken = {token.text for token in tokens[start:at]}
+    plural = plural or (quantifier == "other" and bool(spoken & {"others", "rest", "remaining"}))
     is_one = bool(words) and words[-1] in ("one", "ones")
     if is_one:
         plural = words.pop() == "ones" or plural

@@ -295,8 +295,8 @@ class PathReader:
         ):
             at += 1
         if at == start:
-            said = " ".join(token.text for token in self.tokens[at : at + 8])
-            message = f"'until {said}' is not understood. A limit ends above the place of release."
+            told = " ".join(token.text for token in self.tokens[at : at + 8])
+            message = f"'until {told}' is not understood. A limit ends above the place of release."
             raise GroundingError("unknown_clause", message)
         return at
 

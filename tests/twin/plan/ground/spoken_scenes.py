@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from twin.plan.ground.goals import Grounding
-from twin.plan.ground.vocabulary import Vocabulary, vocabulary_from_labels
+from twin.plan.ground.grammar import ground
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary, vocabulary_from_labels
 
 KEYS = ("object", "container", "support", "reference", "first", "second")
 
@@ -65,3 +66,30 @@ def brief(goal: Mapping[str, Any], chosen: Mapping[str, str]) -> str:
     if isinstance(goal.get("direction"), str):
         words.append(goal["direction"])
     return " ".join(words)
+
+
+def asked(scene: Vocabulary, text: str) -> Grounding | GroundingError:
+    """What comes of an instruction; anything but these two is a bug."""
+    try:
+        return ground(text, scene)
+    except GroundingError as error:
+        return error
+
+
+def outcome(scene: Vocabulary, text: str) -> tuple[str, tuple[str, ...]]:
+    """Goals or the kind of error in one line, with the order or the candidates."""
+    found = asked(scene, text)
+    if isinstance(found, GroundingError):
+        return f"!{found.kind}", found.candidates
+    goals = {brief(goal, chosen_of(found)) for goal in found.goals}
+    return " ; ".join(sorted(goals)), found.order
+
+
+def as_meant(scene: str, text: str, wanted: str, order: str = "") -> bool:
+    """Whether an instruction of ``paraphrases.txt`` is understood as it says."""
+    said, also = outcome(SCENES[scene], text)
+    if wanted.startswith("!"):
+        kind, *named = wanted.split()
+        return said == kind and set(named) <= set(also)
+    goals = " ; ".join(sorted(part.strip() for part in wanted.split(";")))
+    return said == goals and order in ("", " ".join(also))

@@ -119,7 +119,7 @@ def test_every_kind_of_goal_makes_a_valid_file(text: str) -> None:
     assert {spec["kind"] for spec in task.success} >= {"settled", "no_finger_contact"}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.text(alphabet="aé\"\\'\n\t\x7f\x00🙂 ", max_size=20))
 def test_no_adjective_breaks_the_file(odd: str) -> None:
     words = vocabulary_of(CUBE.task())
