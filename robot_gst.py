@@ -93,8 +93,8 @@ COMMANDS: tuple[Command, ...] = (
     (
         "plan",
         "twin.cli:plan",
-        "Plan for a cell that asks over zenoh.",
-        "runs/monday --live",
+        "Plan from words, or for a cell that asks over zenoh.",
+        "runs/monday --task 'put the cube into the box' --dry",
     ),
     (
         "evaluate",

@@ -68,27 +68,46 @@ def plan(
     run: Path,
     /,
     *,
+    task: str = "",
+    dry: bool = False,
     live: bool = False,
     config: LivePlanConfig = LIVE_PLAN,
     output: Output = OUTPUT,
 ) -> int:
-    """Plan for a cell that asks over zenoh (--live); stop with Ctrl-C.
+    """Say what an instruction asks for: objects, goals, stages; keep it as a task of the run.
 
-    Example: robot-gst plan runs/today --live --cell standin
+    With --live, plan for a cell that asks over zenoh; stop with Ctrl-C.
+    Exit code 2, with what could be meant, where the instruction is not understood whole.
+    Example: robot-gst plan runs/today --task "put the cube into the box" --dry
 
     Args:
-        run: Run folder with the rebuilt scene.
+        run: Run folder; its episodes and its scene say which objects there are.
+        task: The instruction in English, or the name or file of a task.
+        dry: Write nothing; otherwise the task goes into the run's tasks/.
         live: Answer a cell's requests.
-        config: Settings.
+        config: Settings of --live.
         output: How to talk.
     """
+    from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
+    from twin.plan.ground.run_tasks import keep, understand
     from twin.plan.live import run_planner
 
-    if not live:
-        message = "say whom to plan for: robot-gst plan RUN --live answers a cell's requests."
+    if live:
+        return run_planner(run, config, output)
+    if not task:
+        message = (
+            'say what to plan: robot-gst plan RUN --task "put the cube into the box", or --live to '
+            "answer a cell's requests."
+        )
         raise UsageError(message)
-    return run_planner(run, config, output)
+    folder = RunFolder.open(run)
+    understood = understand(folder, task)
+    path = None if dry else keep(folder, understood)
+    data = {**understood.to_json(), "file": None if path is None else str(path)}
+    wrote = [] if path is None else ["", f"wrote {path}"]
+    output.result(data, "\n".join([*understood.lines(), *wrote]))
+    return 0
 
 
 def rebuild(

@@ -213,8 +213,7 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
             if name in table["objects"] and name not in table["manipulated"]:
                 yield f"{place}.{verb}: {name} is not in manipulated"
         yield from _push(place, stage, table)
-        if "clearance_m" in stage and "carry" not in stage:
-            yield f"{place}.clearance_m: belongs to carry"
+        yield from _on_the_way(place, stage, table)
         for number, pair in enumerate(stage.get("allowed_contacts", [])):
             where = f"{place}.allowed_contacts[{number}]"
             for body in pair:
@@ -223,6 +222,30 @@ def _stages(table: Mapping[str, Any]) -> Iterator[str]:
                     yield f"{where}: there is no body {body!r}. Bodies: {_names(bodies)}.{near}"
             if pair[0] == pair[1]:
                 yield f"{where}: {pair[0]} cannot touch itself"
+
+
+def _on_the_way(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    """What belongs to one verb of a stage, and what holds while the stage lasts."""
+    if "part" in stage and "grasp" not in stage:
+        yield f"{place}.part: belongs to grasp"
+    if "clearance_m" in stage and "carry" not in stage:
+        yield f"{place}.clearance_m: belongs to carry"
+    for number, way in enumerate(stage.get("path", [])):
+        yield from _way(f"{place}.path[{number}]", way, table)
+
+
+def _way(place: str, way: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    """What holds while a stage lasts: the objects exist, and there is a limit."""
+    named = {"obj": way.get("obj"), "region.over": way.get("region", {}).get("over")}
+    if way.get("against") != TABLE:
+        named["against"] = way.get("against")
+    for key, name in named.items():
+        if name is not None:
+            yield from _is_no_object(f"{place}.{key}", name, table)
+    if way["kind"] == "height" and not {"min", "max"} & way.keys():
+        yield f"{place}: says no limit. Give one or both of max, min."
+    if way.get("min", -math.inf) > way.get("max", math.inf):
+        yield f"{place}: min {way['min']} is above max {way['max']}"
 
 
 def _push(place: str, stage: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:

@@ -19,11 +19,15 @@ def describe_task(task: Task) -> str:
     """Return some lines for a person who wants to know whether the file says what they mean."""
     stages = [
         f"  {number}. {stage['id']}: {_handled(stage)}; may touch: {_pairs(stage)}"
+        + "".join(f"; {describe_way(way)}" for way in stage.get("path", []))
         for number, stage in enumerate(task.stages, start=1)
     ]
+    about = task.derived
+    made = [f"derived by the {about['by']} from {', '.join(about['tasks'])}"] if about else []
     return "\n".join(
         [
             f"{task.name}: {task.instruction}",
+            *made,
             f"cell: {task.cell}; moved by the robot: {', '.join(task.manipulated)}",
             "objects",
             *(f"  {_object(model, task.start[key])}" for key, model in task.objects.items()),
@@ -38,6 +42,25 @@ def describe_task(task: Task) -> str:
 def describe_predicate(spec: Mapping[str, Any]) -> str:
     """Say in words when one success predicate holds."""
     return _WORDS[spec["kind"]](spec)
+
+
+def describe_way(way: Mapping[str, Any]) -> str:
+    """Say in words what one constraint asks while its stage lasts."""
+    who = way.get("obj", "the tool")
+    match way["kind"]:
+        case "clearance":
+            return f"{who} stays at least {_mm(way['min'])} mm away from {way['against']}"
+        case "keepout":
+            return f"{who} never passes over {way['region']['over']}"
+        case "upright":
+            return f"{who} stays upright within {way.get('max_deg', 10):g} degrees"
+        case "height":
+            bounds = [f"{word} {_mm(way[key])} mm" for key, word in _BOUNDS.items() if key in way]
+            return f"the lowest point of {who} stays at {' and '.join(bounds)} over the table"
+    return f"{who} moves at most at {way['max']:g} m/s"
+
+
+_BOUNDS = {"min": "least", "max": "most"}
 
 
 def _object(model: ObjectModel, start: StartRange) -> str:
@@ -63,6 +86,8 @@ def _mm(length_m: float) -> str:
 def _handled(stage: Mapping[str, Any]) -> str:
     done = [f"{verb}s {stage[verb]}" for verb in VERBS if verb in stage]
     said = " and ".join(done).replace("carrys", "carries").replace("pushs", "pushes")
+    if "part" in stage:
+        said += f" by its {stage['part']}"
     if "speed_m_s" in stage:
         said += f" at {stage['speed_m_s']:g} m/s"
     if "clearance_m" in stage:

@@ -2,6 +2,7 @@
 
 import hashlib
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -129,6 +130,8 @@ class Task:
     success: tuple[dict[str, Any], ...]
     cell: str = "standin"
     """Cell file the task was made for."""
+    derived: Mapping[str, Any] | None = None
+    """Who made the file of which tasks' objects, by which version of its rules; None: a person."""
     grip_force_N: float | None = None
     """How hard each finger presses, as the gripper is set for this task; None: not known."""
 
@@ -260,6 +263,7 @@ def _task_from(table: dict[str, Any]) -> Task:
         stages=tuple(table["stages"]),
         success=tuple(table["success"]),
         cell=table.get("cell", "standin"),
+        derived=table.get("derived"),
         grip_force_N=None if (force := table.get("grip_force_N")) is None else float(force),
     )
 

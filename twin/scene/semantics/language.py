@@ -30,7 +30,7 @@ SHAPE_WORDS = {
 """What a thing of a shape may be called."""
 ANY_THING = ("object", "thing", "item", "stuff")
 ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
-KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal"), "other": ()}
+KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal", "plush"), "other": ()}
 """What every thing of a kind may be called, see ``kind_of``."""
 TYPICAL_COLOURS = {
     "duck": ("yellow", "orange"),
@@ -49,7 +49,23 @@ PART_WORDS = {
     "head": ("head", "face", "beak"),
     "limbs": ("limb", "leg", "arm", "foot", "hand", "paw", "wing"),
 }
-SAME_COLOURS = {"gray": "grey", "violet": "purple", "tan": "beige", "turquoise": "cyan"}
+SAME_COLOURS = {
+    "gray": "grey", "silver": "grey", "charcoal": "grey",
+    "violet": "purple", "lilac": "purple", "mauve": "purple",
+    "tan": "beige", "cream": "beige", "ivory": "beige", "khaki": "beige",
+    "turquoise": "cyan", "teal": "cyan", "aqua": "cyan",
+    "crimson": "red", "scarlet": "red", "ruby": "red", "vermilion": "red",
+    "navy": "blue", "azure": "blue", "cobalt": "blue",
+    "emerald": "green", "olive": "green", "lime": "green", "jade": "green",
+    "golden": "yellow", "gold": "yellow", "amber": "yellow",
+    "chocolate": "brown", "magenta": "pink",
+}  # fmt: skip
+SAME_NOUNS = {
+    "duckling": "duck", "ducky": "duck", "duckie": "duck", "plushie": "plush", "plushy": "plush",
+    "hamper": "basket", "receptacle": "container", "vessel": "container", "pail": "bucket",
+    "cuboid": "block", "die": "dice",
+}  # fmt: skip
+"""Nouns that are another word for one of the lexicon."""
 SMALL_WORDS = ("the", "a", "an", "all", "of", "on", "in", "any", "every", "my", "this", "that")
 SIZES = ("small", "little", "tiny", "large", "big", "open", "flat", "tall")
 
@@ -57,12 +73,13 @@ SIZES = ("small", "little", "tiny", "large", "big", "open", "flat", "tall")
 def words_of(text: str) -> list[str]:
     """Lower-case words, plurals made singular, possessives cut, articles left out."""
     cleaned = "".join(c if c.isalnum() else " " for c in text.lower().replace("'s", " "))
-    return [singular(word) for word in cleaned.split() if word not in SMALL_WORDS]
+    words = (singular(word) for word in cleaned.split() if word not in SMALL_WORDS)
+    return [SAME_NOUNS.get(word, word) for word in words]
 
 
 def singular(word: str) -> str:
     """Cut a plural ending: ducks, boxes, berries; glass stays."""
-    irregular = {"feet": "foot", "dice": "dice", "teddies": "teddy"}
+    irregular = {"feet": "foot", "dice": "dice", "teddies": "teddy", "duckies": "ducky"}
     if word in irregular:
         return irregular[word]
     if word.endswith("ies") and len(word) > 4:

@@ -1,0 +1,95 @@
+"""Scenes to speak about, and how the outcome of an instruction is compared."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from twin.plan.ground.goals import Grounding
+from twin.plan.ground.grammar import ground
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary, vocabulary_from_labels
+
+KEYS = ("object", "container", "support", "reference", "first", "second")
+
+
+def _thing(label: str, colour: str, role: str) -> dict[str, str]:
+    return {"label": label, "colour": colour, "role": role}
+
+
+def _cube(colour: str) -> dict[str, str]:
+    return _thing("cube", colour, "movable")
+
+
+def _open(colour: str) -> dict[str, str]:
+    return _thing("open container", colour, "fixed")
+
+
+SLOTH = _thing("sloth", "brown", "movable, soft")
+DUCK = _thing("duck", "yellow", "movable, soft")
+SCENES: dict[str, Vocabulary] = {
+    name: vocabulary_from_labels(things)
+    for name, things in {
+        "cube": {"cube": _cube("red"), "box": _open("blue")},
+        "sloth": {"sloth": SLOTH, "basket": _open("beige")},
+        "ducks": {**{f"duck_{n}": DUCK for n in range(1, 6)}, "basket": _open("beige")},
+        "blocks": {
+            **{f"{colour}_cube": _cube(colour) for colour in ("red", "green", "blue")},
+            "box": _open("blue"),
+        },
+        "sorting": {
+            **{f"{c}_cube_{n}": _cube(c) for c in ("red", "green") for n in (1, 2)},
+            **{f"{c}_bin": _open(c) for c in ("red", "green")},
+        },
+        "mixed": {
+            "sloth": SLOTH,
+            "duck_1": DUCK,
+            "duck_2": DUCK,
+            "red_cube": _cube("red"),
+            "basket": _open("beige"),
+            "box": _open("blue"),
+        },
+    }.items()
+}
+
+
+def chosen_of(found: Grounding) -> dict[str, str]:
+    """What stands for objects of which any would have done."""
+    return {key: f"any{item.count}" for item in found.choices for key in item.chosen}
+
+
+def brief(goal: Mapping[str, Any], chosen: Mapping[str, str]) -> str:
+    """A goal in one line: its kind, its objects, how far, in which direction."""
+    words = [goal["kind"]]
+    for key in KEYS:
+        if key in goal:
+            words.append(chosen.get(goal[key], goal[key]) if key == "object" else goal[key])
+    if "by_m" in goal:
+        words.append(f"{goal['by_m']:g}")
+    if isinstance(goal.get("direction"), str):
+        words.append(goal["direction"])
+    return " ".join(words)
+
+
+def asked(scene: Vocabulary, text: str) -> Grounding | GroundingError:
+    """What comes of an instruction; anything but these two is a bug."""
+    try:
+        return ground(text, scene)
+    except GroundingError as error:
+        return error
+
+
+def outcome(scene: Vocabulary, text: str) -> tuple[str, tuple[str, ...]]:
+    """Goals or the kind of error in one line, with the order or the candidates."""
+    found = asked(scene, text)
+    if isinstance(found, GroundingError):
+        return f"!{found.kind}", found.candidates
+    goals = {brief(goal, chosen_of(found)) for goal in found.goals}
+    return " ; ".join(sorted(goals)), found.order
+
+
+def as_meant(scene: str, text: str, wanted: str, order: str = "") -> bool:
+    """Whether an instruction of ``paraphrases.txt`` is understood as it says."""
+    said, also = outcome(SCENES[scene], text)
+    if wanted.startswith("!"):
+        kind, *named = wanted.split()
+        return said == kind and set(named) <= set(also)
+    goals = " ; ".join(sorted(part.strip() for part in wanted.split(";")))
+    return said == goals and order in ("", " ".join(also))

@@ -1,0 +1,195 @@
+"""Task files made of instructions: valid, the same each time, by rules that know kinds only."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import robot_gst
+from bridge.data_files import datasets_folder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
+from bridge.task.task_file import Task, TaskFile
+from twin.plan.ground.derive import derive_task
+from twin.plan.ground.grammar import ground
+from twin.plan.ground.run_tasks import keep, task_files_of, understand
+from twin.plan.ground.vocabulary import GroundingError, vocabulary_of
+
+CUBE = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
+DUCKS = TaskFile.read(datasets_folder() / "tasks" / "five_ducks_into_basket.toml")
+STACK = TaskFile.read(datasets_folder() / "tasks" / "stack_two_cubes.toml")
+
+
+def derived(text: str, *base: TaskFile) -> Task:
+    words = vocabulary_of(base[0].task())
+    return derive_task(ground(text, words), base).task()
+
+
+def pairs(task: Task, number: int) -> set[frozenset[str]]:
+    return {frozenset(pair) for pair in task.stages[number]["allowed_contacts"]}
+
+
+def test_an_instruction_becomes_the_task_that_ships() -> None:
+    task = derived("Put the red cube into the box.", CUBE)
+    ships = CUBE.task()
+    assert task.objects == ships.objects
+    assert task.start == ships.start
+    assert task.manipulated == ships.manipulated
+    assert task.containers == ships.containers
+    plain = [{k: v for k, v in spec.items() if k != "margin_m"} for spec in ships.success]
+    assert list(task.success) == plain
+    assert [set(stage) & {"grasp", "carry", "release"} for stage in task.stages] == [
+        {"grasp"},
+        {"carry"},
+        {"release"},
+    ]
+    allowed = set().union(*(pairs(task, n) for n in range(3)))
+    wanted = {frozenset(p) for stage in ships.stages for p in stage["allowed_contacts"]}
+    assert allowed == wanted
+    assert task.derived is not None
+    assert task.derived["by"] == "grammar"
+    assert task.derived["tasks"] == ["cube_into_box"]
+    assert ships.derived is None
+
+
+def test_the_contacts_of_five_ducks_are_those_of_the_task_that_ships() -> None:
+    task, ships = derived("Put all ducks into the basket", DUCKS), DUCKS.task()
+    assert task.grip_force_N == ships.grip_force_N
+    assert len(task.stages) == len(ships.stages)
+    for number, stage in enumerate(ships.stages):
+        theirs = {frozenset(pair) for pair in stage["allowed_contacts"]}
+        resting = {
+            frozenset((f"duck_{n}", place)) for n in range(1, 6) for place in ("table", "basket")
+        }
+        ducks = {pair for pair in pairs(task, number) if all("duck" in key for key in pair)}
+        assert theirs <= pairs(task, number)
+        assert pairs(task, number) - theirs <= resting | ducks
+    kinds = [spec["kind"] for spec in task.success]
+    assert kinds.count("shape") == kinds.count("inside") == kinds.count("settled") == 5
+
+
+def test_a_stack_may_touch_what_it_stands_on_and_nothing_else() -> None:
+    task = derived("Stack red on blue", STACK)
+    assert pairs(task, 0) == {
+        frozenset(("lower", "table")), frozenset(("cube", "table")), frozenset(("gripper", "cube"))
+    }  # fmt: skip
+    assert pairs(task, 1) == {frozenset(("lower", "table")), frozenset(("gripper", "cube"))}
+    assert pairs(task, 2) == pairs(task, 1) | {frozenset(("cube", "lower"))}
+
+
+def test_limits_and_the_part_go_to_their_stages() -> None:
+    task = derived(
+        "Put the cube into the box, at least 5 cm away from its walls, keep it upright", CUBE
+    )
+    _, carry, release = task.stages
+    assert {way["kind"] for way in carry["path"]} == {"clearance", "upright"}
+    assert {way["kind"] for way in release["path"]} == {"upright"}
+    sloth = TaskFile.read(datasets_folder() / "tasks" / "sloth_into_basket.toml")
+    taken = derived("Grab the sloth by its arm and put it into the basket", sloth)
+    assert taken.stages[0]["part"] == "limbs"
+
+
+def test_the_same_instruction_gives_the_same_bytes_and_another_one_another_name() -> None:
+    words = vocabulary_of(CUBE.task())
+    first, again = (derive_task(ground("Put the cube in the box", words), [CUBE]) for _ in range(2))
+    assert first.data == again.data
+    other = derive_task(ground("Put the cube into the box", words), [CUBE])
+    assert other.task().name != first.task().name
+
+
+TEXTS = (
+    "put the cube left of the box",
+    "move the cube 10 cm to the right and 5 cm forwards",
+    "take the cube out of the box and put it on the table",
+    "put the cube behind the box with a gap of 1 to 3 cm, upright",
+    "put the cube next to the box, aligned with the box",
+    "put the shiny cube into the box",
+)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_every_kind_of_goal_makes_a_valid_file(text: str) -> None:
+    task = derived(text, CUBE)
+    assert task.instruction == text
+    assert {spec["kind"] for spec in task.success} >= {"settled", "no_finger_contact"}
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.text(alphabet="aé\"\\'\n\t\x7f\x00🙂 ", max_size=20))
+def test_no_adjective_breaks_the_file(odd: str) -> None:
+    words = vocabulary_of(CUBE.task())
+    try:
+        found = ground(f"put the {odd} cube into the box", words)
+    except GroundingError:
+        return
+    derive_task(found, [CUBE])
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    folder = RunFolder.create(tmp_path / "run")
+    for name, file in (("a", CUBE), ("b", CUBE)):
+        with EpisodeWriter(folder.episodes_dir / f"{name}.mcap") as writer:
+            info = EpisodeInfo(id=name, kind="scan", task=file.task().name, task_sha256=file.sha256)
+            writer.describe(info)
+            writer.attach(ATTACHMENT, file.data, media_type=MEDIA_TYPE, log_time_ns=1)
+    return folder
+
+
+def test_the_objects_are_those_of_the_episodes(run: RunFolder, tmp_path: Path) -> None:
+    assert [file.task().name for file in task_files_of(run)] == ["cube_into_box"]
+    understood = understand(run, "put the red cube into the box")
+    path = keep(run, understood)
+    assert path is not None
+    assert TaskFile.read(path).task().derived is not None
+    assert keep(run, understood) == path
+    named = understand(run, understood.file.task().name)
+    assert named.grounding is None
+    assert named.file.data == understood.file.data
+    with pytest.raises(UsageError, match="says which objects"):
+        understand(RunFolder.create(tmp_path / "other"), "put the red cube into the box")
+
+
+def test_the_command_prints_what_was_understood(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["plan", str(run.path), "--task"]
+    assert robot_gst.run([*command, "put the crimson block into the box", "--dry"]) == 0
+    said = capsys.readouterr().out
+    assert "the middle of cube is inside box" in said
+    assert "'the crimson block' is cube (red cube): the only one that fits" in said
+    assert "3. release: releases cube" in said
+    assert not run.tasks_dir.exists()
+    assert robot_gst.run([*command, "put the cube into the box", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["grounding"]["goals"] == [{"kind": "inside", "object": "cube", "container": "box"}]
+    assert Path(data["file"]).is_file()
+    assert robot_gst.run([*command, data["task"], "--dry"]) == 0
+    assert robot_gst.run([*command, "cube_into_box", "--dry"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("put the green cube into the box", "no green cube here. There is: cube"),
+        ("", "the instruction is empty"),
+        ("juggle the cube", "nothing this robot can do"),
+        ("put the cube into the box; $(reboot)", "not understood"),
+        ("no_such_task", "no task named"),
+        ("x" * 10_000, "2000 is the most"),
+        ("put " * 3_000, "2000 is the most"),
+    ],
+)
+def test_what_is_not_understood_ends_with_2_and_writes_nothing(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    assert robot_gst.run(["plan", str(run.path), "--task", text]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+    assert not run.tasks_dir.exists()

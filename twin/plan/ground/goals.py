@@ -1,0 +1,253 @@
+"""What an instruction asks for, whether it can be, and in which order it is done."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bridge.task.check import REFERENCES, TABLE
+from bridge.task.relations import direction_of
+from bridge.task.summary import describe_predicate
+from twin.plan.ground.noun_phrases import Choice
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary
+
+PLACES = {"inside": "container", "on": "support"}
+"""Relations of which an object can have only one, with the key of what it is in or on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathLimit:
+    """Something that holds while an object is carried, as a record of the constraint schema."""
+
+    object_id: str
+    constraint: Mapping[str, Any]
+    until_release: bool
+    """It ends before the object is let go; else it holds until then."""
+    words: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grounding:
+    """An instruction that was understood."""
+
+    text: str
+    goals: tuple[Mapping[str, Any], ...]
+    """Success predicates of a task file, in the order they were said."""
+    order: tuple[str, ...]
+    """Objects in the order in which they are moved."""
+    is_order_given: bool
+    """The instruction asks for that order, or its relations do; else another one is as good."""
+    path: tuple[PathLimit, ...] = ()
+    grasp_parts: Mapping[str, str] = field(default_factory=dict)
+    """By object: the part it is to be taken by."""
+    choices: tuple[Choice, ...] = ()
+    remarks: tuple[str, ...] = ()
+    explanation: tuple[str, ...] = ()
+    """What each phrase means, and why."""
+
+    def lines(self) -> list[str]:
+        """The goals, the order, the limits on the way and what they were made of, in words."""
+        order = ", then ".join(self.order)
+        told = "" if self.is_order_given or len(self.order) < 2 else " (any order will do)"
+        return [
+            "goals, when at the end",
+            *(f"  {describe_predicate(goal)}" for goal in self.goals),
+            f"moved: {order}{told}",
+            *(f"on the way: {limit.words}" for limit in self.path),
+            *(f"taken by: {key} by its {part}" for key, part in self.grasp_parts.items()),
+            "understood",
+            *(f"  {line}" for line in self.explanation),
+            *(f"remark: {text}" for text in self.remarks),
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as data."""
+        return {
+            "instruction": self.text,
+            "goals": [dict(goal) for goal in self.goals],
+            "order": list(self.order),
+            "is_order_given": self.is_order_given,
+            "path": [
+                {
+                    "object": limit.object_id,
+                    "constraint": dict(limit.constraint),
+                    "until_release": limit.until_release,
+                }
+                for limit in self.path
+            ],
+            "grasp_parts": dict(self.grasp_parts),
+            "choices": [
+                {"count": item.count, "among": list(item.among), "chosen": list(item.chosen)}
+                for item in self.choices
+            ],
+            "remarks": list(self.remarks),
+            "explanation": list(self.explanation),
+        }
+
+
+class Goals:
+    """Collects goals clause by clause, and refuses what cannot be."""
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        """Begin without any.
+
+        Args:
+            vocabulary: Says what can move and what is open.
+        """
+        self.vocabulary = vocabulary
+        self.found: list[dict[str, Any]] = []
+        self.steps: list[tuple[str, ...]] = []
+        """Objects of each clause."""
+        self.edges: list[tuple[int, int]] = []
+        """Clauses that come before others."""
+        self.is_order_given = False
+
+    def add_clause(self, goals: Sequence[dict[str, Any]]) -> None:
+        """Take the goals of one clause.
+
+        Raises:
+            GroundingError: When one of them can never hold.
+        """
+        for goal in goals:
+            self._refuse(goal)
+            if goal not in self.found:
+                self.found.append(goal)
+        self.steps.append(tuple(dict.fromkeys(goal["object"] for goal in goals)))
+
+    def _refuse(self, goal: Mapping[str, Any]) -> None:
+        things, object_id = self.vocabulary.things, goal["object"]
+        told = self.vocabulary.describe([object_id])
+        others = [goal[key] for key in REFERENCES[1:] if key in goal]
+        if object_id in others or len(set(others)) < len(others):
+            message = f"{told} cannot stand in a relation to itself."
+            raise GroundingError("impossible", message, candidates=[object_id])
+        container = goal.get("container")
+        if container is not None and not things[container].container:
+            open_ones = self.vocabulary.containers()
+            message = (
+                f"{self.vocabulary.describe([container])} has no inside: nothing can be put in it "
+                "or taken out of it."
+            )
+            raise GroundingError("impossible", message, candidates=open_ones or [container])
+        support = goal.get("support", TABLE)
+        if support != TABLE and things[support].container:
+            message = (
+                f"{self.vocabulary.describe([support])} is open above; what is put there is "
+                "inside it, not on it. Say 'into'."
+            )
+            raise GroundingError("impossible", message, candidates=[support])
+        if not things[object_id].movable:
+            message = f"{told} is fixed: nothing can move it."
+            raise GroundingError("fixed_object", message, candidates=[object_id])
+
+    def merged(self) -> list[dict[str, Any]]:
+        """All goals, none of which rules out another.
+
+        Raises:
+            GroundingError: When two do.
+        """
+        by_object: dict[str, list[dict[str, Any]]] = {}
+        for goal in self.found:
+            by_object.setdefault(goal["object"], []).append(goal)
+        for key, goals in by_object.items():
+            self._refuse_contradiction(key, goals)
+        merged = [goal for goal in self.found if goal["kind"] != "moved"]
+        for key, goals in by_object.items():
+            ways = [goal for goal in goals if goal["kind"] == "moved"]
+            if ways:
+                merged.append(ways[0] if len(ways) == 1 else self._joined(key, ways))
+        return merged
+
+    def _refuse_contradiction(self, key: str, goals: Sequence[Mapping[str, Any]]) -> None:
+        kinds = {goal["kind"] for goal in goals}
+        places = {(g["kind"], g[PLACES[g["kind"]]]) for g in goals if g["kind"] in PLACES}
+        inside = {goal["container"] for goal in goals if goal["kind"] == "inside"}
+        supports = {goal["support"] for goal in goals if goal["kind"] == "on"}
+        outside = {goal["container"] for goal in goals if goal["kind"] == "outside"}
+        sides: dict[str, set[str]] = {}
+        for goal in goals:
+            if goal["kind"] == "beside":
+                sides.setdefault(goal["reference"], set()).add(str(goal.get("direction", "")))
+        if (
+            len(places) > 1
+            or inside & outside
+            or ("moved" in kinds and places - {("on", TABLE)})
+            or (inside | supports) & set(sides)
+            or any(len(found - {""}) > 1 for found in sides.values())
+        ):
+            told = "; ".join(describe_predicate(goal) for goal in goals)
+            message = f"{key} cannot end as asked, all at once: {told}."
+            raise GroundingError("contradiction", message, candidates=[key])
+
+    def _joined(self, key: str, ways: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """One movement of several: 10 cm to the left and 5 cm forwards."""
+        if not all("by_m" in way for way in ways):
+            message = f"{key} is to move in several directions. Say how far in each."
+            raise GroundingError("contradiction", message, candidates=[key])
+        steps = [way["by_m"] * direction_of(way["direction"]) for way in ways]
+        directions = [step / np.linalg.norm(step) for step in steps]
+        if any(abs(float(a @ b)) > 0.1 for i, a in enumerate(directions) for b in directions[:i]):
+            message = f"{key} is to move along one line twice. Say once where it is to end."
+            raise GroundingError("contradiction", message, candidates=[key])
+        whole = np.sum(steps, axis=0)
+        length = float(np.linalg.norm(whole))
+        direction = [round(float(part), 6) for part in whole / length]
+        return {"kind": "moved", "object": key, "by_m": round(length, 6), "direction": direction}
+
+
+def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Put the objects into the order in which they are moved.
+
+    What something is put on or beside is moved first; then what the instruction says; then the
+    order in which the objects were named.
+
+    Args:
+        goals: The clauses, and which comes before which.
+        found: All goals.
+
+    Raises:
+        GroundingError: When there is no such order.
+    """
+    names = list(dict.fromkeys(key for step in goals.steps for key in step))
+    before: dict[str, set[str]] = {key: set() for key in names}
+    for goal in found:
+        for other in (goal[key] for key in REFERENCES[1:] if key in goal):
+            if other in before:
+                before[goal["object"]].add(other)
+    relations = {key: set(values) for key, values in before.items()}
+    if _sorted(names, relations) is None:
+        circle = _circle(names, relations)
+        message = f"{', '.join(circle)} each wait for another to be in place first."
+        raise GroundingError("cyclic", message, candidates=circle)
+    for first, second in goals.edges:
+        for later in goals.steps[second]:
+            before[later] |= set(goals.steps[first]) - {later}
+    order = _sorted(names, before)
+    if order is None:
+        circle = _circle(names, before)
+        message = (
+            f"the order asked for cannot be: one of {', '.join(circle)} would be moved after "
+            "something was put on it or beside it. Say it the other way round."
+        )
+        raise GroundingError("contradiction", message, candidates=circle)
+    return tuple(order)
+
+
+def _sorted(names: Sequence[str], before: Mapping[str, set[str]]) -> list[str] | None:
+    left, order = list(names), []
+    while left:
+        ready = next((key for key in left if not before[key] & set(left)), None)
+        if ready is None:
+            return None
+        order.append(ready)
+        left.remove(ready)
+    return order
+
+
+def _circle(names: Sequence[str], before: Mapping[str, set[str]]) -> list[str]:
+    """Those that wait for each other."""
+    left = set(names)
+    while ready := {key for key in left if not before[key] & left}:
+        left -= ready
+    return [key for key in names if key in left]

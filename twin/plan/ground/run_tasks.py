@@ -1,0 +1,134 @@
+"""What a run says an instruction can be about, and the task that comes of it."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import BridgeError, UsageError
+from bridge.task.find import chosen_task_file, keep_task_file, union_of
+from bridge.task.summary import describe_task
+from bridge.task.task_file import TaskFile
+from twin.plan.ground.derive import derive_task
+from twin.plan.ground.goals import Grounding
+from twin.plan.ground.grammar import ground
+from twin.plan.ground.vocabulary import Vocabulary, vocabulary_of
+from twin.scene.store.folder import read_record
+
+MAX_NAME = 400
+"""Characters of a task's name or path."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*|\S+\.toml")
+"""What can only be a task's name or its file: an instruction has more than one word."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnderstoodTask:
+    """The task that is planned, and how an instruction became it."""
+
+    file: TaskFile
+    grounding: Grounding | None
+    """None: the task was named."""
+
+    def lines(self) -> list[str]:
+        """Everything for a person: what was understood, then the task."""
+        head = [] if self.grounding is None else [*self.grounding.lines(), ""]
+        return [*head, describe_task(self.file.task())]
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as data."""
+        task = self.file.task()
+        return {
+            "task": task.name,
+            "sha256": self.file.sha256,
+            "instruction": task.instruction,
+            "derived": task.derived,
+            "stages": list(task.stages),
+            "success": list(task.success),
+            "grounding": None if self.grounding is None else self.grounding.to_json(),
+        }
+
+
+def understand(run: RunFolder, words: str) -> UnderstoodTask:
+    """Find the task a person names, or make one of their instruction; nothing is written.
+
+    Args:
+        run: Its episodes say which objects there are, its scene what they are called.
+        words: The name of a task, its file, or an instruction.
+
+    Raises:
+        GroundingError: When the instruction is not understood or cannot be done.
+        UsageError: When there is no such task, or nothing says what the scene holds.
+    """
+    if len(words) <= MAX_NAME and _NAME.fullmatch(words):
+        file = chosen_task_file(words, tasks_dir=run.tasks_dir)
+        file.task()
+        return UnderstoodTask(file=file, grounding=None)
+    base = task_files_of(run)
+    grounding = ground(words, vocabulary_of_run(run, base))
+    return UnderstoodTask(file=derive_task(grounding, base), grounding=grounding)
+
+
+def keep(run: RunFolder, understood: UnderstoodTask) -> Path | None:
+    """Write a derived task into the run's ``tasks/``; return where it lies, None for a named one.
+
+    Args:
+        run: Where it goes.
+        understood: What to keep.
+    """
+    if understood.grounding is None:
+        return None
+    return keep_task_file(run.tasks_dir, understood.file.task().name, understood.file.data)
+
+
+def task_files_of(run: RunFolder) -> list[TaskFile]:
+    """The task files that say which objects a run's scene holds: those of its episodes.
+
+    Files derived from an instruction count only where there is nothing else: their objects are
+    those of others.
+
+    Raises:
+        UsageError: When no episode names a task that is there.
+    """
+    found: dict[str, TaskFile] = {}
+    problems: list[str] = []
+    for path in run.episodes():
+        try:
+            episode = Episode.open(path)
+            if episode.info.task:
+                file = streams.task_file(episode)
+                found.setdefault(file.sha256, file)
+        except (BridgeError, UsageError) as error:
+            problems.append(str(error))
+    files = sorted(found.values(), key=lambda file: file.task().name)
+    own = [file for file in files if file.task().derived is None]
+    if not files:
+        why = f" {problems[0]}" if problems else ""
+        message = (
+            f"nothing in {run.path} says which objects there are: no episode was recorded with a "
+            f"task.{why} Record some: robot-gst record {run.path} --task TASK."
+        )
+        raise UsageError(message)
+    return own or files
+
+
+def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
+    """What the objects of task files are called in a run's scene.
+
+    Args:
+        run: Whose ``scene.json`` holds labels, colours and parts; without one, the files' own.
+        base: At least one.
+
+    Raises:
+        UsageError: When two files define one object differently.
+        UnreadableSceneError: When ``scene.json`` cannot be understood.
+    """
+    task = union_of(base)
+    if task is None:
+        raise UsageError("no task file to take objects from.")
+    record = read_record(run) or {}
+    instances = (record.get("semantics") or {}).get("instances", ())
+    return vocabulary_of(task, instances)
