@@ -68,9 +68,7 @@ def problem_of(
     rebuilt = RebuiltScene() if run is None else read_rebuilt_scene(run, task)
     scene = rebuilt.scene(task, urdf, poses, reasons=reasons, covariances=covariances)
     shapes = shapes_of(None if run is None else run.scene_dir, task)
-    return Problem(
-        scene=replace(scene, start_rad=start_rad), robot=load_robot(urdf), shapes=shapes
-    )
+    return Problem(scene=replace(scene, start_rad=start_rad), robot=load_robot(urdf), shapes=shapes)
 
 
 def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:

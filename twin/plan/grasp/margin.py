@@ -184,5 +184,3 @@ def _together(
     """Add the chances of missing up."""
     chance = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)
     return np.asarray(-ndtri_exp(chance))
-
-

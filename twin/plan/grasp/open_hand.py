@@ -19,6 +19,9 @@ from twin.robot.model import RobotModel
 _SAME_M = 0.001
 """A hand whose pieces differ by less from themselves turned half about the approach is the same."""
 
+_BETWEEN = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
+"""Shares of half the opening at which it is looked whether a finger fills it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SweptPiece:
@@ -47,7 +50,7 @@ class OpenHand:
     depth_m: float
     """From the tool centre point back to what carries the fingers."""
     pad_half_m: float
-    """Half the breadth of the narrower finger near the tool centre point, across approach and closing direction."""
+    """Half the breadth of the narrowest finger piece at the tips, along the tool's x axis."""
     symmetric: bool
     """Whether it is the same after half a turn about the approach."""
     closed_in: bool
@@ -86,16 +89,6 @@ class OpenHand:
         heights = Ts_base_tcp[:, 2, :3] @ corners.T + Ts_base_tcp[:, 2, 3, None]
         return np.asarray(heights.min(axis=1))
 
-    def samples_m(self, pregrasp_m: float) -> Float[np.ndarray, "num_points 3"]:
-        """Corners and middles of the pieces at the grasp, half way and where the approach begins."""
-        points = [
-            np.concatenate([piece.corners_m, piece.corners_m.mean(axis=0, keepdims=True)])
-            for piece in self.pieces
-        ]
-        rows = np.concatenate(points)
-        back = np.array([0.0, 0.0, pregrasp_m])
-        return np.concatenate([rows - share * back for share in (0.0, 0.5, 1.0)])
-
 
 def has_fingers(robot: RobotModel) -> bool:
     """Whether anything of a robot closes."""
@@ -128,8 +121,9 @@ def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
     closing = [piece for piece in pieces if piece.finger]
     palm = [piece for piece in pieces if not piece.finger]
     tips = [piece for piece in closing if piece.corners_m[:, 2].max() > 0] or closing
-    middle = np.zeros((1, 3))
-    filled = any((p.normals @ middle[0] + p.offsets_m).max() < 0 for p in closing)
+    between = np.zeros((_BETWEEN.size, 3))
+    between[:, 1] = _BETWEEN * open_m / 2
+    filled = any((between @ p.normals.T + p.offsets_m < 0).all(axis=1).any() for p in closing)
     return OpenHand(
         pieces=tuple(pieces),
         open_m=open_m,

@@ -135,7 +135,7 @@ def antipodal_pairs(
     hint_m: tuple[float, float, float] | None,
     seed: int,
 ) -> Pairs:
-    """Cast rays into an object from all over its surface, within the friction cone of where they start.
+    """Cast rays into an object from all over its surface, within the cone where they start.
 
     From each point three: along the normal, along the normal laid level, and one drawn from the
     cone. Which pairs hold, and which are too wide, is for the caller to say.
@@ -176,7 +176,7 @@ def _hinted(
     Float[np.ndarray, "num_rays 3"],
 ]:
     """Where a line along y through a point enters the object."""
-    outside = hint_m + [0.0, 1.0, 0.0]
+    outside = hint_m + np.array([0.0, 1.0, 0.0])
     away, normal = surface.leave(outside[None], np.array([[0.0, -1.0, 0.0]]))
     hit = np.isfinite(away)
     entry = (outside - np.array([0.0, 1.0, 0.0]) * np.where(hit, away, 0.0)[:, None])[hit]

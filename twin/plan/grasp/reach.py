@@ -160,7 +160,7 @@ class _Reaches:
         at_rad: Float[np.ndarray, " num_joints"],
         before_rad: Float[np.ndarray, " num_joints"],
     ) -> bool:
-        """At the grasp and where its approach begins; between, the hand was looked at as a whole."""
+        """At the grasp and where its approach begins; the hand was looked at all the way."""
         return all(self._arm.is_clear(row, self._hand.open_m) for row in (at_rad, before_rad))
 
 

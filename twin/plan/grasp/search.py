@@ -69,7 +69,7 @@ class NoGraspError(TwinError):
 class GraspConfig:
     """How grasps are searched."""
 
-    samples: int = 600
+    samples: int = 500
     """Points of the surface that closing lines start from."""
     friction: float = 0.5
     """Least friction coefficient between pads and object that a grasp must hold with."""
@@ -266,8 +266,11 @@ class GraspSearcher:
             )
 
     def _uncertain(self, object_id: str) -> tuple[str, str, str] | None:
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(self._covariance(object_id)[:3, :3]).max()))
-        if sigma_m <= self.config.most_uncertain_m:  # never true of what is no number
+        covariance = self._covariance(object_id)
+        if not np.isfinite(covariance).all():
+            return ("uncertain", "its covariance is not made of numbers", "Localise it again.")
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max()))
+        if sigma_m <= self.config.most_uncertain_m:
             return None
         return (
             "uncertain",
@@ -393,9 +396,7 @@ class GraspSearcher:
         found.keep(level, "tilt")
         return found
 
-    def _past_table(
-        self, found: _Candidates, T: Float[np.ndarray, "4 4"], hand: OpenHand
-    ) -> None:
+    def _past_table(self, found: _Candidates, T: Float[np.ndarray, "4 4"], hand: OpenHand) -> None:
         low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
         table_m = self.problem.scene.table_height_m + self.config.clearance_m
         found.keep(low_m >= table_m, "table")
@@ -509,6 +510,7 @@ class GraspSearcher:
                     margin=float(margin[index]),
                     joints_rad=way.joints_rad,
                     pregrasp_m=config.pregrasp_m,
+                    contacts_m=_contacts(lines, index),
                 )
             )
             if len(taken) == config.most:
@@ -522,7 +524,7 @@ class GraspSearcher:
             sigma_m = VariationConfig().unknown_pose_m
             remarks.append(f"nobody says how sure its pose is: {sigma_m * 1e3:.0f} mm assumed")
         if hand.closed_in:
-            remarks.append("the fingers' hulls fill the hand: only its palm was kept clear")
+            remarks.append("the fingers' hulls fill the hand: they were not kept clear of it")
         unseen = [name for name in scene.missing() if name != object_id]
         if unseen:
             remarks.append(f"not localised, so not kept clear of: {', '.join(unseen)}")
@@ -560,6 +562,11 @@ def in_tools(
     return np.asarray(points_m @ R - shift[:, None])
 
 
+def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:
+    half = lines.Ts_object_tcp[index, :3, 1] * lines.widths_m[index] / 2
+    return np.stack([lines.middles_m[index] - half, lines.middles_m[index] + half])
+
+
 def _is_like(
     lines: Lines, index: int, kept: list[int], config: GraspConfig, symmetric: bool
 ) -> bool:
@@ -576,4 +583,3 @@ def _is_like(
         if (cosine > np.cos(config.merge_rad)).any():
             return True
     return False
-
