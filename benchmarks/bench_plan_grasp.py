@@ -276,10 +276,10 @@ def main() -> None:
             continue
         targets += first_grasps(name, shape, chosen.starts)
         _, rows = ranking(name, shape, chosen.ranked)
-        tau, chance = agreement(rows)
+        tau, order = agreement(rows)
         targets.append(
             Target(what=f"{name}: margin and lifting, tau", measured=tau, limit=0.15, at_most=False,
-                   reference=f"right order {100 * chance:.0f} % of {len(rows)} driven")
+                   reference=f"right order {100 * order:.0f} % of {len(rows)} driven")
         )  # fmt: skip
     report_targets("bench_plan_grasp", targets, note=NOTE)
 

@@ -94,7 +94,7 @@ def reaches_along(
 def _first_lost(good: Bool[np.ndarray, "num_grasps num_shifts"]) -> Float[np.ndarray, " num"]:
     """The last shift before the first that fails."""
     kept = np.logical_and.accumulate(good, axis=1).sum(axis=1)
-    return np.array([0.0, *SHIFTS_M])[kept]
+    return np.asarray(np.array([0.0, *SHIFTS_M])[kept])
 
 
 def slacks(
@@ -182,5 +182,5 @@ def _together(
     each: Float[np.ndarray, "num_grasps num_ways"],
 ) -> Float[np.ndarray, " num_grasps"]:
     """Add the chances of missing up."""
-    chance = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)
-    return np.asarray(-ndtri_exp(chance))
+    missing_log = np.minimum(logsumexp(log_ndtr(-each), axis=1), 0.0)
+    return np.asarray(-ndtri_exp(missing_log))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bridge.errors import refuse_outside
 from bridge.geometry import se3
@@ -69,7 +69,7 @@ class NoGraspError(TwinError):
 class GraspConfig:
     """How grasps are searched."""
 
-    samples: int = 500
+    samples: int = 800
     """Points of the surface that closing lines start from."""
     friction: float = 0.5
     """Least friction coefficient between pads and object that a grasp must hold with."""
@@ -163,8 +163,9 @@ _UNDERSIDE = 0.5
 """Sine under the horizontal of a scanned surface that no camera above the table sees."""
 _PART_M = 0.008
 """A contact this near to a point of a part is on the part."""
-_CELL_M, _CELL_RAD = 0.006, 0.2
-"""Closing lines that share such a cell are one."""
+_CELLS_M, _CELL_RAD = (0.003, 0.004, 0.005, 0.006, 0.008, 0.010, 0.013), 0.2
+"""Closing lines that share such a cell are one; the first that leaves few enough of them."""
+_MOST_LINES = 180
 _TWIST_SHARE = 2 / 3
 """Of the pad's half breadth, the radius at which its friction resists turning: that of a disc."""
 _SAFETY = 1.5
@@ -284,7 +285,7 @@ class GraspSearcher:
         scene, shapes = self.problem.scene, self.problem.shapes
         own = se3.apply(scene.Ts_base_object[object_id], shapes[object_id].vertices_m)
         try:
-            footprint = Delaunay(own[:, :2])
+            sides = ConvexHull(own[:, :2]).equations
         except (QhullError, ValueError):
             return None
         top_m = float(own[:, 2].max())
@@ -292,7 +293,7 @@ class GraspSearcher:
             if name == object_id or not np.isfinite(T).all():
                 continue
             other = se3.apply(T, self._surface(name).samples(_NEIGHBOUR_POINTS, 0)[0])
-            over = other[footprint.find_simplex(other[:, :2]) >= 0]
+            over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
                 return ("covered", f"{name} is on top of it", f"Move {name} away first.")
         return None
@@ -333,6 +334,7 @@ class GraspSearcher:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
         rejected: dict[str, int] = {}
+        kept: Int[np.ndarray, " num_kept"] = np.zeros(0, dtype=np.int64)
         pairs = antipodal_pairs(
             self._surface(object_id),
             count=config.samples,
@@ -356,7 +358,11 @@ class GraspSearcher:
             ends = (pairs.first_m, pairs.first_m + pairs.axes * pairs.widths_m[:, None])
             near = [part.query(end)[0] <= _PART_M for end in ends]
             pairs = keep(pairs, near[0] & near[1], "part")
-        return pairs.chosen(thinned(pairs, cell_m=_CELL_M, cell_rad=_CELL_RAD)), rejected
+        for cell_m in _CELLS_M:
+            kept = thinned(pairs, cell_m=cell_m, cell_rad=_CELL_RAD)
+            if len(kept) <= _MOST_LINES:
+                break
+        return pairs.chosen(kept), rejected
 
     def _hands_on(
         self,
@@ -559,7 +565,8 @@ def in_tools(
     """Points of the object, in the tool frame of each grasp."""
     R, p = lines.Ts_object_tcp[:, :3, :3], lines.Ts_object_tcp[:, :3, 3]
     shift = np.einsum("nij,ni->nj", R, p)
-    return np.asarray(points_m @ R - shift[:, None])
+    turned_all = points_m @ R.transpose(1, 0, 2).reshape(3, -1)  # one product, not one for each
+    return np.asarray(turned_all.reshape(len(points_m), -1, 3).transpose(1, 0, 2) - shift[:, None])
 
 
 def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:
