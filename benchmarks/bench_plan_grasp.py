@@ -3,7 +3,7 @@
 Each object is scanned once in the stand-in cell (seed of the development range, Gaussians not
 fitted) and reconstructed as ``rebuild`` does it. Then starts are drawn in as many laboratories,
 localised in the cells' own images, and the first grasp is driven: straight down, closed, lifted by
-10 cm; it counts when the object truly rose by 6 cm. Reference in the same run: the task's own point
+10 cm; it counts when the object's middle truly rose by 4 cm (a soft toy held by its head sags). Reference in the same run: the task's own point
 (``grasp_m``, closing along the object's y axis, from above), driven alike.
 
 Rank: the object is believed to be where it is not, by 9 mm and 8 degrees, the covariance says so,
@@ -48,13 +48,13 @@ OBJECTS = {
     "duck": ("five_ducks_into_basket", "duck_1"),
     "sloth": ("sloth_into_basket", "sloth"),
 }
-APPROACH_M, LIFT_M, LIFTED_M = 0.08, 0.10, 0.06
+APPROACH_M, LIFT_M, LIFTED_M = 0.08, 0.10, 0.04
 STEPS = 8
 ROUGH = np.diag(np.square([0.009, 0.009, 0.001, 0.01, 0.01, 0.14]))
 EVERYTHING = GraspConfig(least_margin=-50.0, most=300)
 """Bad grasps too: a ranking of good ones alone says nothing."""
 NUM_RANKS = 6
-MOST_CPU_S, LEAST_GRASPS, LEAST_LIFTED = 0.5, 50, 90.0
+MOST_CPU_S, LEAST_GRASPS, LEAST_LIFTED, LEAST_IN_ORDER = 0.5, 50, 90.0, 60.0
 NOTE = "reconstructed from one scan each; localised in the cell's images; CPU time, one thread"
 
 
@@ -200,14 +200,6 @@ def first_grasps(name: str, shape: Shape, count: int) -> list[Target]:
         reference.append(lifts(start, start.Ts_seen[key], nominal_grasp(problem, key)))
         if not lifted[-1]:
             print(f"  {name} {seed}: not lifted; {len(grasps)} grasps; {why}")
-            if grasps:
-                print(
-                    "     ",
-                    grasps[0].margin,
-                    grasps[0].width_m,
-                    grasps[0].T_object_tcp.round(3).tolist(),
-                    (start.Ts_seen[key] - start.Ts_true[key])[:3, 3] * 1e3,
-                )
     limit = ROBOT.gripper.max_width_m - 0.006
     return [
         Target(what=f"{name}: fewest grasps of a start", measured=min(counts), limit=LEAST_GRASPS,
@@ -222,7 +214,7 @@ def first_grasps(name: str, shape: Shape, count: int) -> list[Target]:
     ]  # fmt: skip
 
 
-def ranking(name: str, shape: Shape, count: int) -> tuple[list[Target], list[tuple[float, bool]]]:
+def ranking(name: str, shape: Shape, count: int) -> list[tuple[float, bool]]:
     """Drive grasps from all over the ranking where the object is not where it is believed to be."""
     task_name, key = OBJECTS[name]
     task = load_task(task_name)
@@ -246,7 +238,7 @@ def ranking(name: str, shape: Shape, count: int) -> tuple[list[Target], list[tup
         f"  {name}: {100 * good.mean():.0f} % of {len(rows)} lift; by quarter of the margin:",
         [f"{100 * good[part].mean():.0f}" for part in np.array_split(np.argsort(-margin), 4)],
     )
-    return [], rows
+    return rows
 
 
 def agreement(rows: list[tuple[float, bool]]) -> tuple[float, float]:
@@ -275,11 +267,14 @@ def main() -> None:
         if shape is None:
             continue
         targets += first_grasps(name, shape, chosen.starts)
-        _, rows = ranking(name, shape, chosen.ranked)
+        if not chosen.ranked:
+            continue
+        rows = ranking(name, shape, chosen.ranked)
         tau, order = agreement(rows)
         targets.append(
-            Target(what=f"{name}: margin and lifting, tau", measured=tau, limit=0.15, at_most=False,
-                   reference=f"right order {100 * order:.0f} % of {len(rows)} driven")
+            Target(what=f"{name}: margin and lifting in order", measured=100 * order,
+                   limit=LEAST_IN_ORDER, unit="%", at_most=False,
+                   reference=f"tau-b {tau:.2f}; {len(rows)} driven")
         )  # fmt: skip
     report_targets("bench_plan_grasp", targets, note=NOTE)
 
