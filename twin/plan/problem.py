@@ -103,6 +103,8 @@ class Grasp:
     """Arm at the grasp, from the base's side."""
     pregrasp_m: float
     """Length of the straight approach along the tool's z axis."""
+    contacts_m: Float[np.ndarray, "2 3"] | None = None
+    """Where the pads meet the surface, object frame; None: not known."""
     remarks: tuple[str, ...] = ()
 
 

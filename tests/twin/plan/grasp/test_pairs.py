@@ -1,0 +1,100 @@
+"""Antipodal pairs: what rays say of a box and a ball is what geometry says."""
+
+import numpy as np
+import pytest
+
+from bridge.task.meshes.catalogue import toy_mesh
+from bridge.task.task_file import ObjectModel
+from twin.plan.grasp.pairs import Surface, antipodal_pairs, pairs_along, thinned
+from twin.plan.problem import Shape
+from twin.scene.objects.decompose import shape_mesh
+from twin.scene.shape.reconstruct import shape_of_mesh
+
+SIZE = (0.06, 0.03, 0.04)
+CONE_RAD = 0.4636
+
+
+def box(error_m: float = 0.0) -> Shape:
+    model = ObjectModel(id="it", shape="box", size_m=SIZE, color_srgb=(0, 0, 0))
+    vertices, triangles = shape_mesh(model)
+    return Shape(vertices_m=vertices, triangles=triangles, source="test", error_m=error_m)
+
+
+def scanned_duck() -> Shape:
+    """As voxels have it: rough at 1.5 mm."""
+    toy = toy_mesh("duck", (0.07, 0.05, 0.06))
+    found = shape_of_mesh(toy.vertices_m, toy.triangles, toy.vertices_m)
+    return Shape(vertices_m=found.vertices_m, triangles=found.faces, source="test", error_m=0.0015)
+
+
+def test_straight_through_a_box_is_as_long_as_its_side() -> None:
+    surface = Surface(box())
+    points, normals = surface.samples(200, 0)
+    pairs = pairs_along(surface, points, normals, -normals)
+    along = np.abs(pairs.axes).argmax(axis=1)
+    assert len(pairs.widths_m) == 200
+    np.testing.assert_allclose(pairs.widths_m, np.array(SIZE)[along], atol=2e-6)
+    np.testing.assert_allclose(pairs.cosines, 1.0, atol=1e-6)
+    middles = np.take_along_axis(pairs.middles_m, along[:, None], axis=1)
+    np.testing.assert_allclose(middles, 0.0, atol=2e-6)
+
+
+def test_both_ends_of_all_pairs_lie_on_the_surface() -> None:
+    pairs = antipodal_pairs(
+        Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=(0.0, 0.0, 0.0), seed=1
+    )
+    half = np.array(SIZE) / 2
+    for end in (pairs.first_m, pairs.first_m + pairs.axes * pairs.widths_m[:, None]):
+        off = np.abs(np.abs(end) - half).min(axis=1)
+        assert off.max() < 2e-5
+        assert (np.abs(end) <= half + 2e-5).all()
+
+
+def test_a_line_within_both_cones_crosses_a_box_between_facing_sides_only() -> None:
+    pairs = antipodal_pairs(Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=2)
+    holds = pairs.chosen(pairs.cosines >= np.cos(CONE_RAD))
+    # the shortest way between facing sides, lengthened by the tilt at most
+    along = np.abs(holds.axes).argmax(axis=1)
+    side = np.array(SIZE)[along]
+    assert (holds.widths_m >= side - 2e-5).all()
+    assert (holds.widths_m <= side / np.cos(CONE_RAD) + 2e-5).all()
+    assert 0 < len(holds.widths_m) < len(pairs.widths_m)
+
+
+def test_the_hinted_line_is_among_the_pairs() -> None:
+    hint = (0.013, 0.0, 0.004)
+    pairs = antipodal_pairs(Surface(box()), count=1, cone_rad=CONE_RAD, hint_m=hint, seed=3)
+    away = np.linalg.norm(pairs.middles_m - hint, axis=1) + np.abs(np.abs(pairs.axes[:, 1]) - 1)
+    assert away.min() < 1e-5
+
+
+@pytest.mark.parametrize("hint", [(0.2, 0.0, 0.0), (0.0, 0.0, -0.3)])
+def test_a_hint_beside_the_object_adds_nothing(hint: tuple[float, float, float]) -> None:
+    surface = Surface(box())
+    with_hint, without = (
+        antipodal_pairs(surface, count=20, cone_rad=CONE_RAD, hint_m=h, seed=3)
+        for h in (hint, None)
+    )
+    np.testing.assert_array_equal(with_hint.first_m, without.first_m)
+
+
+def test_normals_of_a_scan_are_those_of_the_thing() -> None:
+    shape = scanned_duck()
+    points, rough = Surface(Shape(**{**vars(shape), "error_m": 0.0})).samples(400, 0)
+    _, averaged = Surface(shape).samples(400, 0)
+    toy = toy_mesh("duck", (0.07, 0.05, 0.06))
+    step = 1e-4
+    gradient = np.stack(
+        [toy.solid(points + step * e) - toy.solid(points - step * e) for e in np.eye(3)], axis=1
+    )
+    true = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    off = [np.degrees(np.arccos(np.clip((n * true).sum(axis=1), -1, 1))) for n in (rough, averaged)]
+    assert np.median(off[1]) < 8.0
+    assert np.percentile(off[1], 90) < np.percentile(off[0], 90)
+
+
+def test_thinning_keeps_one_of_what_is_alike() -> None:
+    pairs = antipodal_pairs(Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=4)
+    twice = pairs.chosen(np.tile(np.arange(len(pairs.widths_m)), 2))
+    once = thinned(pairs, cell_m=0.006, cell_rad=0.2)
+    assert len(thinned(twice, cell_m=0.006, cell_rad=0.2)) == len(once) < len(pairs.widths_m)

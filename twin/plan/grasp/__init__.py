@@ -1,0 +1,1 @@
+"""Where a hand can take hold of an object, and how sure that is."""

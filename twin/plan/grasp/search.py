@@ -1,0 +1,592 @@
+"""All grasps of one object that the hand can reach, the surest first, and why others are none.
+
+Antipodal pairs of the surface, hands on them from several directions, the open hand's straight way
+past table, object and neighbours, the arm on every branch of its inverse kinematics; then by how
+many standard deviations of the localised pose each bears. What is rejected counts under a cause.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from bridge.errors import refuse_outside
+from bridge.geometry import se3
+from bridge.task.check import nearest
+from twin.errors import TwinError
+from twin.physics.config import PhysicsConfig
+from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
+from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
+from twin.plan.grasp.pairs import Pairs, Surface, antipodal_pairs, thinned
+from twin.plan.grasp.reach import ArmReach, Reached
+from twin.plan.problem import Grasp, Problem
+from twin.replay.config import VariationConfig
+
+CAUSES: Mapping[str, str] = {
+    "cone": "no two surfaces face each other within the friction cone",
+    "width": "what faces each other is wider than the hand opens",
+    "unseen": "what could be taken was seen by no camera",
+    "part": "what could be taken is not on the named part",
+    "tilt": "the hand would have to come too far from the side",
+    "table": "the hand would meet the table",
+    "palm": "it is taller there than the hand is deep",
+    "fingers": "a finger would come down on the object",
+    "neighbour": "something beside it is in the hand's way",
+    "margin": "a grasp would bear less than the pose is uncertain",
+    "reach": "the arm reaches no grasp",
+    "approach": "the arm cannot follow the straight approach",
+    "arm": "arm or hand would touch what stands around",
+}
+"""Why candidates are rejected, in the order in which they are looked at."""
+HINTS: Mapping[str, str] = {
+    "width": "Take it at a narrower place, or use a wider gripper.",
+    "unseen": "Scan it from lower down.",
+    "table": "Take something higher, or turn the object.",
+    "palm": "Take it higher up.",
+    "neighbour": "Move what is beside it first.",
+    "margin": "Localise it again, nearer or with more frames.",
+    "reach": "Move the object nearer to the arm.",
+    "arm": "Move the object away from what stands around.",
+}
+
+
+class NoGraspError(TwinError):
+    """An object cannot be taken hold of; ``cause`` says why in one word."""
+
+    def __init__(
+        self, *, object_id: str, cause: str, found: str, hint: str, rejected: Mapping[str, int]
+    ) -> None:
+        """Remember the object, the cause and how many candidates fell to which cause."""
+        self.object_id = object_id
+        self.cause = cause
+        self.rejected = dict(rejected)
+        super().__init__(f"no grasp of {object_id}: {found}. {hint}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspConfig:
+    """How grasps are searched."""
+
+    samples: int = 800
+    """Points of the surface that closing lines start from."""
+    friction: float = 0.5
+    """Least friction coefficient between pads and object that a grasp must hold with."""
+    clearance_m: float = 0.003
+    """Between each pad and the object, and between the hand and anything else [m]."""
+    approaches_rad: tuple[float, ...] = (0.0, -0.35, 0.35, -0.7, 0.7)
+    """Turns about the closing line, from the approach nearest to straight down [rad]."""
+    most_tilt_rad: float = 0.9
+    """Of the approach from straight down [rad]."""
+    depths_m: tuple[float, ...] = (0.0, -0.005, 0.012)
+    """How far the tool centre point goes beyond the closing line [m]."""
+    pregrasp_m: float = 0.08
+    """Length of the straight approach [m]."""
+    most_uncertain_m: float = 0.010
+    """Standard deviation of the position beyond which nothing is grasped [m]."""
+    robot_error_m: float = 0.0015
+    """Standard deviation of the tool in any direction [m]."""
+    least_margin: float = 1.0
+    """Standard deviations that a grasp must bear."""
+    merge_m: float = 0.01
+    """Grasps nearer than this to a better one, and turned by less than ``merge_rad``, are it."""
+    merge_rad: float = 0.1745
+    """Ten degrees."""
+    most: int = 100
+    """Grasps that are returned."""
+    seed: int = 0
+    """Of all that is drawn."""
+
+    def __post_init__(self) -> None:
+        """Refuse what searches nothing."""
+        refuse_outside(
+            self,
+            {
+                "samples": (1, 100_000),
+                "friction": (0.01, 10.0),
+                "clearance_m": (0.0, 0.1),
+                "most_tilt_rad": (0.0, np.pi),
+                "pregrasp_m": (0.0, 1.0),
+                "most_uncertain_m": (0.0, 1.0),
+                "robot_error_m": (0.0, 0.1),
+                "least_margin": (-100.0, 100.0),
+                "merge_m": (0.0, 1.0),
+                "merge_rad": (0.0, np.pi),
+                "most": (1, 100_000),
+                "seed": (0, 2**63),
+            },
+        )
+
+    @property
+    def cone_rad(self) -> float:
+        """Half the opening of the friction cone."""
+        return float(np.arctan(self.friction))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspSearch:
+    """What a search found."""
+
+    grasps: tuple[Grasp, ...]
+    """The surest first, no two alike."""
+    rejected: Mapping[str, int]
+    """Candidates by the cause for which they are none; see ``CAUSES``."""
+    remarks: tuple[str, ...] = ()
+    """What was not known, and what stood in for it."""
+
+
+@dataclass
+class _Candidates:
+    """Hands on closing lines, object frame; fields are in step."""
+
+    lines: Lines
+    rejected: dict[str, int] = field(default_factory=dict)
+
+    def keep(self, mask: Bool[np.ndarray, " num_candidates"], cause: str) -> None:
+        """Reject the others."""
+        _count(self.rejected, cause, int((~mask).sum()))
+        self.lines = Lines(**{name: value[mask] for name, value in vars(self.lines).items()})
+
+    def __len__(self) -> int:
+        return len(self.lines.widths_m)
+
+
+def _count(rejected: dict[str, int], cause: str, number: int) -> None:
+    if number:
+        rejected[cause] = rejected.get(cause, 0) + number
+
+
+_TARGET_POINTS = 500
+_NEIGHBOUR_POINTS = 900
+_UNDERSIDE = 0.5
+"""Sine under the horizontal of a scanned surface that no camera above the table sees."""
+_PART_M = 0.008
+"""A contact this near to a point of a part is on the part."""
+_CELLS_M, _CELL_RAD = (0.003, 0.004, 0.005, 0.006, 0.008, 0.010, 0.013), 0.2
+"""Closing lines that share such a cell are one; the first that leaves few enough of them."""
+_MOST_LINES = 180
+_TWIST_SHARE = 2 / 3
+"""Of the pad's half breadth, the radius at which its friction resists turning: that of a disc."""
+_SAFETY = 1.5
+"""On the weight that friction must hold: the arm accelerates too."""
+_MIDDLE_SHARE = 0.05
+"""Of its largest extent, how far the middle of an object's mass may be off."""
+_COVERED_M = 0.006
+"""Something whose underside is no more than this under the top of what it covers lies on it."""
+
+
+class GraspSearcher:
+    """Searches grasps in one start; made once per problem, asked per object."""
+
+    def __init__(self, problem: Problem, config: GraspConfig | None = None) -> None:
+        """Lay out what all searches share.
+
+        Args:
+            problem: Where everything is.
+            config: How grasps are searched; the defaults when None.
+
+        Raises:
+            NoGraspError: The robot has nothing that closes.
+        """
+        self.problem = problem
+        self.config = GraspConfig() if config is None else config
+        robot = problem.robot
+        if not has_fingers(robot):
+            raise NoGraspError(
+                object_id="anything",
+                cause="no_gripper",
+                found=f"{robot.record.name} has no fingers that close",
+                hint="Give its gripper in the robot file (docs/robots.md).",
+                rejected={},
+            )
+        self.max_width_m = robot.record.gripper.max_width_m
+        self._reach = ArmReach(problem)
+        self._surfaces: dict[str, Surface] = {}
+
+    def search(
+        self, object_id: str, part_points_m: Float[np.ndarray, "num_points 3"] | None = None
+    ) -> GraspSearch:
+        """Find grasps of an object.
+
+        Args:
+            object_id: Of the task.
+            part_points_m: Points of a part, in the object's frame: both contacts are to be on it;
+                None: it may be taken anywhere.
+
+        Returns:
+            At least one grasp.
+
+        Raises:
+            NoGraspError: There is none; the error says why, and counts what was rejected.
+        """
+        self._refuse(object_id)
+        config = self.config
+        T = self.problem.scene.Ts_base_object[object_id]
+        pairs, rejected = self._pairs(object_id, part_points_m)
+        hand = open_hand(self.problem.robot, self.max_width_m, config.pregrasp_m)
+        found = self._hands_on(pairs, T, hand, rejected)
+        points = self._surface(object_id).samples(_TARGET_POINTS, config.seed)[0]
+        around = self._neighbours(object_id, T)
+        self._past_table(found, T, hand)
+        self._past_object(found, points, hand)
+        self._past_neighbours(found, T, around, hand)
+        margin = self._margins(found, object_id, points, hand)
+        grasps = self._choose(found, margin, object_id, hand)
+        if not grasps:
+            raise self._none(object_id, found.rejected, hand)
+        return GraspSearch(
+            grasps=grasps, rejected=found.rejected, remarks=self._remarks(object_id, hand)
+        )
+
+    def _refuse(self, object_id: str) -> None:
+        """Say what makes a search pointless."""
+        scene = self.problem.scene
+        refusal: tuple[str, str, str] | None = None
+        if object_id not in scene.task.objects:
+            known = ", ".join(scene.task.objects)
+            refusal = (
+                "unknown",
+                f"task {scene.task.name} has no such object",
+                f"It has: {known}.{nearest(object_id, scene.task.objects)}",
+            )
+        elif object_id in scene.containers() or scene.task.objects[object_id].fixed:
+            refusal = ("fixed", "it is fixed", "Choose an object that may be moved.")
+        elif object_id not in scene.Ts_base_object:
+            why = scene.reasons.get(object_id, "it was not looked for")
+            refusal = ("not_localised", f"it was not localised ({why})", "Localise it first.")
+        elif not np.isfinite(scene.Ts_base_object[object_id]).all():
+            refusal = ("not_localised", "its pose is not made of numbers", "Localise it again.")
+        else:
+            refusal = self._uncertain(object_id) or self._covered(object_id)
+            refusal = refusal or self._too_heavy(object_id)
+        if refusal is not None:
+            cause, found, hint = refusal
+            raise NoGraspError(
+                object_id=object_id, cause=cause, found=found, hint=hint, rejected={}
+            )
+
+    def _uncertain(self, object_id: str) -> tuple[str, str, str] | None:
+        covariance = self._covariance(object_id)
+        if not np.isfinite(covariance).all():
+            return ("uncertain", "its covariance is not made of numbers", "Localise it again.")
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max()))
+        if sigma_m <= self.config.most_uncertain_m:
+            return None
+        return (
+            "uncertain",
+            f"its position is known to {sigma_m * 1e3:.0f} mm, and at most "
+            f"{self.config.most_uncertain_m * 1e3:.0f} mm are good enough",
+            "Localise it again, nearer or with more frames.",
+        )
+
+    def _covered(self, object_id: str) -> tuple[str, str, str] | None:
+        """Whether something lies on it: lifting it would throw that down."""
+        scene, shapes = self.problem.scene, self.problem.shapes
+        own = se3.apply(scene.Ts_base_object[object_id], shapes[object_id].vertices_m)
+        try:
+            sides = ConvexHull(own[:, :2]).equations
+        except (QhullError, ValueError):
+            return None
+        top_m = float(own[:, 2].max())
+        for name, T in scene.movable().items():
+            if name == object_id or not np.isfinite(T).all():
+                continue
+            other = se3.apply(T, self._surface(name).samples(_NEIGHBOUR_POINTS, 0)[0])
+            over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
+            if len(over) and over[:, 2].min() > top_m - _COVERED_M:
+                return ("covered", f"{name} is on top of it", f"Move {name} away first.")
+        return None
+
+    def _too_heavy(self, object_id: str) -> tuple[str, str, str] | None:
+        model = self.problem.model(object_id)
+        weight_N = model.mass_kg * PhysicsConfig().gravity_m_s2 * _SAFETY
+        held_N = 2 * self.config.friction * self._grip_N()
+        if weight_N <= held_N:
+            return None
+        return (
+            "weight",
+            f"friction holds {held_N:.0f} N, and lifting {model.mass_kg:.2f} kg takes up to "
+            f"{weight_N:.0f} N",
+            "Press harder (grip_force_N of the task file), or take something lighter.",
+        )
+
+    def _grip_N(self) -> float:
+        given = self.problem.scene.task.grip_force_N
+        return PhysicsConfig().grip_force_N if given is None else given
+
+    def _covariance(self, object_id: str) -> Float[np.ndarray, "6 6"]:
+        known = self.problem.scene.covariances.get(object_id)
+        if known is not None:
+            return known
+        prior = VariationConfig()
+        sigma = [prior.unknown_pose_m] * 3 + [prior.unknown_pose_rad] * 3
+        return np.diag(np.square(sigma))
+
+    def _surface(self, object_id: str) -> Surface:
+        if object_id not in self._surfaces:
+            self._surfaces[object_id] = Surface(self.problem.shapes[object_id])
+        return self._surfaces[object_id]
+
+    def _pairs(
+        self, object_id: str, part_points_m: Float[np.ndarray, "num_points 3"] | None
+    ) -> tuple[Pairs, dict[str, int]]:
+        """Closing lines that hold, fit between the pads, and are on what was seen."""
+        config, shape = self.config, self.problem.shapes[object_id]
+        rejected: dict[str, int] = {}
+        kept: Int[np.ndarray, " num_kept"] = np.zeros(0, dtype=np.int64)
+        pairs = antipodal_pairs(
+            self._surface(object_id),
+            count=config.samples,
+            cone_rad=config.cone_rad,
+            hint_m=self.problem.model(object_id).grasp_m,
+            seed=config.seed,
+        )
+
+        def keep(pairs: Pairs, mask: Bool[np.ndarray, " num_pairs"], cause: str) -> Pairs:
+            _count(rejected, cause, int((~mask).sum()))
+            return pairs.chosen(mask)
+
+        pairs = keep(pairs, pairs.cosines >= np.cos(config.cone_rad), "cone")
+        pairs = keep(pairs, pairs.widths_m <= self.max_width_m - 2 * config.clearance_m, "width")
+        seen = pairs.lowest_m >= shape.trusted_from_m
+        if np.isfinite(shape.trusted_from_m):
+            seen &= pairs.downward <= _UNDERSIDE
+        pairs = keep(pairs, seen, "unseen")
+        if part_points_m is not None:
+            part = cKDTree(part_points_m)
+            ends = (pairs.first_m, pairs.first_m + pairs.axes * pairs.widths_m[:, None])
+            near = [part.query(end)[0] <= _PART_M for end in ends]
+            pairs = keep(pairs, near[0] & near[1], "part")
+        for cell_m in _CELLS_M:
+            kept = thinned(pairs, cell_m=cell_m, cell_rad=_CELL_RAD)
+            if len(kept) <= _MOST_LINES:
+                break
+        return pairs.chosen(kept), rejected
+
+    def _hands_on(
+        self,
+        pairs: Pairs,
+        T_base_object: Float[np.ndarray, "4 4"],
+        hand: OpenHand,
+        rejected: dict[str, int],
+    ) -> _Candidates:
+        """Put hands onto closing lines, from several directions and at several depths."""
+        config = self.config
+        down = -T_base_object[2, :3]
+        y = pairs.axes
+        steep = down - y * (y @ down)[:, None]
+        length = np.linalg.norm(steep, axis=1)
+        z0 = steep / np.maximum(length, 1e-9)[:, None]
+        rows: list[tuple[Float[np.ndarray, "num_pairs 4 4"], Int[np.ndarray, " num_pairs"]]] = []
+        for turn in config.approaches_rad:
+            z = np.cos(turn) * z0 + np.sin(turn) * np.cross(y, z0)
+            R = np.stack([np.cross(y, z), y, z], axis=-1)
+            for depth in config.depths_m:
+                Ts = np.tile(np.eye(4), (len(y), 1, 1))
+                Ts[:, :3, :3] = R
+                Ts[:, :3, 3] = pairs.middles_m + depth * z
+                rows.append((Ts, np.arange(len(y))))
+        Ts_all = np.concatenate([Ts for Ts, _ in rows])
+        ids = np.concatenate([numbers for _, numbers in rows])
+        if not hand.symmetric:
+            Ts_all, ids = np.concatenate([Ts_all, turned(Ts_all)]), np.concatenate([ids, ids])
+        lines = Lines(
+            Ts_object_tcp=Ts_all,
+            middles_m=pairs.middles_m[ids],
+            widths_m=pairs.widths_m[ids],
+            cosines=pairs.cosines[ids],
+        )
+        found = _Candidates(lines=lines, rejected=rejected)
+        level = (Ts_all[:, :3, 2] @ down >= np.cos(config.most_tilt_rad)) & (length[ids] > 1e-6)
+        found.keep(level, "tilt")
+        return found
+
+    def _past_table(self, found: _Candidates, T: Float[np.ndarray, "4 4"], hand: OpenHand) -> None:
+        low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
+        table_m = self.problem.scene.table_height_m + self.config.clearance_m
+        found.keep(low_m >= table_m, "table")
+
+    def _past_object(
+        self, found: _Candidates, points_m: Float[np.ndarray, "num_points 3"], hand: OpenHand
+    ) -> None:
+        hits = hand.hits(in_tools(found.lines, points_m), self.config.clearance_m / 2)
+        fingers = hits["fingers"][~hits["palm"]]
+        found.keep(~hits["palm"], "palm")
+        found.keep(~fingers, "fingers")
+
+    def _neighbours(
+        self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
+    ) -> list[tuple[Float[np.ndarray, "num_points 3"], float]]:
+        """Points of other objects, in the object's frame, and how far they may be off."""
+        scene, rows = self.problem.scene, []
+        T_object_base = se3.invert(T_base_object)
+        for name, T in scene.Ts_base_object.items():
+            if name == object_id or not np.isfinite(T).all():
+                continue
+            points = self._surface(name).samples(_NEIGHBOUR_POINTS, self.config.seed)[0]
+            covariance = self._covariance(name)
+            sigma_m = float(np.sqrt(np.abs(np.diag(covariance)[:3]).max()))
+            near = se3.apply(T_object_base @ T, points)
+            rows.append((near, self.config.clearance_m + sigma_m))
+        return rows
+
+    def _past_neighbours(
+        self,
+        found: _Candidates,
+        T: Float[np.ndarray, "4 4"],
+        around: list[tuple[Float[np.ndarray, "num_points 3"], float]],
+        hand: OpenHand,
+    ) -> None:
+        for points, margin_m in around:
+            if not len(found):
+                return
+            low = np.min([piece.low_m for piece in hand.pieces], axis=0)
+            high = np.max([piece.high_m for piece in hand.pieces], axis=0)
+            reach_m = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
+            centre = found.lines.Ts_object_tcp[:, :3, 3].mean(axis=0)
+            spread = np.linalg.norm(found.lines.Ts_object_tcp[:, :3, 3] - centre, axis=1).max()
+            near = points[np.linalg.norm(points - centre, axis=1) < reach_m + spread + margin_m]
+            if len(near):
+                hits = hand.hits(in_tools(found.lines, near), margin_m)
+                found.keep(~(hits["fingers"] | hits["palm"]), "neighbour")
+
+    def _margins(
+        self,
+        found: _Candidates,
+        object_id: str,
+        points_m: Float[np.ndarray, "num_points 3"],
+        hand: OpenHand,
+    ) -> Float[np.ndarray, " num_candidates"]:
+        """How much each grasp bears; those that bear too little are rejected."""
+        config, model = self.config, self.problem.model(object_id)
+        T = self.problem.scene.Ts_base_object[object_id]
+        twist_Nm = 2 * config.friction * self._grip_N() * _TWIST_SHARE * hand.pad_half_m
+        weight_N = max(model.mass_kg * PhysicsConfig().gravity_m_s2, 1e-9)
+        low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
+        slack = slacks(
+            self._surface(object_id),
+            found.lines,
+            hand,
+            in_tools(found.lines, points_m),
+            over_table_m=low_m - self.problem.scene.table_height_m,
+            cone_rad=config.cone_rad,
+            lever_m=twist_Nm / weight_N,
+        )
+        error_m = self.problem.shapes[object_id].error_m
+        doubt = Doubt(
+            covariance=self._covariance(object_id),
+            other_m=float(np.hypot(config.robot_error_m, error_m)),
+            robot_m=config.robot_error_m,
+            middle_m=_MIDDLE_SHARE * max(model.size_m),
+        )
+        margin = margins(slack, found.lines, T, doubt)
+        enough = margin >= config.least_margin
+        found.keep(enough, "margin")
+        return margin[enough]
+
+    def _choose(
+        self,
+        found: _Candidates,
+        margin: Float[np.ndarray, " num_candidates"],
+        object_id: str,
+        hand: OpenHand,
+    ) -> tuple[Grasp, ...]:
+        """Take the surest that the arm reaches, leaving out what is like one that was taken."""
+        config, lines = self.config, found.lines
+        T = self.problem.scene.Ts_base_object[object_id]
+        arm = self._reach.prepared(T @ lines.Ts_object_tcp, hand, config.pregrasp_m)
+        taken: list[Grasp] = []
+        kept: list[int] = []
+        for index in np.argsort(-margin, kind="stable").tolist():
+            if kept and _is_like(lines, index, kept, config, hand.symmetric):
+                continue
+            way = arm.first(index)
+            if not isinstance(way, Reached):
+                _count(found.rejected, way, 1)
+                continue
+            kept.append(index)
+            T_object_tcp = lines.Ts_object_tcp[index]
+            taken.append(
+                Grasp(
+                    object_id=object_id,
+                    T_object_tcp=turned(T_object_tcp[None])[0] if way.turned else T_object_tcp,
+                    width_m=float(lines.widths_m[index]),
+                    open_m=hand.open_m,
+                    margin=float(margin[index]),
+                    joints_rad=way.joints_rad,
+                    pregrasp_m=config.pregrasp_m,
+                    contacts_m=_contacts(lines, index),
+                )
+            )
+            if len(taken) == config.most:
+                break
+        return tuple(taken)
+
+    def _remarks(self, object_id: str, hand: OpenHand) -> tuple[str, ...]:
+        scene = self.problem.scene
+        remarks = [f"surface: {self.problem.shapes[object_id].source}"]
+        if object_id not in scene.covariances:
+            sigma_m = VariationConfig().unknown_pose_m
+            remarks.append(f"nobody says how sure its pose is: {sigma_m * 1e3:.0f} mm assumed")
+        if hand.closed_in:
+            remarks.append("the fingers' hulls fill the hand: they were not kept clear of it")
+        unseen = [name for name in scene.missing() if name != object_id]
+        if unseen:
+            remarks.append(f"not localised, so not kept clear of: {', '.join(unseen)}")
+        return tuple(remarks)
+
+    def _none(self, object_id: str, rejected: Mapping[str, int], hand: OpenHand) -> NoGraspError:
+        """Name what rejected the candidates that came furthest."""
+        cause = [name for name in CAUSES if rejected.get(name)][-1:] or ["cone"]
+        found = CAUSES[cause[0]]
+        if cause[0] == "width":
+            found += f" ({self.max_width_m * 1e3:.0f} mm)"
+        if cause[0] == "palm":
+            found += f" ({hand.depth_m * 1e3:.0f} mm)"
+        counted = ", ".join(f"{name} {rejected[name]}" for name in CAUSES if rejected.get(name))
+        return NoGraspError(
+            object_id=object_id,
+            cause=cause[0],
+            found=f"{found} (rejected: {counted or 'nothing was found'})",
+            hint=HINTS.get(cause[0], "Turn the object, or take another one."),
+            rejected=rejected,
+        )
+
+
+def turned(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_poses 4 4"]:
+    """The same hands turned half about their approach."""
+    return np.asarray(Ts * np.array([-1.0, -1.0, 1.0, 1.0]))
+
+
+def in_tools(
+    lines: Lines, points_m: Float[np.ndarray, "num_points 3"]
+) -> Float[np.ndarray, "num_grasps num_points 3"]:
+    """Points of the object, in the tool frame of each grasp."""
+    R, p = lines.Ts_object_tcp[:, :3, :3], lines.Ts_object_tcp[:, :3, 3]
+    shift = np.einsum("nij,ni->nj", R, p)
+    turned_all = points_m @ R.transpose(1, 0, 2).reshape(3, -1)  # one product, not one for each
+    return np.asarray(turned_all.reshape(len(points_m), -1, 3).transpose(1, 0, 2) - shift[:, None])
+
+
+def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:
+    half = lines.Ts_object_tcp[index, :3, 1] * lines.widths_m[index] / 2
+    return np.stack([lines.middles_m[index] - half, lines.middles_m[index] + half])
+
+
+def _is_like(
+    lines: Lines, index: int, kept: list[int], config: GraspConfig, symmetric: bool
+) -> bool:
+    """Whether a grasp is near one that was taken; of a symmetric hand also turned half."""
+    Ts = lines.Ts_object_tcp
+    near = np.linalg.norm(Ts[kept, :3, 3] - Ts[index, :3, 3], axis=1) < config.merge_m
+    if not near.any():
+        return False
+    R = Ts[np.array(kept)[near], :3, :3]
+    one = Ts[index, :3, :3]
+    hands = [one, one * np.array([-1.0, -1.0, 1.0])] if symmetric else [one]
+    for hand in hands:
+        cosine = (np.einsum("nij,ij->n", R, hand) - 1) / 2
+        if (cosine > np.cos(config.merge_rad)).any():
+            return True
+    return False

@@ -1,0 +1,144 @@
+"""The surfaces of a task's objects, and all that the planner knows of one start.
+
+A rebuilt scene gives the surface it reconstructed, where it did; the task file stands in for the
+rest. Two things are corrected on the way. A reconstruction is laid where the scan saw the object,
+millimetres from where later localisations, which lay the task's shape onto the points, have it: for
+objects of a known shape its middle is put back. And no camera saw the underside: from its lower rim
+up the surface is trusted, which is as high as the depth of the table still reached into it.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode.run_folder import RunFolder
+from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.plan.problem import Problem, Shape
+from twin.replay.rebuilt_scene import MOST_OFF, RebuiltScene, read_rebuilt_scene
+from twin.robot.model import load_robot
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.objects.decompose import shape_mesh
+from twin.scene.shape.files import MESH, TASK_SHAPE
+from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
+
+GUESSED_SHARE = 0.1
+"""Of its largest extent, a scanned object may be off that no scan has shown yet."""
+
+
+def problem_of(
+    run: RunFolder | None,
+    task: Task,
+    localised: Mapping[str, LocalisedObject],
+    urdf: str,
+    start_rad: Float[np.ndarray, " num_joints"] | None = None,
+) -> Problem:
+    """Put together what the planner knows when it plans.
+
+    Args:
+        run: Its scene and calibration are used; None: there is none, the task file says all.
+        task: Whose objects they are.
+        localised: Where they were found; those that were not keep the reason.
+        urdf: The robot's description.
+        start_rad: Where the arm stands, base to hand; None: not known.
+
+    Raises:
+        RobotDescriptionError: The robot cannot be used.
+        UnreadableSceneError: The run's scene cannot be understood.
+    """
+    found = {
+        key: item
+        for key, item in localised.items()
+        if key in task.objects and item.T_base_object is not None
+    }
+    poses = {
+        key: item.T_base_object for key, item in found.items() if item.T_base_object is not None
+    }
+    reasons = {
+        key: localised[key].reason or "not found" if key in localised else "was not looked for"
+        for key in task.objects
+        if key not in found
+    }
+    covariances = {
+        key: item.covariance for key, item in found.items() if item.covariance is not None
+    }
+    rebuilt = RebuiltScene() if run is None else read_rebuilt_scene(run, task)
+    scene = rebuilt.scene(task, urdf, poses, reasons=reasons, covariances=covariances)
+    shapes = shapes_of(None if run is None else run.scene_dir, task)
+    return Problem(scene=replace(scene, start_rad=start_rad), robot=load_robot(urdf), shapes=shapes)
+
+
+def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
+    """The surface of every object of a task, in its own frame.
+
+    Args:
+        scene_dir: The rebuilt scene; None: there is none.
+        task: Its nominal shapes stand in for what the scene lacks.
+    """
+    return {
+        key: _task_shape(model, "task file: there is no scene")
+        if scene_dir is None
+        else _shape_of(scene_dir / "objects" / key, model)
+        for key, model in task.objects.items()
+    }
+
+
+def _shape_of(folder: Path, model: ObjectModel) -> Shape:
+    if not (folder / MESH).is_file():
+        return _task_shape(model, "task file: the scene has no mesh of it")
+    try:
+        about = json.loads((folder / "object.json").read_text())
+        source, geometry = str(about["shape_source"]), about.get("geometry") or {}
+        truncation_m = float(geometry.get("truncation_m", 0.0))
+        voxel_m = float(geometry.get("voxel_m", 0.0))
+        closed = geometry.get("watertight") is True
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return _task_shape(model, f"task file: what the scene says of it is damaged ({error!r})")
+    if source == TASK_SHAPE:
+        return _task_shape(model, "task file: the scene did not reconstruct it")
+    if not closed:
+        return _task_shape(model, "task file: the scene's mesh of it is not closed")
+    try:
+        vertices, triangles = read_mesh(folder / MESH)
+    except UnreadableMeshError as error:
+        return _task_shape(model, f"task file: {error}")
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    known_low, known_high = _extents(model)
+    off = float(np.max(np.abs((high - low) / (known_high - known_low) - 1.0)))
+    said = f"scan ({source})"
+    if model.shape != SCANNED:
+        if off > MOST_OFF:
+            return _task_shape(model, f"task file: an extent of the scene's mesh is {off:.0%} off")
+        shift = (known_low + known_high - low - high) / 2
+        shift[2] = known_low[2] - low[2]  # it stands on the table
+        vertices = vertices + shift
+        said += f", moved by {np.linalg.norm(shift) * 1e3:.1f} mm onto the task's shape"
+    return Shape(
+        vertices_m=vertices,
+        triangles=triangles,
+        source=said,
+        trusted_from_m=float(vertices[:, 2].min()) + truncation_m,
+        error_m=voxel_m,
+    )
+
+
+def _extents(model: ObjectModel) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Lowest and highest corner of an object in its frame."""
+    half = np.array(model.size_m) / 2
+    middle = np.array([0.0, 0.0, 0.0 if model.origin_at_centre else half[2]])
+    return middle - half, middle + half
+
+
+def _task_shape(model: ObjectModel, why: str) -> Shape:
+    vertices, triangles = shape_mesh(model)
+    if model.shape != SCANNED:
+        return Shape(vertices_m=vertices, triangles=triangles, source=why)
+    return Shape(
+        vertices_m=vertices,
+        triangles=triangles,
+        source=f"{why}; only the box around it is known",
+        error_m=GUESSED_SHARE * max(model.size_m),
+    )
