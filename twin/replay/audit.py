@@ -51,6 +51,8 @@ _BLOCK_M = 0.15
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 Corners = Float[np.ndarray, "8 3"]
+_Excess = tuple[float, str, tuple[str, str]]
+"""How much less distance was found than was said [m], in words, and between which bodies."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ class _Audit:
             for name, Ts in states.Ts_base_object.items()
         ]
         moved = {name: self._moved(Ts) for name, Ts in states.Ts_base_object.items()}
-        found: list[tuple[float, str]] = []
+        found: list[_Excess] = []
         fixed = self._fixed()
         always = np.ones(len(states.stamps_ns), dtype=bool)
         for first in links:
@@ -176,7 +178,8 @@ class _Audit:
         if self._left < 0:
             return self._too_many()
         if found:
-            return Factor(value=None, detail=max(found)[1])
+            _, detail, bodies = max(found)
+            return Factor(value=None, detail=detail, bodies=bodies)
         detail = f"{len(states.stamps_ns)} states and {asked} distances asked again"
         return Factor(value=True, detail=detail)
 
@@ -186,7 +189,7 @@ class _Audit:
 
     def _ask(
         self, first: _Placed, second: _Placed, states: _States, where: Bool[np.ndarray, " n"]
-    ) -> list[tuple[float, str]]:
+    ) -> list[_Excess]:
         """Distances of a pair that are less than was said: by how much, and in words."""
         tolerance = max(first.body.tolerance_m, second.body.tolerance_m)
         low, high = first.box()
@@ -198,7 +201,7 @@ class _Audit:
         if not ask.any():
             return []
         ask &= ~self._may_touch(first.body.name, second.body.name, states)
-        found: list[tuple[float, str]] = []
+        found: list[_Excess] = []
         for index in np.flatnonzero(ask).tolist():
             self._left -= 1
             if self._left < 0:
@@ -211,7 +214,7 @@ class _Audit:
                     f"{first.body.name} is {distance * 1e3:.1f} mm from {second.body.name} at "
                     f"{t_s:.2f} s by python-fcl, the clearance said {claimed_mm:.1f} mm"
                 )
-                found.append((excess, detail))
+                found.append((excess, detail, (first.body.name, second.body.name)))
         return found
 
     def _distance_m(self, first: _Placed, second: _Placed, index: int) -> float:

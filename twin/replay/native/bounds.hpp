@@ -9,9 +9,10 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <limits>
 #include <stdexcept>
 #include <vector>
+
+#include "grid_search.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -22,11 +23,6 @@ using Turns = nb::ndarray<const double, nb::shape<-1, 3, 3>, nb::c_contig, nb::d
 using Ranges = nb::ndarray<const std::int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using Answers = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Order = nb::ndarray<std::int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-
-struct Visit {
-    double distance;
-    std::int32_t index;
-};
 
 // Lower bounds of the signed distances of pairs, nearest first.
 class Bounds {

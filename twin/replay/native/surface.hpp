@@ -3,9 +3,17 @@
 // tests/parity/test_clearance_parity.py has both formulas in NumPy.
 #pragma once
 
-#include "grid.hpp"
+#include "bounds.hpp"
+#include "grid_search.hpp"
 
+using Values = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Distances = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+inline Grid grid_of(const Values& values, const Vector& origin, double voxel) {
+    std::int64_t sides[3];
+    for (int axis = 0; axis < 3; ++axis) sides[axis] = static_cast<std::int64_t>(values.shape(axis));
+    return Grid(values.data(), sides, origin.data(), voxel);
+}
 
 // Coordinates of a body's points, each in a row of its own, so that a pose is applied to many.
 class Surface {
@@ -67,7 +75,7 @@ inline void surface_to_grid(const Values& values, const Vector& origin, double v
     const std::size_t count = R.shape(0);
     if (origin.shape(0) != 3 || t.shape(0) != count || answers.shape(0) != count)
         throw std::invalid_argument("poses and answers differ in number");
-    const Grid grid(values, origin, voxel);
+    const Grid grid = grid_of(values, origin, voxel);
     Surface surface(points);
     const std::size_t size = surface.size();
     for (std::size_t pose = 0; pose < count; ++pose) {
@@ -90,7 +98,7 @@ inline void points_to_grid(const Values& values, const Vector& origin, double vo
     if (origin.shape(0) != 3 || t.shape(0) != count || answers.shape(0) != count ||
         answers.shape(1) != size)
         throw std::invalid_argument("poses, points and answers differ in number");
-    const Grid grid(values, origin, voxel);
+    const Grid grid = grid_of(values, origin, voxel);
     Surface surface(points);
     for (std::size_t pose = 0; pose < count; ++pose) {
         const double* placed = surface.place(R.data() + 9 * pose, t.data() + 3 * pose);

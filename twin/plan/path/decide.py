@@ -1,0 +1,207 @@
+"""The last word on a movement: the monitor's exact clearance, then python-fcl on real meshes.
+
+What is asked is the movement as it will be followed, straight in joints between its knots. The
+monitor looks at as many postures in between as its bound wants; links are asked against each other
+at every knot. What they refuse comes back as pairs of bodies, for the search to keep farther apart.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.task.plan import Plan, Stage
+from bridge.task.verdict import Factor, Verdict
+from twin.plan.path.world import Carried
+from twin.plan.problem import Problem, TimedPath
+from twin.replay.audit import audit
+from twin.replay.clearance.bodies import own_links
+from twin.replay.clearance.monitor import Allowed, ClearanceMonitor
+from twin.replay.config import ReplayConfig
+from twin.replay.result import ReplayResult
+from twin.robot.collision import hulls_of
+
+_STAGE = "move"
+AUDIT_STEP_M = 0.001
+"""How much farther a pair is kept that python-fcl finds nearer than was said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Two bodies that come too near on a movement."""
+
+    bodies: tuple[str, str]
+    lacking_m: float
+    """How much farther apart they should have been."""
+    t_ns: int
+    by: str
+    """Who refused."""
+    detail: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """What the exact checks say of a movement."""
+
+    refusals: tuple[Refusal, ...]
+    clearance_m: Float[np.ndarray, " num_points"]
+    """Smallest distance over the pairs that may not touch, at and before each knot."""
+    audit: Factor | None = None
+    """None: python-fcl was not asked."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether nobody refused; an audit that could not be made refuses nothing."""
+        return not self.refusals
+
+
+def object_poses(
+    problem: Problem,
+    joints_rad: Float[np.ndarray, "num_points num_joints"],
+    carried: Carried | None,
+) -> dict[str, Float[np.ndarray, "num_points 4 4"]]:
+    """Where the movable objects are along a movement: at their start, or in the hand.
+
+    Args:
+        problem: Start poses and the robot.
+        joints_rad: Postures.
+        carried: What goes with the tool.
+    """
+    poses = {
+        name: np.repeat(T[None], len(joints_rad), axis=0)
+        for name, T in problem.scene.movable().items()
+    }
+    if carried is not None:
+        poses[carried.object_id] = problem.robot.Ts_base_tcp(joints_rad) @ carried.T_tcp_object
+    return poses
+
+
+def decide(
+    problem: Problem,
+    timed: TimedPath,
+    *,
+    width_m: float,
+    config: ReplayConfig,
+    carried: Carried | None = None,
+    allowed: Allowed = frozenset(),
+    audited: bool = False,
+) -> Decision:
+    """Check a movement exactly.
+
+    Args:
+        problem: Scene and robot.
+        timed: The movement.
+        width_m: Distance between the finger pads.
+        config: Its ``eps_col_m`` and depth of allowed contacts count.
+        carried: What is in the hand.
+        allowed: Pairs that may touch.
+        audited: Ask python-fcl too, where the monitor refuses nothing.
+    """
+    robot, scene = problem.robot, problem.scene
+    hulls, links = hulls_of(robot), own_links(hulls_of(robot))
+    contacts = tuple((min(pair), max(pair)) for pair in sorted(allowed, key=sorted))
+    plan = _plan(problem, contacts)
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    poses = object_poses(problem, timed.joints_rad, carried)
+    stamps = np.round(timed.times_s * 1e9).astype(np.int64)
+    refusals: list[Refusal] = []
+    clearance = np.empty(len(stamps))
+    for index, joints in enumerate(timed.joints_rad):
+        Ts = {name: rows[index] for name, rows in poses.items()}
+        clearance[index] = monitor.measure(int(stamps[index]), joints, width_m, Ts)
+        if links.touch():
+            closest = hulls.self_distance()
+            refusals.append(
+                Refusal(
+                    bodies=closest.links,
+                    lacking_m=-closest.distance_m,
+                    t_ns=int(stamps[index]),
+                    by="links",
+                    detail=f"{closest.links[0]} touches {closest.links[1]}",
+                )
+            )
+            break
+    limits = {"deep_contact": -config.max_contact_depth_m}
+    refusals += [
+        Refusal(
+            bodies=(failure.bodies[0], failure.bodies[1]),
+            lacking_m=limits.get(failure.cause, config.eps_col_m) - _least(monitor, failure.bodies),
+            t_ns=failure.t_ns,
+            by="clearance",
+            detail=failure.detail,
+        )
+        for failure in monitor.failures
+    ]
+    factor = None
+    if audited and not refusals:
+        factor = audit(_result(problem, timed, width_m, poses, clearance), plan, scene, config)
+        if factor.bodies:
+            refusals.append(_by_audit(factor))
+    return Decision(refusals=tuple(refusals), clearance_m=clearance, audit=factor)
+
+
+def _least(monitor: ClearanceMonitor, bodies: Sequence[str]) -> float:
+    """The smallest distance that two bodies had [m]."""
+    wanted = frozenset(bodies)
+    return min(
+        (item.min_distance_m for item in monitor.contacts() if frozenset(item.bodies) == wanted),
+        default=0.0,
+    )
+
+
+def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
+    """The one stage that a movement is, as monitor and audit read it."""
+    stage = Stage(id=_STAGE, text="", allowed_contacts=contacts)
+    return Plan(
+        id=_STAGE,
+        planner="",
+        policy="",
+        condition="",
+        robot=problem.robot.name,
+        frame=problem.robot.record.base_frame,
+        instruction="",
+        stages=(stage,),
+        tau=(),
+    )
+
+
+def _by_audit(factor: Factor) -> Refusal:
+    """What python-fcl found nearer than the monitor said."""
+    first, second = factor.bodies[:2]
+    detail = factor.detail or ""
+    return Refusal(
+        bodies=(first, second), lacking_m=AUDIT_STEP_M, t_ns=0, by="audit", detail=detail
+    )
+
+
+def _result(
+    problem: Problem,
+    timed: TimedPath,
+    width_m: float,
+    poses: Mapping[str, Float[np.ndarray, "num_points 4 4"]],
+    clearance_m: Float[np.ndarray, " num_points"],
+) -> ReplayResult:
+    """A movement as the audit reads one: nothing but arm and objects, and what was said of them."""
+    unknown = Factor(value=None)
+    verdict = Verdict(
+        plan_id=_STAGE,
+        trajectory="planned",
+        mode="kinematic",
+        ik=unknown,
+        clearance=unknown,
+        terminal=unknown,
+        engine="",
+        seed=0,
+    )
+    return ReplayResult(
+        verdict=verdict,
+        stamps_ns=np.round(timed.times_s * 1e9).astype(np.int64),
+        joints_rad=timed.joints_rad,
+        width_m=np.full(len(timed.times_s), width_m),
+        Ts_base_tcp=problem.robot.Ts_base_tcp(timed.joints_rad),
+        Ts_base_object=dict(poses),
+        finger_contact={},
+        clearance_m=clearance_m,
+        contacts=[],
+    )

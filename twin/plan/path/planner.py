@@ -1,0 +1,434 @@
+"""Plan one movement: around what is in the way, made short, timed, and checked exactly.
+
+The search (RRT-Connect and shortcuts, native) knows spheres and hulls and misses nothing between
+two postures; what it finds is timed, and the exact clearance and, where it is asked, python-fcl
+decide. What they refuse is searched again with the refused pair kept farther apart. Everything
+follows from the seed; work is counted, never timed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.errors import refuse_outside
+from bridge.geometry import se3
+from bridge.task.plan import Waypoint
+from twin.errors import TwinError
+from twin.plan.path.decide import Decision, Refusal, decide
+from twin.plan.path.world import SPARE_M, Carried, World, build_world
+from twin.plan.problem import Problem, TimedPath
+from twin.replay.clearance.monitor import Allowed
+from twin.replay.config import ReplayConfig
+from twin.robot.follow import follow_poses
+from twin.robot.model import RobotModel
+
+REASONS = {
+    1: "start touches",
+    2: "goal touches",
+    3: "budget spent",
+    4: "outside the joint limits",
+}
+"""Why a search ends without a path, by the native search's number."""
+_WIDER_M = 0.001
+"""Kept beyond what a refusal lacked."""
+_STRAIGHT_M, _STRAIGHT_RAD = 0.005, 0.05
+"""Longest parts of a straight tool movement."""
+_JUMP = 6.0
+"""A joint that moves more than so many times the median of its steps leaves its branch."""
+_LEAST_JUMP_RAD = 0.2
+_KNOTS = ((1.0, True), (0.25, True), (1.0, False))
+"""Tried one after the other: share of the spacing, and whether corners are rounded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathConfig:
+    """How far a search goes, and how fast the arm may be told to go."""
+
+    range_rad: float = 1.0
+    """Longest step of the search's trees [rad, over all joints]."""
+    max_nodes: int = 5000
+    """Postures in both trees at most."""
+    max_postures: int = 150_000
+    """Postures looked at at most, in one search with its shortcuts."""
+    shortcuts: int = 60
+    """Shorter ways that are tried."""
+    rounds: int = 4
+    """Searches at most, each with what was refused before kept farther away."""
+    speed_share: float = 0.95
+    """Share of the limits of joint and tool speed that is used."""
+    acceleration_share: float = 0.33
+    """Share of the limits of acceleration; a third of the UR5's is what MoveIt assumes of it."""
+    contact_m_s: float = 0.1
+    """Speed of the tool on straight movements, at whose ends something is touched [m/s]."""
+    acceleration_rad_s2: float = 5.0
+    """Limit of joints whose acceleration the robot file does not limit."""
+    step_s: float = 0.02
+    """Time between two knots of a path [s]."""
+    audited: bool = True
+    """Ask python-fcl too before a path is handed out."""
+    seed: int = 0
+    """Of the search."""
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    """The exact clearance."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers with which nothing could be planned."""
+        refuse_outside(
+            self,
+            {
+                "range_rad": (0.01, 100),
+                "max_nodes": (2, 10_000_000),
+                "max_postures": (1, 1_000_000_000),
+                "shortcuts": (0, 100_000),
+                "rounds": (1, 100),
+                "speed_share": (0.01, 1),
+                "acceleration_share": (0.01, 1),
+                "contact_m_s": (0.001, 10),
+                "acceleration_rad_s2": (0.01, 1000),
+                "step_s": (0.001, 1),
+                "seed": (0, 2**63 - 1),
+            },
+        )
+
+
+class NoPathError(TwinError):
+    """There is no path, or none was found with the work that was allowed."""
+
+    def __init__(
+        self, *, reason: str, bodies: tuple[str, ...] = (), detail: str = "", work: int = 0
+    ) -> None:
+        """Remember what is in the way.
+
+        Args:
+            reason: One of ``REASONS``, unreachable, branch, refused, or not a posture.
+            bodies: The pair that touches, where one does.
+            detail: More, in words.
+            work: Postures that were looked at.
+        """
+        self.reason, self.bodies, self.detail, self.work = reason, bodies, detail, work
+        self.leg = ""
+        """Which movement of several it was; whoever plans several says so."""
+        super().__init__(reason)
+
+    def __str__(self) -> str:
+        """What is in the way of which movement."""
+        leg = f" for {self.leg!r}" if self.leg else ""
+        pair = f": {self.bodies[0]} and {self.bodies[1]}" if len(self.bodies) > 1 else ""
+        more = f" ({self.detail})" if self.detail else ""
+        return f"no path{leg}: {self.reason}{pair}{more}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Movement:
+    """A timed path with what was decided of it."""
+
+    path: TimedPath
+    decision: Decision
+    width_m: float
+    carried: Carried | None
+    goal: int = 0
+    """Which of the goals was reached."""
+
+
+def plan_move(
+    problem: Problem,
+    start_rad: Float[np.ndarray, " num_joints"],
+    goals_rad: Float[np.ndarray, "num_goals num_joints"],
+    config: PathConfig,
+    *,
+    width_m: float,
+    carried: Carried | None = None,
+    allowed: Allowed = frozenset(),
+) -> Movement:
+    """Find a collision-free, short, timed movement to one of some postures.
+
+    Args:
+        problem: Scene and robot.
+        start_rad: Where the arm stands.
+        goals_rad: Where it may end; the nearest on the way is taken.
+        config: Budgets, limits and seed.
+        width_m: Distance between the finger pads, all the way.
+        carried: What is in the hand.
+        allowed: Pairs that may touch, such as gripper and what it carries.
+
+    Raises:
+        NoPathError: Start or goals touch something (which), the budget is spent, or the exact
+            check refused every round.
+    """
+    check_numbers(start_rad, goals_rad)
+    wider: dict[frozenset[str], float] = {}
+    work: dict[str, float] = {}
+    refusals: tuple[Refusal, ...] = ()
+    for turn in range(config.rounds):
+        world = build_world(
+            problem,
+            width_m=width_m,
+            eps_col_m=config.replay.eps_col_m,
+            carried=carried,
+            allowed=allowed,
+            wider_m=wider,
+        )
+        _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
+        knots, goal = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
+        path = timed_path(world, knots, config)
+        movement = _decided(problem, path, config, width_m, carried, allowed, goal)
+        work["rounds"] = float(turn + 1)
+        if movement.decision.accepted:
+            return replace(movement, path=replace(path, work={**work, **path.work}))
+        refusals = movement.decision.refusals
+        _widen(wider, refusals)
+    raise NoPathError(
+        reason="refused", bodies=refusals[0].bodies, detail=refusals[0].detail,
+        work=int(work["postures"]),
+    )  # fmt: skip
+
+
+def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
+    """Refuse postures that are no numbers.
+
+    Raises:
+        NoPathError: One of them is not finite.
+    """
+    if not all(np.isfinite(rows).all() for rows in postures):
+        raise NoPathError(reason="not a posture", detail="joints that are not finite")
+
+
+def _widen(wider: dict[frozenset[str], float], refusals: tuple[Refusal, ...]) -> None:
+    for refusal in refusals:
+        pair = frozenset(refusal.bodies)
+        wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
+
+
+def _let_ends_be(
+    world: World,
+    ends_rad: Float[np.ndarray, "num_ends num_joints"],
+    wider_m: Mapping[frozenset[str], float],
+) -> None:
+    """Ask of a refused pair no more than it has at the ends, which nobody chooses here."""
+    for number, names in enumerate(world.names):
+        if frozenset(names) in wider_m:
+            at_ends_m = min(world.motion.distance(row, number)[0] for row in ends_rad)
+            least_m = world.limits_m[number] - wider_m[frozenset(names)]
+            limit_m = min(world.limits_m[number], max(least_m, at_ends_m - SPARE_M))
+            world.motion.set_limit(number, limit_m)
+
+
+def _searched(
+    world: World,
+    start_rad: Float[np.ndarray, " num_joints"],
+    goals_rad: Float[np.ndarray, "num_goals num_joints"],
+    config: PathConfig,
+    turn: int,
+    work: dict[str, float],
+    refusals: tuple[Refusal, ...],
+) -> tuple[Float[np.ndarray, "num_knots num_joints"], int]:
+    """One native search; adds its work."""
+    outcome, pair, goal, knots, spent = world.motion.find(
+        np.ascontiguousarray(start_rad, dtype=np.float64),
+        np.ascontiguousarray(goals_rad, dtype=np.float64),
+        config.seed + turn,
+        config.range_rad,
+        config.max_nodes,
+        config.max_postures,
+        config.shortcuts,
+    )
+    for name, value in spent.items():
+        work[name] = work.get(name, 0.0) + float(value)
+    if outcome:
+        bodies = world.names[pair] if pair >= 0 else ()
+        detail = f"after a refusal: {refusals[0].detail}" if refusals else ""
+        raise NoPathError(
+            reason=REASONS[outcome], bodies=bodies, detail=detail, work=int(work["postures"])
+        )
+    return knots, goal
+
+
+def _decided(
+    problem: Problem,
+    path: TimedPath,
+    config: PathConfig,
+    width_m: float,
+    carried: Carried | None,
+    allowed: Allowed,
+    goal: int = 0,
+) -> Movement:
+    decision = decide(
+        problem,
+        path,
+        width_m=width_m,
+        config=config.replay,
+        carried=carried,
+        allowed=allowed,
+        audited=config.audited,
+    )
+    return Movement(path=path, decision=decision, width_m=width_m, carried=carried, goal=goal)
+
+
+def timed_path(
+    world: World,
+    knots_rad: Float[np.ndarray, "num_knots num_joints"],
+    config: PathConfig,
+    *,
+    tool_m_s: float | None = None,
+) -> TimedPath:
+    """Give a path of straight lines its times: corners rounded where that is free.
+
+    What is handed out is followed straight between its own knots, so it is that which is looked at
+    again; where a chord is not free the corners stay sharp and the arm stops at them.
+
+    Args:
+        world: What must stay clear.
+        knots_rad: Postures joined by straight lines.
+        config: Limits and spacing.
+        tool_m_s: The tool moves no faster than this, or than its own limit.
+    """
+    speed, acceleration, limit_m_s = limits_of(world.robot, config)
+    wanted = [value for value in (limit_m_s, tool_m_s) if value]
+    rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
+    for step_s, rounding in _KNOTS:
+        times, joints, corners, rounded, *_ = world.motion.time(
+            rows, speed, acceleration, min(wanted, default=0.0), config.step_s * step_s, rounding
+        )
+        if world.motion.blocked(joints) < 0:
+            break
+    length = float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
+    return TimedPath(
+        times_s=times,
+        joints_rad=joints,
+        length_rad=length,
+        work={"corners": float(corners), "rounded": float(rounded)},
+    )
+
+
+def limits_of(
+    robot: RobotModel, config: PathConfig
+) -> tuple[Float[np.ndarray, " num_joints"], Float[np.ndarray, " num_joints"], float]:
+    """Return the speeds and accelerations of joints and the tool's speed that are used."""
+    record = robot.record
+    most = record.acceleration_rad_s2 or (config.acceleration_rad_s2,) * len(robot.joints)
+    tool = record.tool_speed_m_s or 0.0
+    return (
+        config.speed_share * robot.velocity_limit_rad_s,
+        config.acceleration_share * np.array(most),
+        config.speed_share * tool,
+    )
+
+
+def plan_straight(
+    problem: Problem,
+    start_rad: Float[np.ndarray, " num_joints"],
+    T_base_goal: Float[np.ndarray, "4 4"],
+    config: PathConfig,
+    *,
+    width_m: float,
+    carried: Carried | None = None,
+    allowed: Allowed = frozenset(),
+) -> Movement:
+    """Move the tool straight to a pose, on the branch of the inverse kinematics it starts on.
+
+    For the last centimetres, where contact is wanted: pairs in ``allowed`` are left to the exact
+    check, which lets them touch but not lie in each other.
+
+    Args:
+        problem: Scene and robot.
+        start_rad: Where the arm stands; the line begins at its tool.
+        T_base_goal: Where it ends.
+        config: Limits.
+        width_m: Distance between the finger pads.
+        carried: What is in the hand.
+        allowed: Pairs that may touch on the way.
+
+    Raises:
+        NoPathError: A pose is out of reach, the arm would have to change its branch, or something
+            is in the way: a straight line cannot go around it.
+    """
+    check_numbers(start_rad, T_base_goal)
+    robot = problem.robot
+    knots = _straight_knots(robot, start_rad, T_base_goal, config)
+    world = build_world(
+        problem,
+        width_m=width_m,
+        eps_col_m=config.replay.eps_col_m,
+        carried=carried,
+        allowed=allowed,
+    )
+    path = timed_path(world, knots, config, tool_m_s=config.contact_m_s)
+    movement = _decided(problem, path, config, width_m, carried, allowed)
+    if not movement.decision.accepted:
+        first = movement.decision.refusals[0]
+        raise NoPathError(reason="refused", bodies=first.bodies, detail=first.detail)
+    return replace(movement, path=replace(path, work={**path.work, "postures": float(len(knots))}))
+
+
+def _straight_knots(
+    robot: RobotModel,
+    start_rad: Float[np.ndarray, " num_joints"],
+    T_base_goal: Float[np.ndarray, "4 4"],
+    config: PathConfig,
+) -> Float[np.ndarray, "num_knots num_joints"]:
+    """Joints along a straight line of the tool, one branch all the way."""
+    T_start = robot.T_base_tcp(start_rad)
+    (q_start, p_start), (q_goal, p_goal) = se3.split(T_start), se3.split(T_base_goal)
+    way_m = float(np.linalg.norm(p_goal - p_start))
+    turn_rad = 2 * np.arccos(min(1.0, abs(float(q_start @ q_goal))))
+    count = int(np.ceil(max(way_m / _STRAIGHT_M, turn_rad / _STRAIGHT_RAD, 1.0)))
+    shares = np.linspace(0.0, 1.0, count + 1)[1:]
+    Ts = np.stack(
+        [
+            se3.transform_from(
+                se3.interpolate_quaternion(q_start, q_goal, np.array(share)),
+                p_start + share * (p_goal - p_start),
+            )
+            for share in shares
+        ]
+    )
+    followed = follow_poses(robot, Ts, start_rad=start_rad, config=config.replay.ik)
+    if not followed.reached.all():
+        share = shares[int(np.argmin(followed.reached))]
+        detail = f"no joints reach the pose at {share * way_m * 1e3:.0f} of {way_m * 1e3:.0f} mm"
+        raise NoPathError(reason="unreachable", detail=detail)
+    knots = np.concatenate([start_rad[None], followed.joints_rad])
+    steps = np.abs(np.diff(knots, axis=0)).max(axis=1)
+    if steps.max() > max(_LEAST_JUMP_RAD, _JUMP * float(np.median(steps))):
+        share = shares[int(steps.argmax())]
+        detail = f"the arm would jump at {share * way_m * 1e3:.0f} of {way_m * 1e3:.0f} mm"
+        raise NoPathError(reason="branch", detail=detail)
+    return knots
+
+
+def reversed_path(path: TimedPath) -> TimedPath:
+    """The same movement backwards; its limits hold as well."""
+    return replace(
+        path, times_s=path.times_s[-1] - path.times_s[::-1], joints_rad=path.joints_rad[::-1].copy()
+    )
+
+
+def waypoints_of(
+    robot: RobotModel, path: TimedPath, *, g: int, width_m: float, begin_s: float = 0.0
+) -> tuple[Waypoint, ...]:
+    """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints.
+
+    Args:
+        robot: Gives the tool's poses.
+        path: Times and postures.
+        g: Gripper all the way: 1 closed, 0 open.
+        width_m: What it is commanded to.
+        begin_s: When the movement starts.
+    """
+    found = []
+    for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True):
+        q, p = se3.split(robot.T_base_tcp(joints))
+        w, x, y, z = q.tolist()
+        found.append(
+            Waypoint(
+                t_ns=round((begin_s + t_s) * 1e9),
+                p_m=(float(p[0]), float(p[1]), float(p[2])),
+                q_wxyz=(w, x, y, z),
+                g=g,
+                width_m=width_m,
+                joints_rad=tuple(joints.tolist()),
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,366 @@
+"""The arm, what it carries and what stands around it, as the native search wants them.
+
+Hulls, pairs and limits are those of ``twin.replay.clearance``: what a path keeps here is what the
+monitor asks for there, and the planner's own are two pairs more, links against each other all the
+way, and what is carried against other objects.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Bool, Float
+
+from bridge.geometry import se3
+from bridge.geometry.mesh import box_corners
+from twin.plan.path._motion import Motion
+from twin.plan.path.spheres import box_spheres, covering_spheres, excess_m
+from twin.plan.problem import Problem
+from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
+from twin.replay.clearance.bounding_spheres import (
+    ARM_FINE_M,
+    FINE_M,
+    BoundingSphereTree,
+    bounding_spheres_of,
+)
+from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.monitor import Allowed
+from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
+from twin.robot.collision import RobotHulls, hulls_of
+from twin.robot.model import RobotModel
+
+SPARE_M = 0.0003
+"""A path keeps this much more than was asked: what the search may overlook is less."""
+BOX, PLANE, GRID, BODY = range(4)
+"""Kinds of the native pairs."""
+
+Names = tuple[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Carried:
+    """An object in the hand."""
+
+    object_id: str
+    T_tcp_object: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain:
+    """The arm's joints one after the other, and its hulls in their frames, at one gripper width."""
+
+    placements: Float[np.ndarray, "num_joints 4 4"]
+    """Each joint's frame in that of the one before, at 0."""
+    axes: Float[np.ndarray, "num_joints 3"]
+    slides: Bool[np.ndarray, " num_joints"]
+    T_last_tcp: Float[np.ndarray, "4 4"]
+    joint_of: tuple[int, ...]
+    """For each hull: how many joints move it."""
+    Ts_joint_hull: Float[np.ndarray, "num_hulls 4 4"]
+
+
+def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
+    """Read an arm's joints off pinocchio, its fingers held at an opening.
+
+    Args:
+        hulls: The robot; its model is placed at zero joints.
+        width_m: Distance between the finger pads.
+    """
+    robot = hulls.robot
+    model, data = robot.model, robot.data
+    zero = np.zeros(len(robot.joints))
+    q = robot.configuration(zero, width_m)
+    ids = [int(model.getJointId(name)) for name in robot.joints]
+    pin.computeJointJacobians(model, data, q)
+    frames = [np.eye(4)] + [np.array(data.oMi[joint].homogeneous) for joint in ids]
+    axes, slides = [], []
+    for joint in ids:
+        column = pin.getJointJacobian(model, data, joint, pin.LOCAL)[:, model.joints[joint].idx_v]
+        turning = bool(np.linalg.norm(column[3:]) > 0.5)
+        axes.append(column[3:] if turning else column[:3])
+        slides.append(not turning)
+    hulls.place(zero, width_m)
+    joint_of, Ts = [], []
+    for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True):
+        joint = int(model.frames[robot.frame_id(hull.link)].parentJoint)
+        while joint and joint not in ids:
+            joint = int(model.parents[joint])
+        number = ids.index(joint) + 1 if joint else 0
+        T_base_hull = np.eye(4)
+        T_base_hull[:3, :3], T_base_hull[:3, 3] = R, t
+        joint_of.append(number)
+        Ts.append(se3.invert(frames[number]) @ T_base_hull)
+    return Chain(
+        placements=np.stack([se3.invert(before) @ own for before, own in pairwise(frames)]),
+        axes=np.array(axes),
+        slides=np.array(slides),
+        T_last_tcp=se3.invert(frames[-1]) @ robot.T_base_tcp(zero),
+        joint_of=tuple(joint_of),
+        Ts_joint_hull=np.stack(Ts),
+    )
+
+
+@dataclass(frozen=True)
+class _HullSpheres:
+    spheres_m: Float[np.ndarray, "num_spheres 4"]
+    excess_m: float
+
+
+@lru_cache(maxsize=4)
+def _link_spheres(hulls: RobotHulls) -> tuple[_HullSpheres, ...]:
+    """Spheres of each hull in its own frame, fitted once for a robot."""
+    found = []
+    for hull in hulls.hulls:
+        spheres = covering_spheres(hull.points_m)
+        found.append(_HullSpheres(spheres, excess_m(hull.points_m, spheres)))
+    return tuple(found)
+
+
+@lru_cache(maxsize=4)
+def _link_trees(hulls: RobotHulls) -> tuple[BoundingSphereTree, ...]:
+    """What grids are asked about, for each hull."""
+    gripper = hulls.robot.record.gripper.links
+    return tuple(
+        bounding_spheres_of(hull.points_m, FINE_M if hull.link in gripper else ARM_FINE_M)
+        for hull in hulls.hulls
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """A native world, and what its numbers mean."""
+
+    motion: Motion
+    names: list[Names]
+    """Of each native pair."""
+    robot: RobotModel
+    width_m: float
+    carried: Carried | None = None
+    limits_m: list[float] = field(default_factory=list)
+
+
+@dataclass(kw_only=True)
+class _Builder:
+    """Adds pairs one after the other, each with what it must keep."""
+
+    motion: Motion
+    hulls: RobotHulls
+    carried: Carried | None
+    eps_m: float
+    allowed: Allowed
+    wider_m: Mapping[frozenset[str], float]
+    names: list[Names] = field(default_factory=list)
+    limits_m: list[float] = field(default_factory=list)
+
+    def add_standing(self, boxes: list[str], *, has_grid: bool) -> None:
+        """Links and what is carried against boxes, the table and the rest of the scene."""
+        stationary, _ = stationary_links(self.hulls)
+        bodies = [hull.link for hull in self.hulls.hulls]
+        bodies += [self.carried.object_id] if self.carried is not None else []
+        for body, name in enumerate(bodies):
+            for number, other in enumerate(boxes):
+                self._pair(body, BOX, number, (name, other))
+            if name not in stationary:
+                self._pair(body, PLANE, 0, (name, TABLE))
+                if has_grid:
+                    self._pair(body, GRID, 0, (name, SCENE))
+
+    def add_own(self) -> None:
+        """Links against each other, and what is carried against those that do not hold it."""
+        links = [hull.link for hull in self.hulls.hulls]
+        for one, other in self.hulls.pairs:
+            self._pair(one, BODY, other, (links[one], links[other]), eps_m=0.0)
+        if self.carried is not None:
+            for index, link in enumerate(links):
+                self._pair(len(links), BODY, index, (link, self.carried.object_id))
+
+    def _pair(
+        self, body: int, kind: int, other: int, names: Names, eps_m: float | None = None
+    ) -> None:
+        """Add one, unless it may touch: what was refused before may not."""
+        more = self.wider_m.get(frozenset(names))
+        known = names_of(names[0], self.hulls.robot.record.gripper)
+        if more is None and any(frozenset((name, names[1])) in self.allowed for name in known):
+            return
+        limit_m = (self.eps_m if eps_m is None else eps_m) + SPARE_M + (more or 0.0)
+        self.motion.add_pair(body, kind, other, limit_m)
+        self.names.append(names)
+        self.limits_m.append(limit_m)
+
+
+def _placed_spheres(
+    T: Float[np.ndarray, "4 4"], spheres_m: Float[np.ndarray, "num_spheres 4"]
+) -> Float[np.ndarray, "num_spheres 4"]:
+    return np.column_stack([se3.apply(T, spheres_m[:, :3]), spheres_m[:, 3]])
+
+
+def build_world(
+    problem: Problem,
+    *,
+    width_m: float,
+    eps_col_m: float,
+    carried: Carried | None = None,
+    allowed: Allowed = frozenset(),
+    wider_m: Mapping[frozenset[str], float] | None = None,
+) -> World:
+    """Fill a native world with an arm, what it carries and what is around it.
+
+    Args:
+        problem: Scene and robot.
+        width_m: Distance between the finger pads, all the way.
+        eps_col_m: What pairs keep that may not touch.
+        carried: What is in the hand.
+        allowed: Pairs of names that may touch; they are left to the monitor.
+        wider_m: Pairs of bodies that keep more: what a check refused before.
+    """
+    robot = problem.robot
+    hulls = hulls_of(robot)
+    chain = chain_of(hulls, width_m)
+    motion = Motion(
+        chain.placements,
+        chain.axes,
+        chain.slides,
+        robot.lower_rad,
+        robot.upper_rad,
+        chain.T_last_tcp[:3, 3],
+    )
+    obstacles = _obstacles(problem, carried)
+    lookup = _lookup(problem, hulls)
+    points = _add_bodies(problem, hulls, chain, motion, carried, lookup)
+    if lookup is not None:
+        _set_grid(motion, lookup, points)
+    motion.set_table(problem.scene.table_height_m)
+    for _, T, size in obstacles:
+        motion.add_box(T, np.asarray(size, dtype=np.float64) / 2)
+    builder = _Builder(
+        motion=motion,
+        hulls=hulls,
+        carried=carried,
+        eps_m=eps_col_m,
+        allowed=allowed,
+        wider_m=wider_m or {},
+    )
+    builder.add_standing([name for name, *_ in obstacles], has_grid=lookup is not None)
+    builder.add_own()
+    motion.prepare()
+    return World(
+        motion=motion,
+        names=builder.names,
+        robot=robot,
+        width_m=width_m,
+        carried=carried,
+        limits_m=builder.limits_m,
+    )
+
+
+Obstacle = tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+"""Its name, ``T_base_box`` and extents [m]."""
+
+
+def _obstacles(problem: Problem, carried: Carried | None) -> list[Obstacle]:
+    """Panels of what stands still, and a box for each other object."""
+    scene = problem.scene
+    found: list[Obstacle] = [
+        (name, T_base_panel, extents)
+        for name, T in scene.containers().items()
+        for T_base_panel, extents in placed_panels(scene.task.objects[name], T)
+    ]
+    found += [
+        (name, T, np.array(scene.task.objects[name].size_m))
+        for name, T in scene.movable().items()
+        if carried is None or name != carried.object_id
+    ]
+    return found
+
+
+def _lookup(problem: Problem, hulls: RobotHulls) -> GridLookup | None:
+    """Distances to what has no name in a scene."""
+    scene = problem.scene
+    if scene.static_sdf is None:
+        return None
+    _, foot = stationary_links(hulls)
+    panels = [
+        panel
+        for name, T in scene.containers().items()
+        for panel in placed_panels(scene.task.objects[name], T)
+    ]
+    grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
+    return None if grid is None else GridLookup(grid)
+
+
+@dataclass
+class _Points:
+    """Trees of points behind each other."""
+
+    points: list[Float[np.ndarray, "n 3"]] = field(default_factory=list)
+    radii: list[Float[np.ndarray, " n"]] = field(default_factory=list)
+    children: list[np.ndarray] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, tree: BoundingSphereTree, T: Float[np.ndarray, "4 4"]) -> tuple[int, int]:
+        """Put a tree behind the others; where its roots begin and end."""
+        begin = self.count
+        self.points.append(se3.apply(T, tree.points_m))
+        self.radii.append(tree.radius_m)
+        self.children.append(tree.children + begin)
+        self.count += len(tree.points_m)
+        return begin, begin + tree.num_roots
+
+
+def _add_bodies(
+    problem: Problem,
+    hulls: RobotHulls,
+    chain: Chain,
+    motion: Motion,
+    carried: Carried | None,
+    lookup: GridLookup | None,
+) -> _Points:
+    """Add the links, then what is carried."""
+    points = _Points()
+    fitted = _link_spheres(hulls)
+    trees = _link_trees(hulls) if lookup is not None else ()
+    for index, hull in enumerate(hulls.hulls):
+        T = chain.Ts_joint_hull[index]
+        roots, cover = (0, 0), 0.0
+        if trees:
+            roots, cover = points.add(trees[index], T), trees[index].cover_m
+        motion.add_body(
+            chain.joint_of[index],
+            se3.apply(T, hull.points_m),
+            _placed_spheres(T, fitted[index].spheres_m),
+            fitted[index].excess_m,
+            cover,
+            *roots,
+        )
+    if carried is not None:
+        size = problem.model(carried.object_id).size_m
+        corners = box_corners(np.array(size))
+        T = chain.T_last_tcp @ carried.T_tcp_object
+        spheres = box_spheres(tuple(size))
+        roots, cover = (0, 0), 0.0
+        if lookup is not None:
+            tree = bounding_spheres_of(corners)
+            roots, cover = points.add(tree, T), tree.cover_m
+        motion.add_body(
+            len(chain.placements),
+            se3.apply(T, corners),
+            _placed_spheres(T, spheres),
+            excess_m(corners, spheres),
+            cover,
+            *roots,
+        )
+    return points
+
+
+def _set_grid(motion: Motion, lookup: GridLookup, points: _Points) -> None:
+    motion.set_grid(
+        lookup.values_m,
+        lookup.origin_m,
+        lookup.voxel_m,
+        np.ascontiguousarray(np.concatenate(points.points)),
+        np.concatenate(points.radii),
+        np.ascontiguousarray(np.concatenate(points.children).astype(np.int32)),
+    )

@@ -1,0 +1,136 @@
+// How near the surface of a placed body comes to the zero level of a grid of distances.
+//
+// A surface is a tree of points: each has a radius within which everything below it lies, so a
+// point at distance d cannot lead to less than d - radius, and most of the tree is never looked at
+// (branch and bound; the children of the nearest point first). Plain double arithmetic in a fixed
+// order: the same bits on every run. tests/parity/test_clearance_parity.py looks at every point.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <vector>
+
+// A point of a surface with the distance found there, or a pair with its bound.
+struct Visit {
+    double distance;
+    std::int32_t index;
+};
+
+constexpr double kShare = 0.02;
+
+// Distances on a grid of voxels, which the caller keeps alive.
+class Grid {
+public:
+    Grid(const float* rows, const std::int64_t* count, const double* origin, double voxel)
+        : rows_(rows), voxel_(voxel) {
+        for (int axis = 0; axis < 3; ++axis) {
+            count_[axis] = count[axis];
+            origin_[axis] = origin[axis];
+            if (count_[axis] < 2) throw std::invalid_argument("a grid needs two voxels a side");
+        }
+    }
+
+    // Trilinear; beyond the grid as if all solid were inside of it (see GridLookup.at).
+    double at(const double* point) const {
+        std::int64_t cell[3];
+        double share[3], beyond = 0.0;
+        for (int axis = 0; axis < 3; ++axis) {
+            const double place = (point[axis] - origin_[axis]) / voxel_;
+            const double last = static_cast<double>(count_[axis] - 1);
+            // Written so that what is no number ends up inside of the grid.
+            const double held = place > 0.0 ? (place < last ? place : last) : 0.0;
+            cell[axis] = std::min(static_cast<std::int64_t>(held), count_[axis] - 2);
+            share[axis] = held - static_cast<double>(cell[axis]);
+            beyond += (place - held) * (place - held);
+        }
+        const std::int64_t step_x = count_[1] * count_[2], step_y = count_[2];
+        const float* c = rows_ + cell[0] * step_x + cell[1] * step_y + cell[2];
+        const auto along_z = [&](std::int64_t from) {
+            const double low = c[from], high = c[from + 1];
+            return low + (high - low) * share[2];
+        };
+        const auto along_y = [&](std::int64_t from) {
+            const double low = along_z(from), high = along_z(from + step_y);
+            return low + (high - low) * share[1];
+        };
+        const double low = along_y(0), high = along_y(step_x);
+        const double value = low + (high - low) * share[0];
+        if (!(beyond > 0.0)) return value;
+        const double far = std::sqrt(beyond) * voxel_;
+        return value > 0.0 ? std::sqrt(value * value + far * far) : value + far;
+    }
+
+private:
+    const float* rows_;
+    double voxel_;
+    std::int64_t count_[3];
+    double origin_[3];
+};
+
+// The surfaces of some bodies, which the caller keeps alive.
+class Search {
+public:
+    Search(const Grid& grid, const double* points, const double* radius,
+           const std::int32_t* children, std::int32_t count)
+        : grid_(grid), points_(points), radius_(radius), children_(children), count_(count) {}
+
+    // Smallest distance of the points below some roots, turned and shifted.
+    double nearest(const double* turn, const double* shift, std::int32_t begin, std::int32_t end) {
+        best_ = std::numeric_limits<double>::infinity();
+        open_.clear();
+        look(turn, shift, begin, end);
+        while (!open_.empty()) {
+            const Visit next = open_.back();
+            open_.pop_back();
+            if (!(next.distance - radius_[next.index] < certain())) continue;
+            look(turn, shift, children_[2 * next.index], children_[2 * next.index + 1]);
+        }
+        return certain();
+    }
+
+private:
+    // What the distance surely is not below; far away a little less than was found, so that a
+    // long way from everything the search ends after a few points.
+    double certain() const { return best_ > 0.0 ? best_ * (1.0 - kShare) : best_; }
+
+    void look(const double* R, const double* t, std::int32_t begin, std::int32_t end) {
+        if (begin < 0 || end > count_) throw std::out_of_range("a child is not there");
+        found_.resize(static_cast<std::size_t>(end > begin ? end - begin : 0));
+        for (std::int32_t index = begin; index < end; ++index) {
+            const double* p = points_ + 3 * static_cast<std::int64_t>(index);
+            const double placed[3] = {
+                R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + t[0],
+                R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + t[1],
+                R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + t[2],
+            };
+            found_[static_cast<std::size_t>(index - begin)] = grid_.at(placed);
+        }
+        for (const double distance : found_) best_ = std::min(best_, distance);
+        // What cannot lead to less is left out at once: sorting it would cost more than finding it.
+        const std::size_t first = open_.size();
+        const double most = certain();
+        for (std::int32_t index = begin; index < end; ++index) {
+            const double distance = found_[static_cast<std::size_t>(index - begin)];
+            if (children_[2 * index] < children_[2 * index + 1] && distance - radius_[index] < most)
+                open_.push_back({distance, index});
+        }
+        // The nearest last: it is looked into next, and soonest makes the others needless.
+        std::sort(open_.begin() + static_cast<std::ptrdiff_t>(first), open_.end(),
+                  [](const Visit& a, const Visit& b) {
+                      return a.distance != b.distance ? a.distance > b.distance
+                                                      : a.index > b.index;
+                  });
+    }
+
+    const Grid& grid_;
+    const double* points_;
+    const double* radius_;
+    const std::int32_t* children_;
+    std::int32_t count_;
+    double best_ = 0.0;
+    std::vector<Visit> open_;
+    std::vector<double> found_;
+};
