@@ -8,6 +8,7 @@ follows from the seed; work is counted, never timed.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -38,8 +39,8 @@ _STRAIGHT_M, _STRAIGHT_RAD = 0.005, 0.05
 _JUMP = 6.0
 """A joint that moves more than so many times the median of its steps leaves its branch."""
 _LEAST_JUMP_RAD = 0.2
-_KNOTS = ((1.0, True), (0.25, True), (1.0, False))
-"""Tried one after the other: share of the spacing, and whether corners are rounded."""
+_OTHERWISE = ((0.25, True), (1.0, False))
+"""Where chords are not free: share of the spacing, and whether corners are still rounded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,12 +288,20 @@ def timed_path(
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
     wanted = [value for value in (limit_m_s, tool_m_s) if value]
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
-    for step_s, rounding in _KNOTS:
-        times, joints, corners, rounded, *_ = world.motion.time(
-            rows, speed, acceleration, min(wanted, default=0.0), config.step_s * step_s, rounding
+    tool = min(wanted, default=0.0)
+
+    def law(share: float, *, rounding: bool) -> tuple[Any, ...]:
+        step_s = share * config.step_s
+        found: tuple[Any, ...] = world.motion.time(
+            rows, speed, acceleration, tool, step_s, rounding
         )
+        return found
+
+    times, joints, corners, rounded, *_ = law(1.0, rounding=True)
+    for share, rounding in _OTHERWISE:
         if world.motion.blocked(joints) < 0:
             break
+        times, joints, corners, rounded, *_ = law(share, rounding=rounding)
     length = float(np.linalg.norm(np.diff(joints, axis=0), axis=1).sum())
     return TimedPath(
         times_s=times,

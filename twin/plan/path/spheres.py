@@ -50,7 +50,7 @@ def covering_spheres(
         Centre and radius of each [m].
     """
     heap = [_part(corners_m, 0)]
-    done = []
+    done: list[_Part] = []
     number = 1
     while heap and len(heap) + len(done) < count:
         worst = heapq.heappop(heap)

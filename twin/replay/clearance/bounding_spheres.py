@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import ConvexHull, cKDTree
 
-from twin.replay._clearance import nearest
+from twin.replay._clearance import least, nearest
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.robot.collision import RobotHulls
 
@@ -85,6 +85,36 @@ class BoundingSpheres:
             answers,
         )
         return np.asarray(answers - self._cover)
+
+    def least_m(
+        self,
+        lookup: GridLookup,
+        R: Float[np.ndarray, "num_pieces 3 3"],
+        t: Float[np.ndarray, "num_pieces 3"],
+        below_m: float,
+    ) -> float:
+        """Return the smallest of ``distances_m``, or a number where none is below it [m].
+
+        Args:
+            lookup: The grid of distances to what stands still.
+            R: Rotation of each piece's link in the grid's frame.
+            t: Origin of each piece's link in the grid's frame [m].
+            below_m: The number; the smaller it is, the less is looked at.
+        """
+        found: float = least(
+            lookup.values_m,
+            lookup.origin_m,
+            lookup.voxel_m,
+            R,
+            t,
+            self._points,
+            self._radius,
+            self._children,
+            self._roots,
+            self._cover,
+            below_m,
+        )
+        return found
 
 
 def bounding_spheres_of(

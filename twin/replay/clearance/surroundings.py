@@ -99,6 +99,7 @@ class Surroundings:
             self.lookup = None if grid is None else GridLookup(grid)
         self._link_spheres: BoundingSpheres | None = None
         self._object_spheres: dict[str, BoundingSpheres] = {}
+        self._spheres_without: dict[frozenset[str], tuple[BoundingSpheres, list[int]]] = {}
         if self.lookup is not None:
             self._link_spheres = robot_bounding_spheres(hulls, stationary)
             self._object_spheres = {
@@ -157,6 +158,49 @@ class Surroundings:
             if distance < best and counts(pair[0], pair[2]):
                 best = distance
         return found, np.inf
+
+    def least_m(self, left_out: frozenset[str]) -> float:
+        """Return the smallest distance of placed links to what stands still [m].
+
+        The same as the smallest of ``measure``, without the other distances.
+
+        Args:
+            left_out: Links that are not asked about.
+        """
+        pairing = self._pairing((), ())
+        links, near = self._hulls, pairing.near
+        num_links = len(self.links)
+        near.R[:num_links], near.t[:num_links] = links.rotations, links.translations
+        best = np.inf
+        for bound, number in near.nearest_first():
+            if bound > best:
+                break
+            if pairing.names[number][0] in left_out:
+                continue
+            one, other = pairing.bodies[number]
+            best = min(
+                best,
+                signed_distance(
+                    pairing.shapes[one],
+                    links.placement(one),
+                    pairing.shapes[other],
+                    pairing.placements[other],
+                ),
+            )
+        if self.lookup is None:
+            return best
+        spheres, asked = self._asked(left_out)
+        return spheres.least_m(self.lookup, links.rotations[asked], links.translations[asked], best)
+
+    def _asked(self, left_out: frozenset[str]) -> tuple[BoundingSpheres, list[int]]:
+        """The bounding spheres of the links that move, but for some; and which links these are."""
+        found = self._spheres_without.get(left_out)
+        if found is None:
+            asked = [index for index in self._mobile if self.links[index].body not in left_out]
+            others = {link.body for link in self.links} - {self.links[i].body for i in asked}
+            found = robot_bounding_spheres(self._hulls, frozenset(others)), asked
+            self._spheres_without[left_out] = found
+        return found
 
     def _pairing(self, known: tuple[str, ...], moved: tuple[str, ...]) -> _Pairing:
         """Links and moved objects against what stands, then links against objects."""
@@ -271,6 +315,7 @@ def posture_clearance(
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links, gripper = own_links(hulls), hulls.robot.record.gripper
+    hand = frozenset(gripper.links)
 
     def margin_m(
         joints_rad: Float[np.ndarray, "num_postures num_joints"],
@@ -281,13 +326,6 @@ def posture_clearance(
         hulls.place(joints_rad, gripper.max_width_m)
         if links.touch():
             return hulls.self_distance().distance_m
-        distances, _ = around.measure(
-            {},
-            [],
-            near_m=config.eps_col_m,
-            counts=lambda body, other: body not in gripper.links,
-        )
-        arm = [d for (body, *_), d in distances.items() if body not in gripper.links]
-        return min(arm, default=np.inf) - config.eps_col_m
+        return around.least_m(hand) - config.eps_col_m
 
     return margin_m

@@ -21,6 +21,34 @@ void nearest(const Values& values, const Vector& origin, double voxel, const Tur
                                               roots.data()[2 * body], roots.data()[2 * body + 1]);
 }
 
+// The smallest of the answers of `nearest` less each body's cover, or `below` where none is smaller.
+// The same bits as from all answers, though most bodies are hardly looked at.
+double least(const Values& values, const Vector& origin, double voxel, const Turns& R,
+             const Points& t, const Points& points, const Vector& radius, const Ranges& children,
+             const Ranges& roots, const Vector& cover, double below) {
+    const std::size_t num_bodies = roots.shape(0);
+    if (origin.shape(0) != 3 || R.shape(0) != num_bodies || t.shape(0) != num_bodies ||
+        cover.shape(0) != num_bodies)
+        throw std::invalid_argument("poses, bodies and covers differ in number");
+    if (radius.shape(0) != points.shape(0) || children.shape(0) != points.shape(0))
+        throw std::invalid_argument("points, radii and children differ in number");
+    const Grid grid = grid_of(values, origin, voxel);
+    Search search(grid, points.data(), radius.data(), children.data(),
+                  static_cast<std::int32_t>(points.shape(0)));
+    constexpr double kLeast = (1.0 - kShare) * (1.0 - kShare);
+    // The last ones first: the hand is nearer to things than the shoulder.
+    for (std::size_t body = num_bodies; body-- > 0;) {
+        const double *turn = R.data() + 9 * body, *shift = t.data() + 3 * body;
+        const std::int32_t begin = roots.data()[2 * body], end = roots.data()[2 * body + 1];
+        // An answer is less than what was found by at most a share: twice that is left open.
+        const double limit = below + cover.data()[body];
+        const double stop = limit > 0.0 ? limit / kLeast : limit;
+        if (search.nearest(turn, shift, begin, end, stop) > stop) continue;
+        below = std::min(below, search.nearest(turn, shift, begin, end) - cover.data()[body]);
+    }
+    return below;
+}
+
 }  // namespace
 
 NB_MODULE(_clearance, module) {
@@ -46,4 +74,7 @@ NB_MODULE(_clearance, module) {
     module.def("points_to_boxes", &points_to_boxes, "turns"_a, "centres"_a, "halves"_a, "keep"_a,
                "most"_a, "R"_a, "t"_a, "points"_a, "answers"_a.noconvert(),
                "Lower answers, none above most, to each point's distance to the boxes less keep.");
+    module.def("least", &least, "values"_a, "origin"_a, "voxel"_a, "R"_a, "t"_a, "points"_a,
+               "radius"_a, "children"_a, "roots"_a, "cover"_a, "below"_a,
+               "The smallest of them less the covers, if it is below a number.");
 }
