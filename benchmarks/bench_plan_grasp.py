@@ -3,8 +3,9 @@
 Each object is scanned once in the stand-in cell (seed of the development range, Gaussians not
 fitted) and reconstructed as ``rebuild`` does it. Then starts are drawn in as many laboratories,
 localised in the cells' own images, and the first grasp is driven: straight down, closed, lifted by
-10 cm; it counts when the object's middle truly rose by 4 cm (a soft toy held by its head sags). Reference in the same run: the task's own point
-(``grasp_m``, closing along the object's y axis, from above), driven alike.
+10 cm; it counts when the object's middle truly rose by 4 cm (a soft toy held by its head sags).
+Reference in the same run: the task's own point (``grasp_m``, closing along the object's y axis,
+from above), driven alike.
 
 Rank: the object is believed to be where it is not, by 9 mm and 8 degrees, the covariance says so,
 and grasps from all over the ranking are driven. Kendall's tau-b between margin and lifting, and the
