@@ -1,7 +1,7 @@
 """How many standard deviations of an object's pose a grasp bears.
 
-Each way in which a grasp can miss has a slack: how far the object may be from where it is believed
-to be. It is compared with the standard deviation of the pose along that way, which the covariance
+Each way in which a grasp can miss has a slack: how far the object may be from where it was
+localised. It is compared with the standard deviation of the pose along that way, which the covariance
 of the localisation gives, widened by what the robot and the surface are off. The chances of missing
 are added up, and their sum is told as the standard deviations of one normal variable.
 """
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from twin.plan.grasp.open_hand import OpenHand
-from twin.plan.grasp.pairs import Surface
+from twin.plan.grasp.pairs import SampledSurface
 
 SHIFTS_M = (0.002, 0.004, 0.006, 0.009, 0.012, 0.016, 0.020, 0.025, 0.030)
 """How far a closing line is shifted over the surface to see where the pads lose it."""
@@ -59,7 +59,7 @@ class Doubt:
 
 
 def reaches_along(
-    surface: Surface,
+    surface: SampledSurface,
     lines: Lines,
     axis: int,
     sign: float,
@@ -98,7 +98,7 @@ def _first_lost(good: Bool[np.ndarray, "num_grasps num_shifts"]) -> Float[np.nda
 
 
 def slacks(
-    surface: Surface,
+    surface: SampledSurface,
     lines: Lines,
     hand: OpenHand,
     points_m: Float[np.ndarray, "num_grasps num_points 3"],
@@ -150,7 +150,7 @@ def margins(
     Args:
         slack: From ``slacks``.
         lines: The grasps.
-        T_base_object: Where the object is believed to be.
+        T_base_object: Where the object was localised.
         doubt: How sure that is.
     """
     R = T_base_object[:3, :3] @ lines.Ts_object_tcp[:, :3, :3]

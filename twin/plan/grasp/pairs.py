@@ -28,7 +28,7 @@ _LEAST_M = 0.004
 """Thinner things are not taken between two pads: the mesh is not that exact."""
 
 
-class Surface:
+class SampledSurface:
     """One object's surface, asked by rays; made once per shape."""
 
     def __init__(self, shape: Shape) -> None:
@@ -128,7 +128,7 @@ class Pairs:
 
 
 def antipodal_pairs(
-    surface: Surface,
+    surface: SampledSurface,
     *,
     count: int,
     cone_rad: float,
@@ -169,7 +169,7 @@ def antipodal_pairs(
 
 
 def _hinted(
-    surface: Surface, hint_m: Float[np.ndarray, "3"]
+    surface: SampledSurface, hint_m: Float[np.ndarray, "3"]
 ) -> tuple[
     Float[np.ndarray, "num_rays 3"],
     Float[np.ndarray, "num_rays 3"],
@@ -184,7 +184,7 @@ def _hinted(
 
 
 def pairs_along(
-    surface: Surface,
+    surface: SampledSurface,
     points_m: Float[np.ndarray, "num_rays 3"],
     normals: Float[np.ndarray, "num_rays 3"],
     directions: Float[np.ndarray, "num_rays 3"],

@@ -19,7 +19,7 @@ from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
 from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
-from twin.plan.grasp.pairs import Pairs, Surface, antipodal_pairs, thinned
+from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
 from twin.plan.grasp.reach import ArmReach, Reached
 from twin.plan.problem import Grasp, Problem
 from twin.replay.config import VariationConfig
@@ -202,7 +202,7 @@ class GraspSearcher:
             )
         self.max_width_m = robot.record.gripper.max_width_m
         self._reach = ArmReach(problem)
-        self._surfaces: dict[str, Surface] = {}
+        self._surfaces: dict[str, SampledSurface] = {}
 
     def search(
         self, object_id: str, part_points_m: Float[np.ndarray, "num_points 3"] | None = None
@@ -323,9 +323,9 @@ class GraspSearcher:
         sigma = [prior.unknown_pose_m] * 3 + [prior.unknown_pose_rad] * 3
         return np.diag(np.square(sigma))
 
-    def _surface(self, object_id: str) -> Surface:
+    def _surface(self, object_id: str) -> SampledSurface:
         if object_id not in self._surfaces:
-            self._surfaces[object_id] = Surface(self.problem.shapes[object_id])
+            self._surfaces[object_id] = SampledSurface(self.problem.shapes[object_id])
         return self._surfaces[object_id]
 
     def _pairs(

@@ -6,7 +6,7 @@ from scipy.stats import norm
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel
 from twin.plan.grasp.margin import SHIFTS_M, WAYS, Doubt, Lines, margins, reaches_along
-from twin.plan.grasp.pairs import Surface
+from twin.plan.grasp.pairs import SampledSurface
 from twin.plan.problem import Shape
 from twin.scene.objects.decompose import shape_mesh
 
@@ -14,10 +14,10 @@ SIZE = (0.06, 0.03, 0.04)
 FAR = 1.0
 
 
-def surface() -> Surface:
+def surface() -> SampledSurface:
     model = ObjectModel(id="it", shape="box", size_m=SIZE, color_srgb=(0, 0, 0))
     vertices, triangles = shape_mesh(model)
-    return Surface(Shape(vertices_m=vertices, triangles=triangles, source="test"))
+    return SampledSurface(Shape(vertices_m=vertices, triangles=triangles, source="test"))
 
 
 def line_at(x_m: float, z_m: float) -> Lines:

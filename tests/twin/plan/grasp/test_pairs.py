@@ -5,7 +5,7 @@ import pytest
 
 from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.task_file import ObjectModel
-from twin.plan.grasp.pairs import Surface, antipodal_pairs, pairs_along, thinned
+from twin.plan.grasp.pairs import SampledSurface, antipodal_pairs, pairs_along, thinned
 from twin.plan.problem import Shape
 from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.reconstruct import shape_of_mesh
@@ -28,7 +28,7 @@ def scanned_duck() -> Shape:
 
 
 def test_straight_through_a_box_is_as_long_as_its_side() -> None:
-    surface = Surface(box())
+    surface = SampledSurface(box())
     points, normals = surface.samples(200, 0)
     pairs = pairs_along(surface, points, normals, -normals)
     along = np.abs(pairs.axes).argmax(axis=1)
@@ -41,7 +41,7 @@ def test_straight_through_a_box_is_as_long_as_its_side() -> None:
 
 def test_both_ends_of_all_pairs_lie_on_the_surface() -> None:
     pairs = antipodal_pairs(
-        Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=(0.0, 0.0, 0.0), seed=1
+        SampledSurface(box()), count=300, cone_rad=CONE_RAD, hint_m=(0.0, 0.0, 0.0), seed=1
     )
     half = np.array(SIZE) / 2
     for end in (pairs.first_m, pairs.first_m + pairs.axes * pairs.widths_m[:, None]):
@@ -51,7 +51,9 @@ def test_both_ends_of_all_pairs_lie_on_the_surface() -> None:
 
 
 def test_a_line_within_both_cones_crosses_a_box_between_facing_sides_only() -> None:
-    pairs = antipodal_pairs(Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=2)
+    pairs = antipodal_pairs(
+        SampledSurface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=2
+    )
     holds = pairs.chosen(pairs.cosines >= np.cos(CONE_RAD))
     # the shortest way between facing sides, lengthened by the tilt at most
     along = np.abs(holds.axes).argmax(axis=1)
@@ -63,14 +65,14 @@ def test_a_line_within_both_cones_crosses_a_box_between_facing_sides_only() -> N
 
 def test_the_hinted_line_is_among_the_pairs() -> None:
     hint = (0.013, 0.0, 0.004)
-    pairs = antipodal_pairs(Surface(box()), count=1, cone_rad=CONE_RAD, hint_m=hint, seed=3)
+    pairs = antipodal_pairs(SampledSurface(box()), count=1, cone_rad=CONE_RAD, hint_m=hint, seed=3)
     away = np.linalg.norm(pairs.middles_m - hint, axis=1) + np.abs(np.abs(pairs.axes[:, 1]) - 1)
     assert away.min() < 1e-5
 
 
 @pytest.mark.parametrize("hint", [(0.2, 0.0, 0.0), (0.0, 0.0, -0.3)])
 def test_a_hint_beside_the_object_adds_nothing(hint: tuple[float, float, float]) -> None:
-    surface = Surface(box())
+    surface = SampledSurface(box())
     with_hint, without = (
         antipodal_pairs(surface, count=20, cone_rad=CONE_RAD, hint_m=h, seed=3)
         for h in (hint, None)
@@ -80,8 +82,8 @@ def test_a_hint_beside_the_object_adds_nothing(hint: tuple[float, float, float])
 
 def test_normals_of_a_scan_are_those_of_the_thing() -> None:
     shape = scanned_duck()
-    points, rough = Surface(Shape(**{**vars(shape), "error_m": 0.0})).samples(400, 0)
-    _, averaged = Surface(shape).samples(400, 0)
+    points, rough = SampledSurface(Shape(**{**vars(shape), "error_m": 0.0})).samples(400, 0)
+    _, averaged = SampledSurface(shape).samples(400, 0)
     toy = toy_mesh("duck", (0.07, 0.05, 0.06))
     step = 1e-4
     gradient = np.stack(
@@ -94,7 +96,9 @@ def test_normals_of_a_scan_are_those_of_the_thing() -> None:
 
 
 def test_thinning_keeps_one_of_what_is_alike() -> None:
-    pairs = antipodal_pairs(Surface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=4)
+    pairs = antipodal_pairs(
+        SampledSurface(box()), count=300, cone_rad=CONE_RAD, hint_m=None, seed=4
+    )
     twice = pairs.chosen(np.tile(np.arange(len(pairs.widths_m)), 2))
     once = thinned(pairs, cell_m=0.006, cell_rad=0.2)
     assert len(thinned(twice, cell_m=0.006, cell_rad=0.2)) == len(once) < len(pairs.widths_m)
