@@ -1,9 +1,9 @@
 """How many standard deviations of an object's pose a grasp bears.
 
 Each way in which a grasp can miss has a slack: how far the object may be from where it was
-localised. It is compared with the standard deviation of the pose along that way, which the covariance
-of the localisation gives, widened by what the robot and the surface are off. The chances of missing
-are added up, and their sum is told as the standard deviations of one normal variable.
+localised. It is compared with the standard deviation of the pose along that way, which the
+covariance of the localisation gives, widened by what the robot and the surface are off. The chances
+of missing are added up, and their sum is told as the standard deviations of one normal variable.
 """
 
 from dataclasses import dataclass
