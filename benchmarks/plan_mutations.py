@@ -237,8 +237,11 @@ def swapped_objects(plan: Record, rng: Rng, solve: Solver) -> Record:
     if rng.random() < 0.7:
         half = 0.5 * plan["tau"][-1]["t_ns"]
         early = [w for w in plan["tau"] if w["t_ns"] < half]
+        later = [w for w in plan["tau"] if w["t_ns"] >= half]
+        if not early or not later:  # another family has broken the times
+            return plan
         low = min(early, key=lambda w: w["p_m"][2])["p_m"]
-        late = min((w for w in plan["tau"] if w["t_ns"] >= half), key=lambda w: w["p_m"][2])["p_m"]
+        late = min(later, key=lambda w: w["p_m"][2])["p_m"]
         shift = np.array(late) - np.array(low)
         shift[2] = -float(rng.uniform(0.0, 0.03))
         for w in early:
