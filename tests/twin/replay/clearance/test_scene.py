@@ -391,9 +391,13 @@ def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
     gripper = hulls.robot.record.gripper.links
     around, links = Surroundings(scene, hulls, config.eps_col_m), own_links(hulls)
     margin_m = posture_clearance(scene, hulls, config)
+    capped_m = posture_clearance(scene, hulls, config, up_to_m=0.03)
+    sign = posture_clearance(scene, hulls, config, up_to_m=0.0)
     inside = outside = 0
     for joints in hulls.robot.home_rad + rng.uniform(-0.9, 0.9, (80, 6)):
         found = float(margin_m(joints[None])[0])
+        assert (float(sign(joints[None])[0]) < 0) == (found < 0)
+        assert float(capped_m(joints[None])[0]) == pytest.approx(min(found, 0.03), abs=1e-12)
         hulls.place(joints, hulls.robot.record.gripper.max_width_m)
         if links.touch():
             continue
