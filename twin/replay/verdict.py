@@ -199,7 +199,7 @@ def replay_plan(
         UnusablePlanError: When the plan has no usable waypoints.
     """
     robot = load_robot(scene.urdf)
-    free = posture_clearance(scene, hulls_of(robot), config)
+    free = posture_clearance(scene, hulls_of(robot), config, up_to_m=0.0)
     path, failures, unreachable_ns = path_of_plan(
         plan, robot, config, clearance=free, start_rad=scene.start_rad
     )

@@ -55,6 +55,15 @@ class BoundingSpheres:
         ends = starts[:-1] + [tree.num_roots for tree in trees]
         self._roots = np.stack([starts[:-1], ends], axis=1).astype(np.int32)
         self._cover = np.array([tree.cover_m for tree in trees])
+        middles = [(tree.points_m.min(axis=0) + tree.points_m.max(axis=0)) / 2 for tree in trees]
+        self._centres = np.stack(middles)
+        # How much less than at its middle a distance may be anywhere on a piece.
+        self._reaches = np.array(
+            [
+                SLOPE * np.linalg.norm(tree.points_m - middle, axis=1).max() + tree.cover_m
+                for tree, middle in zip(trees, middles, strict=True)
+            ]
+        )
 
     def distances_m(
         self,
@@ -112,6 +121,8 @@ class BoundingSpheres:
             self._children,
             self._roots,
             self._cover,
+            self._centres,
+            self._reaches,
             below_m,
         )
         return found

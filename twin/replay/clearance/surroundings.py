@@ -159,19 +159,20 @@ class Surroundings:
                 best = distance
         return found, np.inf
 
-    def least_m(self, left_out: frozenset[str]) -> float:
+    def least_m(self, left_out: frozenset[str], below_m: float = np.inf) -> float:
         """Return the smallest distance of placed links to what stands still [m].
 
         The same as the smallest of ``measure``, without the other distances.
 
         Args:
             left_out: Links that are not asked about.
+            below_m: Returned where no distance is smaller.
         """
         pairing = self._pairing((), ())
         links, near = self._hulls, pairing.near
         num_links = len(self.links)
         near.R[:num_links], near.t[:num_links] = links.rotations, links.translations
-        best = np.inf
+        best = below_m
         for bound, number in near.nearest_first():
             if bound > best:
                 break
@@ -301,7 +302,7 @@ def _box_spheres(size_m: tuple[float, float, float]) -> BoundingSpheres:
 
 
 def posture_clearance(
-    scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig
+    scene: ReplayScene, hulls: RobotHulls, config: ReplayConfig, *, up_to_m: float = np.inf
 ) -> Callable[[Float[np.ndarray, "num_postures num_joints"]], Float[np.ndarray, " num_postures"]]:
     """Return a function that says how far postures stay from contact: negative when links touch.
 
@@ -312,6 +313,8 @@ def posture_clearance(
         scene: Table, containers and distances to the rest.
         hulls: The robot's convex pieces; the function moves them.
         config: Its ``eps_col_m`` is taken off.
+        up_to_m: What is farther from contact than this is said to be so far from it; 0 is enough
+            for whoever asks for the sign, and takes a fraction of the time.
     """
     around = Surroundings(scene, hulls, config.eps_col_m)
     links, gripper = own_links(hulls), hulls.robot.record.gripper
@@ -326,6 +329,6 @@ def posture_clearance(
         hulls.place(joints_rad, gripper.max_width_m)
         if links.touch():
             return hulls.self_distance().distance_m
-        return around.least_m(hand) - config.eps_col_m
+        return around.least_m(hand, config.eps_col_m + up_to_m) - config.eps_col_m
 
     return margin_m

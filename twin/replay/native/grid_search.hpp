@@ -13,6 +13,8 @@
 #include <stdexcept>
 #include <vector>
 
+#include "lookup.hpp"
+
 // A point of a surface with the distance found there, or a pair with its bound.
 struct Visit {
     double distance;
@@ -20,54 +22,44 @@ struct Visit {
 };
 
 constexpr double kShare = 0.02;
+constexpr std::int64_t kMostCells = std::numeric_limits<std::int32_t>::max();
 
 // Distances on a grid of voxels, which the caller keeps alive.
 class Grid {
 public:
-    Grid(const float* rows, const std::int64_t* count, const double* origin, double voxel)
-        : rows_(rows), voxel_(voxel) {
+    Grid(const float* rows, const std::int64_t* count, const double* origin, double voxel) {
+        view_.rows = rows;
+        view_.voxel = voxel;
+        std::int64_t cells = 1;
         for (int axis = 0; axis < 3; ++axis) {
-            count_[axis] = count[axis];
-            origin_[axis] = origin[axis];
-            if (count_[axis] < 2) throw std::invalid_argument("a grid needs two voxels a side");
+            view_.origin[axis] = origin[axis];
+            if (count[axis] < 2) throw std::invalid_argument("a grid needs two voxels a side");
+            if (count[axis] > kMostCells / cells)
+                throw std::invalid_argument("a grid has at most two billion voxels");
+            cells *= count[axis];
+            view_.count[axis] = static_cast<std::int32_t>(count[axis]);
         }
     }
 
     // Trilinear; beyond the grid as if all solid were inside of it (see GridLookup.at).
     double at(const double* point) const {
-        std::int64_t cell[3];
-        double share[3], beyond = 0.0;
-        for (int axis = 0; axis < 3; ++axis) {
-            const double place = (point[axis] - origin_[axis]) / voxel_;
-            const double last = static_cast<double>(count_[axis] - 1);
-            // Written so that what is no number ends up inside of the grid.
-            const double held = place > 0.0 ? (place < last ? place : last) : 0.0;
-            cell[axis] = std::min(static_cast<std::int64_t>(held), count_[axis] - 2);
-            share[axis] = held - static_cast<double>(cell[axis]);
-            beyond += (place - held) * (place - held);
-        }
-        const std::int64_t step_x = count_[1] * count_[2], step_y = count_[2];
-        const float* c = rows_ + cell[0] * step_x + cell[1] * step_y + cell[2];
-        const auto along_z = [&](std::int64_t from) {
-            const double low = c[from], high = c[from + 1];
-            return low + (high - low) * share[2];
-        };
-        const auto along_y = [&](std::int64_t from) {
-            const double low = along_z(from), high = along_z(from + step_y);
-            return low + (high - low) * share[1];
-        };
-        const double low = along_y(0), high = along_y(step_x);
-        const double value = low + (high - low) * share[0];
-        if (!(beyond > 0.0)) return value;
-        const double far = std::sqrt(beyond) * voxel_;
-        return value > 0.0 ? std::sqrt(value * value + far * far) : value + far;
+        constexpr double kUnturned[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, kHere[3] = {0, 0, 0};
+        double distance = 0.0;
+        lookup_(view_, kUnturned, kHere, point, 1, &distance);
+        return distance;
+    }
+
+    // The same of many points that are turned and shifted.
+    void at_all(const double* R, const double* t, const double* points, std::int32_t count,
+                double* distances) const {
+        for (std::int32_t begin = 0; begin < count; begin += kBatch)
+            lookup_(view_, R, t, points + 3 * static_cast<std::ptrdiff_t>(begin),
+                    std::min<std::int32_t>(kBatch, count - begin), distances + begin);
     }
 
 private:
-    const float* rows_;
-    double voxel_;
-    std::int64_t count_[3];
-    double origin_[3];
+    GridView view_{};
+    Lookup lookup_ = lookup();
 };
 
 // The surfaces of some bodies, which the caller keeps alive.
@@ -102,15 +94,7 @@ private:
     void look(const double* R, const double* t, std::int32_t begin, std::int32_t end) {
         if (begin < 0 || end > count_) throw std::out_of_range("a child is not there");
         found_.resize(static_cast<std::size_t>(end > begin ? end - begin : 0));
-        for (std::int32_t index = begin; index < end; ++index) {
-            const double* p = points_ + 3 * static_cast<std::int64_t>(index);
-            const double placed[3] = {
-                R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + t[0],
-                R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + t[1],
-                R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + t[2],
-            };
-            found_[static_cast<std::size_t>(index - begin)] = grid_.at(placed);
-        }
+        grid_.at_all(R, t, points_ + 3 * static_cast<std::ptrdiff_t>(begin), end - begin, found_.data());
         for (const double distance : found_) best_ = std::min(best_, distance);
         // What cannot lead to less is left out at once: sorting it would cost more than finding it.
         const std::size_t first = open_.size();

@@ -1,17 +1,26 @@
 """What the native world says against pinocchio, coal and hulls looked at point by point."""
 
 from collections import defaultdict
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from path_scene import EPS_M, WIDTH_M, Pairs, at, problem_of_test
+from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, problem_of_test, tool_down
 from twin.plan.path._motion import Motion
 
 from bridge.robots.robot import read_robot
+from bridge.task.plan import Plan
 from twin.plan.path.spheres import box_spheres, covering_spheres
 from twin.plan.path.world import BOX, Carried, build_world
+from twin.plan.problem import Problem
+from twin.replay.clearance.bodies import SCENE
+from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import Surroundings
+from twin.replay.config import ReplayConfig
 from twin.robot.collision import RobotHulls, hulls_of
+from twin.scene.shape.sdf import SdfGrid, distances_of_solid
+from twin.scene.shape.static import StaticSdf
 
 ROBOTS = (
     "ur5_parallel_gripper",
@@ -152,3 +161,58 @@ def test_what_is_carried_is_kept_away_from_what_stands_and_from_the_arm(pairs: P
     assert ("forearm_link", "cube") in names
     assert not {pair for pair in names if "finger" in pair[0] or "gripper" in pair[0]}
     assert ("gripper_base", "cube") in empty.names  # it stands on the table, and is not allowed
+
+
+def test_what_only_a_scenes_grid_shows_is_kept_away_from(pairs: Pairs) -> None:
+    """Distances are those of the clearance, and a post without a name is gone around."""
+    voxel_m = 0.01
+    solid = np.zeros((60, 70, 60), dtype=bool)
+    solid[30:36, 30:36, :30] = True  # from (0.4, -0.2) on, six centimetres wide
+    grid = SdfGrid(
+        values_m=distances_of_solid(solid, voxel_m), origin_m=np.array([0.1, -0.5, -0.01]),
+        voxel_m=voxel_m, closed=False,
+    )  # fmt: skip
+    static = StaticSdf(
+        conservative=grid, observed=grid, state=solid.astype(np.uint8), truncation_m=0.03,
+        table_z_m=0.0,
+    )  # fmt: skip
+    problem = replace(pairs.problem, scene=replace(pairs.problem.scene, static_sdf=static))
+    world = build_world(problem, width_m=WIDTH_M, eps_col_m=EPS_M)
+    hulls = hulls_of(problem.robot)
+    surroundings = Surroundings(problem.scene, hulls, EPS_M)
+    pairs_of_grid = {names[0]: i for i, names in enumerate(world.names) if names[1] == SCENE}
+    assert len(pairs_of_grid) > 5
+    rng = np.random.default_rng(5)
+    near = 0
+    for joints in problem.robot.home_rad + rng.uniform(-0.7, 0.7, (25, 6)):
+        hulls.place(joints, WIDTH_M)
+        measured, _ = surroundings.measure({}, [], near_m=9.0, counts=lambda a, b: True)
+        for (body, _, other, _), distance in measured.items():
+            if other == SCENE:
+                least, _, bound = world.motion.distance(joints, pairs_of_grid[body])
+                assert least == pytest.approx(distance, rel=0.021, abs=1e-6)
+                assert bound <= least + 0.021 * abs(least) + 1e-6
+                near += distance < 0.2
+    assert near > 10
+    start = joints_at(problem, tool_down(0.43, -0.32, 0.12, 0.0), None)
+    goal = joints_at(problem, tool_down(0.43, -0.05, 0.14, np.pi / 2), start)
+    assert start is not None
+    assert goal is not None
+    assert world.motion.blocked(np.stack([start, goal])) == 0
+    outcome, _, _, knots, _ = world.motion.find(start, goal[None], 0, 1.0, 5000, 150_000, 60)
+    assert outcome == 0
+    monitor = ClearanceMonitor(problem.scene, empty_plan(problem), hulls, ReplayConfig())
+    for index, joints in enumerate(dense(knots)):
+        assert monitor.measure(index, joints, WIDTH_M, {}) >= EPS_M
+
+
+def empty_plan(problem: Problem) -> Plan:
+    return Plan(
+        id="p", planner="", policy="", condition="", robot=problem.robot.name, frame="base_link",
+        instruction="", stages=(), tau=(),
+    )  # fmt: skip
+
+
+def dense(knots: np.ndarray) -> np.ndarray:
+    shares = np.linspace(0, 1, 12)[:, None]
+    return np.concatenate([a + shares * (b - a) for a, b in pairwise(knots)])

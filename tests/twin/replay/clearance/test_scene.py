@@ -10,11 +10,12 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, planes_of
+from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of
 from twin.replay.clearance.distance_grid import GridLookup, candidate_clearance
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
+from twin.replay.clearance.surroundings import Surroundings, posture_clearance
 from twin.replay.config import ReplayConfig
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.scene import ReplayScene
@@ -378,3 +379,31 @@ def test_a_pose_bias_moves_what_was_seen_of_a_container_with_the_container() -> 
     assert unmodelled_obstacles(static, 0.0, None, [(moved, extents)]) is not None
     assert unmodelled_obstacles(correction.static(static), 0.0, None, [(moved, extents)]) is None
     assert unmodelled_obstacles(static, 0.0, None, [(seen, extents)]) is None
+
+
+def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(
+    script: SimpleNamespace, hulls: RobotHulls
+) -> None:
+    """To the last bit, though most links are hardly looked at."""
+    config, rng = ReplayConfig(), np.random.default_rng(4)
+    post: Box = ((0.45, -0.25, 0.3), (0.06, 0.06, 0.6))
+    scene = replace(script.scene(), static_sdf=static_of(POST, post))
+    gripper = hulls.robot.record.gripper.links
+    around, links = Surroundings(scene, hulls, config.eps_col_m), own_links(hulls)
+    margin_m = posture_clearance(scene, hulls, config)
+    capped_m = posture_clearance(scene, hulls, config, up_to_m=0.03)
+    sign = posture_clearance(scene, hulls, config, up_to_m=0.0)
+    inside = outside = 0
+    for joints in hulls.robot.home_rad + rng.uniform(-0.9, 0.9, (80, 6)):
+        found = float(margin_m(joints[None])[0])
+        assert (float(sign(joints[None])[0]) < 0) == (found < 0)
+        assert float(capped_m(joints[None])[0]) == pytest.approx(min(found, 0.03), abs=1e-12)
+        hulls.place(joints, hulls.robot.record.gripper.max_width_m)
+        if links.touch():
+            continue
+        distances, _ = around.measure({}, [], near_m=9.0, counts=lambda body, other: True)
+        arm = [d for (body, *_), d in distances.items() if body not in gripper]
+        assert found == min(arm) - config.eps_col_m
+        inside, outside = inside + (min(arm) < 0), outside + (min(arm) > 0.02)
+    assert inside > 3
+    assert outside > 10

@@ -1,13 +1,13 @@
 #include "kernels.hpp"
 
-namespace base {
+namespace motion::base {
 extern const Kernels table;
 }
 #ifdef MOTION_HAS_X86
-namespace v3 {
+namespace motion::v3 {
 extern const Kernels table;
 }
-namespace v4 {
+namespace motion::v4 {
 extern const Kernels table;
 }
 #endif
@@ -17,8 +17,8 @@ const Kernels& kernels() {
 #ifdef MOTION_HAS_X86
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw"))
-        return v4::table;
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return v3::table;
+        return motion::v4::table;
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return motion::v3::table;
 #endif
-    return base::table;
+    return motion::base::table;
 }

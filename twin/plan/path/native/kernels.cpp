@@ -6,7 +6,7 @@
 #define MOTION_ISA base
 #endif
 
-namespace MOTION_ISA {
+namespace motion::MOTION_ISA {
 
 namespace {
 
@@ -92,4 +92,4 @@ int farthest(const float* x, const float* y, const float* z, int count, const fl
 extern const Kernels table;
 const Kernels table{place, to_box, to_ground, between, farthest};
 
-}  // namespace MOTION_ISA
+}  // namespace motion::MOTION_ISA

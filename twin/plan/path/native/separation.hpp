@@ -95,7 +95,8 @@ private:
     int count_ = 0;
 };
 
-// Search until the distance is known to be at least `enough` or below `too_little`, or exactly.
+// Search until the distance is known to be at least `enough`, below `too_little` or in between; with
+// an infinite `enough` until it is known.
 //
 // `support(direction)` is the point of the difference (first body less second) that lies farthest
 // along a direction. `guess` is the first direction that is tried, and returns the last one.
@@ -125,6 +126,8 @@ Separation separation(const Support& support, double enough, double too_little, 
         if (!(most < found.most)) return found;  // as near as the numbers allow
         found.most = most;
         if (found.most < too_little) return found;
+        // Neither enough nor too little: nobody asks for more.
+        if (found.most < enough && found.least >= too_little && std::isfinite(enough)) return found;
     }
     found.most = std::min(found.most, norm(v));
     return found;

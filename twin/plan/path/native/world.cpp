@@ -210,8 +210,10 @@ Separation World::exact(std::int32_t index, double enough, double too_little) {
         return found;
     }
     Vec& guess = guesses_[static_cast<std::size_t>(index)];
+    const bool new_guess = !(dot(guess, guess) > 0.0);
     if (pair.kind == Other::kBox) {
         const Box& box = boxes[static_cast<std::size_t>(pair.other)];
+        if (new_guess) guess = centre(pair.body) - box.pose.t;
         return separation(
             [&](Vec d) {
                 const Vec in_box = box.pose.turn_back(d);
@@ -224,6 +226,7 @@ Separation World::exact(std::int32_t index, double enough, double too_little) {
     }
     const Body& other = bodies[static_cast<std::size_t>(pair.other)];
     const Pose& second = frames_[static_cast<std::size_t>(other.joint)];
+    if (new_guess) guess = centre(pair.body) - centre(pair.other);
     return separation(
         [&](Vec d) { return support(body, pose, d) - support(other, second, -1.0 * d); }, enough,
         too_little, guess);
