@@ -52,6 +52,7 @@ double least(const Values& values, const Vector& origin, double voxel, const Tur
         return a.distance != b.distance ? a.distance < b.distance : a.index < b.index;
     });
     bool first = true;
+    constexpr double kNear = 0.02;
     for (const Visit& next : order) {
         const auto body = static_cast<std::size_t>(next.index);
         const double *turn = R.data() + 9 * body, *shift = t.data() + 3 * body;
@@ -60,8 +61,10 @@ double least(const Values& values, const Vector& origin, double voxel, const Tur
         const double limit = below + cover.data()[body];
         const double stop = limit > 0.0 ? limit / kLeast : limit;
         if (next.distance > stop) continue;
-        // The most promising one is the answer most often, and asked for it at once.
-        if (!first && search.nearest(turn, shift, begin, end, stop) > stop) continue;
+        // The most promising one is the answer most often, and asked for it at once; not where only
+        // what nearly touches is asked for.
+        const bool at_once = first && stop > kNear;
+        if (!at_once && search.nearest(turn, shift, begin, end, stop) > stop) continue;
         first = false;
         below = std::min(below, search.nearest(turn, shift, begin, end) - cover.data()[body]);
     }
