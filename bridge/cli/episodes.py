@@ -55,6 +55,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         episode: An episode file, recorded or derived.
         output: How to talk.
     """
+    from bridge.episode.clocks import clocks_of
     from bridge.episode.contract import PRESENCE_RECORD, presence_lines
     from bridge.episode.reader import Episode
     from bridge.task.find import HASH_DIGITS
@@ -62,6 +63,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     opened = Episode.open(episode)
     topics = opened.topics()
     outcome = opened.outcome
+    clocks = clocks_of(opened)
     data = {
         "file": str(episode),
         "info": asdict(opened.info),
@@ -73,6 +75,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
+        "clocks": [clock.to_json() for clock in clocks],
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -101,6 +104,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
     presence = opened.metadata_records.get(PRESENCE_RECORD, {})
     lines += [f"  {text}" for text in presence_lines(presence)]
+    lines += [f"  {text}" for clock in clocks for text in clock.sentences()]
     width = max((len(topic) for topic in topics), default=0)
     seen = presence.get("topics")
     shown = seen if isinstance(seen, dict) else {}

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from bridge.clock import ClockChoice
 from bridge.episode.schema import StampedMessage
 from bridge.exchange.lerobot.layout import LeRobotConfig
 from bridge.sources.folder.config import FolderConfig
@@ -23,6 +24,7 @@ def export_tum(
     *,
     camera: str | None = None,
     color: Literal["recorded", "png"] = "recorded",
+    clock: ClockChoice = "recorded",
     force: bool = False,
     output: Output = OUTPUT,
 ) -> int:
@@ -36,13 +38,14 @@ def export_tum(
         out: The folder to make.
         camera: Only this camera.
         color: recorded keeps JPEG bytes as they are; png decodes them.
+        clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
         output: How to talk.
     """
-    from bridge.episode.reader import Episode
+    from bridge.episode.clocks import open_episode
     from bridge.exchange.rgbd import export_tum as write_tum
 
-    opened = Episode.open(episode)
+    opened = open_episode(episode, clock=clock)
     images = sum(item.count for topic, item in opened.topics().items() if topic.endswith("/image"))
     with output.progress("export", images) as advance:
         reports = write_tum(opened, out, camera=camera, color=color, force=force, advance=advance)
@@ -71,6 +74,7 @@ def export_csv(
     /,
     *,
     derived: bool = False,
+    clock: ClockChoice = "recorded",
     force: bool = False,
     output: Output = OUTPUT,
 ) -> int:
@@ -83,6 +87,7 @@ def export_csv(
         source: An episode file, or a run folder.
         out: The folder to make.
         derived: Also the replays and localisations of the run.
+        clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
         output: How to talk.
     """
@@ -91,7 +96,7 @@ def export_csv(
 
     files, _ = episode_files(source, derived=derived)
     with output.progress("export", len(files)) as advance:
-        rows = write_csv(source, out, derived=derived, force=force, advance=advance)
+        rows = write_csv(source, out, derived=derived, clock=clock, force=force, advance=advance)
     lines = [f"{out}: {len(files)} episodes"]
     lines += [f"  {name:<14} {count:>9} rows" for name, count in sorted(rows.items())]
     output.result({"out": str(out), "episodes": len(files), "rows": rows}, "\n".join(lines))

@@ -142,6 +142,7 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.DIVERGENCE: lambda data: parse_record(data, name="divergence"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
     schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
+    schema.CLOCKS: lambda data: parse_record(data, name="clocks", package="bridge.episode"),
 }
 
 

@@ -18,6 +18,7 @@ from bridge.errors import GstError, UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
+from bridge.record.presence import News
 from bridge.record.queue import (
     OVERHEAD_BYTES,
     Command,
@@ -179,6 +180,8 @@ class Lifecycle:
         """What others have to say of each episode, by name."""
         self.contract: Contract | None = None
         """What the topics of the next episode promise."""
+        self.earlier_clocks: Callable[[], list[Answer]] = list
+        """Readings of the sources' clocks made before an episode."""
         self.ring = PreRoll(
             seconds=config.preroll_s,
             max_bytes=config.preroll_mb * BYTES_PER_MB,
@@ -246,6 +249,13 @@ class Lifecycle:
         self.ring.trim(now_ns)
         if self.take is not None:
             self.take.tick(now_ns, self._health())
+
+    def take_news(self) -> list[News]:
+        """What the open episode has noticed since the last call."""
+        if self.take is None:
+            return []
+        news, self.take.news = self.take.news, []
+        return news
 
     def look_at_file(self) -> str:
         """Return what happened to the open file from outside, or ""; raises OSError."""
@@ -379,6 +389,7 @@ class Lifecycle:
             others=self.others,
             contract=self.contract,
             task=task,
+            clocks=self.earlier_clocks(),
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take

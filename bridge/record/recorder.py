@@ -20,6 +20,7 @@ from bridge.episode.catalogue import label_episode, list_episodes, note_finished
 from bridge.episode.contract import find_contract
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
+from bridge.record.clocks import ClockBook
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
 from bridge.record.errors import (
@@ -86,6 +87,8 @@ class Recorder:
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
         self.presence = PresenceMonitor(self.input_queue.seen, tell=self._note)
+        self.clocks = ClockBook(tell=self._note, write=self._write_clock)
+        self._life.earlier_clocks = self.clocks.earlier
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
         """What a person should hear of at once, for one reader who takes it out."""
         self.news_arrived = threading.Event()
@@ -204,7 +207,24 @@ class Recorder:
             if take is not None and not self._life.is_finishing:
                 stamp_ns = command.received_ns
                 take.write_event("note", stamp_ns=stamp_ns, text=news.text, data=news.data)
+                if news.warns:
+                    take.ledger.warn(news.text)
 
+        self._aside(act)
+
+    def _write_clock(self, record: Answer) -> None:
+        """Write a reading of a source's clock into the open episode."""
+
+        def act(command: Command) -> None:
+            take = self._life.take
+            if take is not None and not self._life.is_finishing:
+                take.write_clock(record, command.received_ns)
+
+        if self._life.take is not None:
+            self._aside(act)
+
+    def _aside(self, act: Callable[[Command], None]) -> None:
+        """Have the writer thread do something in its place; nobody waits for it."""
         command = Command(
             action=lambda command: self._guard(lambda: act(command)),
             received_ns=self._now_ns(),
@@ -317,11 +337,16 @@ class Recorder:
         """Begin later episodes with the last message of a topic; its publisher says so."""
         self.input_queue.latched.declare(topic)
 
-    def forget(self, prefix: str) -> None:
-        """Repeat no latched message of topics that begin so: their publisher has gone."""
+    def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
+        """Repeat no latched message of topics that begin so: their publisher has gone.
+
+        Args:
+            prefix: Beginning of the topics.
+            but: Longer beginnings whose publisher is there.
+        """
 
         def act(command: Command) -> None:
-            self._life.latched.forget(prefix)
+            self._life.latched.forget(prefix, but)
 
         self.input_queue.put_command(Command(action=act, received_ns=0, is_barrier=False))
 
@@ -458,6 +483,9 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
+            for news in self._life.take_news():  # of clocks that were set, by the stamps
+                if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
+                    self._note(news)
             if happened := self._life.look_at_file():
                 self._note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()

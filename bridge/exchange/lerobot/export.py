@@ -16,6 +16,7 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.clocks import open_episode
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import (
@@ -361,7 +362,7 @@ def export_lerobot(
     run = RunFolder(source) if source.is_dir() else None
     with new_folder(out, force=force) as folder:
         layout.parquet()  # says what is missing before the long look
-        first = Episode.open(files[0])
+        first = open_episode(files[0], clock=config.clock)
         fps = config.fps or choose_fps(first)
         success = [_success(run, Episode.open(path)) for path in files]
         kind, sizes = _look(files, fps, config, advance)
@@ -377,7 +378,7 @@ def export_lerobot(
         writer = DatasetWriter(folder, shape)
         try:
             table = []
-            for row in _add_all(writer, files, success, kind, cameras, shape):
+            for row in _add_all(writer, files, success, kind, cameras, shape, config):
                 table.append(row)
                 advance(len(files) + len(table), str(row["id"]))
             writer.close()
@@ -405,10 +406,11 @@ def _add_all(
     kind: ActionKind,
     cameras: dict[str, str],
     shape: DatasetShape,
+    config: LeRobotConfig,
 ) -> Iterator[dict[str, Any]]:
     """Write one episode after another; yields what there is to say of each."""
     for number, path in enumerate(files):
-        episode = Episode.open(path)
+        episode = open_episode(path, clock=config.clock)
         samples = sample(episode, shape.fps)
         writer.add(
             task=_task(episode),
@@ -431,7 +433,7 @@ def _look(
     sizes: dict[str, tuple[int, int]] = {}
     without_plan: list[Path] = []
     for number, path in enumerate(files):
-        episode = Episode.open(path)
+        episode = open_episode(path, clock=config.clock)
         samples = sample(episode, fps)
         found = {camera: _size(episode, camera, samples) for camera in samples.images}
         if number == 0:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from bridge.clock import ClockChoice
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
 
 
@@ -26,6 +27,8 @@ class LeRobotConfig:
     """Only the episodes with these ids, of any kind."""
     crf: int = 23
     """Quality of the H.264 video, lower is better."""
+    clock: ClockChoice = "recorded"
+    """corrected takes offset and drift of the sources' clocks out of all stamps."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense."""
