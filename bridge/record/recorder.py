@@ -86,8 +86,8 @@ class Recorder:
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
-        self.presence = PresenceMonitor(self.input_queue.seen, tell=self._note)
-        self.clocks = ClockBook(tell=self._note, write=self._write_clock)
+        self.presence = PresenceMonitor(self.input_queue.seen, tell=self.note)
+        self.clocks = ClockBook(tell=self.note, write=self._write_clock)
         self._life.earlier_clocks = self.clocks.earlier
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
         """What a person should hear of at once, for one reader who takes it out."""
@@ -114,6 +114,12 @@ class Recorder:
     def is_paused(self) -> bool:
         """Say whether the open episode is paused."""
         return self._life.is_paused and self._life.take is not None
+
+    @property
+    def recording(self) -> str | None:
+        """Id of the episode that is being recorded."""
+        take = self._life.take
+        return None if take is None else take.info.id
 
     @property
     def last_episode(self) -> str | None:
@@ -197,7 +203,7 @@ class Recorder:
             )
         return answer
 
-    def _note(self, news: News) -> None:
+    def note(self, news: News) -> None:
         """Tell people of something, and write it into the open episode."""
         self.news.append(news.text)
         self.news_arrived.set()
@@ -485,9 +491,9 @@ class Recorder:
                 self._life.note_clock_step(step_ns, now_ns)
             for news in self._life.take_news():  # of clocks that were set, by the stamps
                 if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
-                    self._note(news)
+                    self.note(news)
             if happened := self._life.look_at_file():
-                self._note(News(text=happened, data={"kind": "file_removed"}))
+                self.note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
             if cause and not self._status.failing and not self._take_over(cause):
                 self._end_because(cause)
@@ -508,7 +514,7 @@ class Recorder:
         if not happened:
             return False
         self._run = self._life.run
-        self._note(News(text=happened, data={"kind": "failover"}))
+        self.note(News(text=happened, data={"kind": "failover"}))
         return True
 
     def _fail(self, error: OSError) -> DiskError | None:
