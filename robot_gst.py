@@ -56,8 +56,20 @@ COMMANDS: tuple[Command, ...] = (
     (
         "label",
         f"{EPISODES}:label",
-        "Set the outcome of a recorded episode.",
+        "Set the outcome of a recorded episode, or flag it.",
         "runs/demo trial_1 --result failure",
+    ),
+    (
+        "prune",
+        f"{EPISODES}:prune",
+        "Remove labelled episodes by age, size and quota.",
+        "runs/demo --quota-mb 50000",
+    ),
+    (
+        "sync",
+        f"{EXCHANGE}:sync",
+        "Copy a run elsewhere, verified by hash; resumes.",
+        "runs/monday /mnt/archive",
     ),
     (
         "rebuild",

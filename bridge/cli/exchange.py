@@ -388,3 +388,42 @@ def import_rosbag2(
         f"of {len(report.files)} files",
     )
     return 0
+
+
+def sync(
+    run: Path,
+    destination: str,
+    /,
+    *,
+    verify: Annotated[bool, Parameter(negative=())] = False,
+    output: Output = OUTPUT,
+) -> int:
+    """Copy a run to another folder or to any target of fsspec, each file verified by SHA-256.
+
+    Finished files only; a copy that was interrupted goes on where it stopped. Nothing is removed.
+    Exit code 1: some files could not be copied; run it again.
+    Example: robot-gst sync runs/monday /mnt/archive
+    With fsspec and what the protocol needs: robot-gst sync runs/monday s3://lab-archive/runs
+
+    Args:
+        run: Run folder; the copy is a folder of the same name.
+        destination: Folder or URL that runs are copied into.
+        verify: Read every copy again, also those that were verified before.
+        output: How to talk.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from bridge.exchange.sync import files_of, sync_run
+
+    opened = RunFolder.open(run)
+    opened.refuse_empty()
+    total = sum((run / name).stat().st_size for name in files_of(opened))
+    with output.progress("copy", total) as advance:
+        report = sync_run(opened, destination, verify=verify, advance=advance)
+    lines = [f"failed: {name}: {why}" for name, why in report.failed.items()]
+    resumed = f" ({len(report.resumed)} of them went on)" if report.resumed else ""
+    lines.append(
+        f"{report.destination}: {len(report.copied)} files copied and verified{resumed}, "
+        f"{report.num_bytes / 1e6:.1f} MB sent, {report.unchanged} there already"
+    )
+    output.result(asdict(report), "\n".join(lines))
+    return 1 if report.failed else 0

@@ -48,6 +48,9 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
+    quota_mb: int = 0
+    """What the run's episodes may take [MB]: beyond it the oldest ones go that are labelled and not
+    flagged; 0: no quota."""
     failover: Path | None = None
     """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
     DIR`` joins the halves."""
@@ -62,7 +65,8 @@ class DiskConfig:
 
     def __post_init__(self) -> None:
         """Refuse negative sizes and times."""
-        refuse_outside(self, dict.fromkeys(("min_free_mb", "footer_mb"), (0, UNBOUNDED)))
+        sizes = ("min_free_mb", "footer_mb", "quota_mb")
+        refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
