@@ -323,7 +323,7 @@ def find_runs(folder: Path) -> list[RunFolder]:
 
     Raises:
         PathNotFoundError: When there is no such folder.
-        UsageError: When there is no run in it.
+        UsageError: When there is none in it.
     """
     run = RunFolder.open(folder)
     if run.episodes_dir.is_dir():

@@ -143,7 +143,7 @@ class ClockAsker:
 
 
 class StampJumps:
-    """Clocks that were set, by the stamps of an episode's messages; one sentence for each."""
+    """Clocks that were set, by the stamps of an episode's messages; one line for each."""
 
     def __init__(self) -> None:
         """Begin an episode."""
