@@ -271,8 +271,13 @@ class EpisodeFiles:
         self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
         self._finisher.start()
 
-    def fail_over(self, folder: Path, cause: str) -> Path:
+    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
         """Go on in another folder, with all that the disk has not taken.
+
+        Args:
+            folder: Where episodes lie on the other disk.
+            cause: What the disk said.
+            is_hanging: It says nothing, and is not waited for.
 
         Raises:
             UsageError: When the part exists there.
@@ -281,7 +286,7 @@ class EpisodeFiles:
         """
         before = self.writer
         path = folder / part_name(self._info.id, self.index + 1)
-        self.writer = before.continue_in(path)
+        self.writer = before.continue_in(path, is_hanging=is_hanging)
         self.index += 1
         self._is_split = True
         self._paths.append(path)
@@ -429,9 +434,9 @@ class EpisodeRecording:
         """Write the file anew where somebody removed it; raises OSError when that fails."""
         return self._parts.writer.keep_name()
 
-    def fail_over(self, folder: Path, cause: str) -> Path:
+    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
         """Go on in another folder; see ``EpisodeFiles.fail_over``."""
-        path = self._parts.fail_over(folder, cause)
+        path = self._parts.fail_over(folder, cause, is_hanging=is_hanging)
         self.failovers.append({"path": str(path), "cause": cause})
         self.ledger.warn(f"the disk failed ({cause}); the rest is in {path}")
         return path

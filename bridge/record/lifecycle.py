@@ -149,6 +149,8 @@ def _size(entry: Item | Dropped) -> int:
 
 
 Answer = dict[str, Any]
+UNANSWERED_S = 1.0
+"""A disk that has been at one write for so long is not asked for anything else [s]."""
 
 
 class Lifecycle:
@@ -264,8 +266,25 @@ class Lifecycle:
             return ""
         return f"{take.part_path} was removed while it was written; it was written there anew"
 
-    def fail_over(self, cause: str) -> str:
+    def hangs(self) -> str:
+        """Say that the disk does not answer while another one could take over; else ""."""
+        disk, take = self._config.disk, self.take
+        if disk.failover is None or take is None or self._has_failed_over:
+            return ""
+        busy_s = take.disk["busy_s"]
+        return f"the disk has not answered for {busy_s:.1f} s" if busy_s > disk.hang_s else ""
+
+    @property
+    def may_ask_disk(self) -> bool:
+        """Whether the disk answers, so that asking it for names and space holds nobody up."""
+        return self.take is None or self.take.disk["busy_s"] < UNANSWERED_S
+
+    def fail_over(self, cause: str, *, is_hanging: bool = False) -> str:
         """Let another disk take over the open episode and all later ones.
+
+        Args:
+            cause: What the disk said.
+            is_hanging: It says nothing, and is not waited for.
 
         Returns:
             What happened, in words; "" when there is no other disk, or it fails as well.
@@ -277,11 +296,12 @@ class Lifecycle:
         before = self.take.part_path
         try:
             run = RunFolder.create(folder)
-            path = self.take.fail_over(run.episodes_dir, cause)
+            path = self.take.fail_over(run.episodes_dir, cause, is_hanging=is_hanging)
         except (GstError, OSError):
             return ""
         self._run = run
-        self._reserve.release()
+        if not is_hanging:  # closing a file there would hang as well
+            self._reserve.release()
         self._reserve = DiskReserve(run.episodes_dir, self._config.disk.footer_mb)
         with contextlib.suppress(NoSpaceError):  # then there is none to hold back
             self._reserve.hold()

@@ -488,6 +488,8 @@ class Recorder:
     def _tick(self) -> None:
         now_ns, now_s = self._now_ns(), time.monotonic()
         self._status.beat()
+        if cause := self._life.hangs():
+            self._take_over(cause, is_hanging=True)
         self._life.tick(now_ns)
         if now_s >= self._next_second_s:
             self._next_second_s = now_s + SECOND_S
@@ -498,6 +500,8 @@ class Recorder:
             for news in self._life.take_news():  # of clocks that were set, by the stamps
                 if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
                     self.note(news)
+            if not self._life.may_ask_disk:
+                return
             if happened := self._life.look_at_file():
                 self.note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
@@ -514,9 +518,9 @@ class Recorder:
         self._status.failing = cause
         self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
-    def _take_over(self, cause: str) -> bool:
+    def _take_over(self, cause: str, *, is_hanging: bool = False) -> bool:
         """Let another disk take over, if there is one."""
-        happened = self._life.fail_over(cause)
+        happened = self._life.fail_over(cause, is_hanging=is_hanging)
         if not happened:
             return False
         self._run = self._life.run
