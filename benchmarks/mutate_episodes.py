@@ -24,10 +24,11 @@ import robot_gst
 from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.messages import Selection, merged
 from bridge.episode.reader import Episode
+from bridge.episode.schema import Schema
 from bridge.episode.writer import EpisodeWriter
 
 CODES = {0, 1, 2, 3}
-PAGE = 4096
+PAGE, SEED = 4096, 1
 STRANGE = ("", "null", "[]", "{}", "-1", '"x"', "1e999", "NaN", "[[[[")
 """Values of metadata."""
 MAX_IMAGES = 4
@@ -62,7 +63,14 @@ def thin(path: Path, to: Path, flip: random.Random | None = None) -> None:
             writer.write_foreign(
                 item.channel.topic,
                 data,
-                schema_record=None if record is None else _schema(record, item),
+                schema_record=None
+                if record is None
+                else Schema(
+                    name=record.name,
+                    schema_encoding=record.encoding,
+                    message_encoding=item.channel.message_encoding,
+                    data=record.data,
+                ),
                 message_encoding=item.channel.message_encoding,
                 log_time_ns=item.log_time_ns,
                 publish_time_ns=item.publish_time_ns,
@@ -70,17 +78,6 @@ def thin(path: Path, to: Path, flip: random.Random | None = None) -> None:
             )
         for file in episode.files:
             _add_metadata(writer, file, flip if hit >= 0 and flip and flip.random() < 0.2 else None)
-
-
-def _schema(record: object, item: object) -> object:
-    from bridge.episode.schema import Schema
-
-    return Schema(
-        name=record.name,  # type: ignore[attr-defined]
-        schema_encoding=record.encoding,  # type: ignore[attr-defined]
-        message_encoding=item.channel.message_encoding,  # type: ignore[attr-defined]
-        data=record.data,  # type: ignore[attr-defined]
-    )
 
 
 def _add_metadata(writer: EpisodeWriter, file: McapFile, flip: random.Random | None) -> None:
@@ -159,45 +156,59 @@ def run_command(name: str, arguments: list[str]) -> tuple[int | None, str]:
         return None, f"{said.getvalue()}\n{traceback.format_exc()}"
 
 
+class Trial:
+    """A copy of a run with one episode, which is damaged again and again."""
+
+    def __init__(self, source: Path, episode_id: str, folder: Path) -> None:
+        """Copy the run without its other episodes, results and caches."""
+        self.folder = folder
+        self.run = folder / "run"
+        left_out = shutil.ignore_patterns("results", "*.views.*", "*.sqlite")
+        shutil.copytree(source, self.run, ignore=left_out)
+        self.target = self.run / "episodes" / f"{episode_id}.mcap"
+        self.original = folder / "original.mcap"
+        shutil.copy(self.target, self.original)
+        self.codes: Counter[tuple[str, int | None]] = Counter()
+        self.failures: list[str] = []
+        self._clear(self.target)
+
+    def _clear(self, kept: Path) -> None:
+        for left in (self.run / "episodes").glob("*"):
+            if left != kept:
+                left.unlink()
+        shutil.rmtree(self.folder / "out", ignore_errors=True)
+        shutil.rmtree(self.run / "results", ignore_errors=True)
+
+    def give(self, name: str, data: bytes, commands: list[str]) -> None:
+        """Give one damaged copy to each command."""
+        for command in commands:
+            self.target.write_bytes(data)
+            self._clear(self.target)
+            values = {"run": self.run, "episode": self.target, "out": self.folder / "out"}
+            arguments = [text.format(**values) for text in ARGUMENTS[command]]
+            code, text = run_command(command, arguments)
+            self.codes[command, code] += 1
+            is_mute = code in (1, 2) and not text.strip()
+            if code not in CODES or "Traceback" in text or is_mute:
+                self.failures.append(f"{command}, {name}: {code}\n{text[-3000:]}")
+
+
 def main() -> int:
     """Run, and print what went wrong."""
     source, episode_id, count = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     commands = sys.argv[4:] or ["info", "check"]
-    seed = 1
-    codes: Counter[tuple[str, int | None]] = Counter()
-    failures: list[str] = []
     begun_s = time.process_time()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        run = folder / "run"
-        left_out = shutil.ignore_patterns("results", "*.views.*", "*.sqlite")
-        shutil.copytree(source, run, ignore=left_out)
-        for other in (run / "episodes").iterdir():
-            if other.name != f"{episode_id}.mcap":
-                other.unlink()
-        target = run / "episodes" / f"{episode_id}.mcap"
-        original = folder / "original.mcap"
-        shutil.copy(target, original)
-        for number, data in enumerate(mutants(original, folder, count, seed)):
-            for command in commands:
-                target.write_bytes(data)
-                values = {"run": str(run), "episode": str(target), "out": str(folder / "out")}
-                shutil.rmtree(folder / "out", ignore_errors=True)
-                shutil.rmtree(run / "results", ignore_errors=True)
-                arguments = [text.format(**values) for text in ARGUMENTS[command]]
-                code, text = run_command(command, arguments)
-                codes[command, code] += 1
-                is_mute = code in (1, 2) and not text.strip()
-                if code not in CODES or "Traceback" in text or is_mute:
-                    failures.append(f"{command}, mutant {number}: {code}\n{text[-3000:]}")
-                    print(failures[-1], flush=True)
-                for left in (run / "episodes").glob("*"):
-                    if left != target:
-                        left.unlink()
-    table = {f"{name} {code}": found for (name, code), found in sorted(codes.items(), key=str)}
-    print(json.dumps({"mutants": count, "codes": table, "failures": len(failures)}))
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Trial(source, episode_id, Path(folder))
+        for number, data in enumerate(mutants(trial.original, Path(folder), count, SEED)):
+            before = len(trial.failures)
+            trial.give(f"mutant {number}", data, commands)
+            for failure in trial.failures[before:]:
+                print(failure, flush=True)
+    codes = {f"{name} {code}": n for (name, code), n in sorted(trial.codes.items(), key=str)}
+    print(json.dumps({"mutants": count, "codes": codes, "failures": len(trial.failures)}))
     print(f"{time.process_time() - begun_s:.0f} s CPU")
-    return 1 if failures else 0
+    return 1 if trial.failures else 0
 
 
 if __name__ == "__main__":
