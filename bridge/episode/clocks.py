@@ -443,6 +443,12 @@ class CorrectedEpisode(Episode):
         """Topics whose stamps are moved."""
         return self._correction.topics & frozenset(self.topics())
 
+    def shift_ns(self, message: RawMessage) -> int:
+        """What must be added to the stamps of a message as it was recorded [ns]."""
+        return self._correction.shift_ns(
+            message.topic, message.publish_time_ns, message.log_time_ns
+        )
+
     def messages(
         self,
         topics: Iterable[str] | None = None,
@@ -458,10 +464,9 @@ class CorrectedEpisode(Episode):
             end_ns: Log time to stop before [ns since 1970]; None: to the end.
         """
         for message in super().messages(topics, start_ns=start_ns, end_ns=end_ns):
-            topic, publish_ns = message.topic, message.publish_time_ns
-            shift_ns = self._correction.shift_ns(topic, publish_ns, message.log_time_ns)
+            shift_ns = self.shift_ns(message)
             if shift_ns:
-                definition = self._definitions.get((topic, message.type_name))
+                definition = self._definitions.get((message.topic, message.type_name))
                 yield restamped(message, definition, shift_ns)
             else:
                 yield message
