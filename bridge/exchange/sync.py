@@ -15,7 +15,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 from bridge.episode.catalogue_store import FILE_NAME
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import BridgeError, GstError, MissingDependencyError, UsageError
+from bridge.errors import BridgeError, GstError, UsageError
 from bridge.whole_file import write_whole
 
 MANIFEST = "sync.json"
@@ -128,8 +128,8 @@ class RemotePlace:
         """Connect.
 
         Raises:
-            MissingDependencyError: Without fsspec, or the package that its protocol needs.
-            SyncError: When it cannot be reached.
+            SyncError: Without fsspec, or the package that its protocol needs.
+            UsageError: When fsspec knows no such protocol.
         """
         scheme = url.partition(":")[0]
         try:
@@ -137,9 +137,9 @@ class RemotePlace:
 
             self._fs, self._root = url_to_fs(url)
         except ImportError as error:
-            package = f"fsspec (with what {scheme}:// needs: {error})"
-            raise MissingDependencyError(
-                package=package, extra="report", purpose=f"copying to {scheme}://"
+            raise SyncError(
+                f"{scheme}:// needs fsspec and the package of that protocol, and one of them is "
+                f"not installed ({error}). For example: pip install fsspec s3fs."
             ) from error
         except ValueError as error:
             raise UsageError(f"{url}: {error}. fsspec knows no such protocol.") from error

@@ -129,7 +129,7 @@ def test_a_disk_that_breaks_is_named_and_another_takes_over(cell: FaultCell) -> 
     recorder.wait_for("The recording goes on in ")
     assert "Input/output error (the disk, or the connection to it, is failing)" in recorder.said()
     flow.answer()
-    answer = asker.ask("stop")["ok"]
+    answer = flow.ask("stop")["ok"]  # in line behind the last message
     assert (answer["lost"], answer["parts"]) == (0, 2)
     assert asker.ask("start", {"id": "t2", "info": {"cell": "cell"}})["ok"]["ok"]
     assert asker.ask("stop")["ok"]["ok"]
@@ -161,7 +161,7 @@ def test_another_disk_takes_over_from_one_that_hangs(cell: FaultCell, answers: b
     if answers:
         recorder.send(signal.SIGUSR2)
     flow.answer()
-    answer = asker.ask("stop")["ok"]
+    answer = flow.ask("stop")["ok"]  # in line behind the last message
     assert (answer["lost"], answer["parts"]) == (0, 2)
     recorder.finish()
     assert robot_gst.run(["recover", str(cell.run), str(other), "-q"]) == 0
