@@ -13,7 +13,7 @@ import time
 import tomllib
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -123,7 +123,7 @@ def _rule(values: Any, where: str) -> Rule:
     for key in _NEEDS.get(kind, ()):
         if not values.get(key):
             raise TriggerError(f"{where}: on = {kind!r} needs {key}.")
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for key in _POSITIVE:
         value = values.get(key)
         if value is None:
@@ -132,8 +132,8 @@ def _rule(values: Any, where: str) -> Rule:
         if not is_number or not 0 <= value < math.inf:
             raise TriggerError(f"{where}: {key} must be a number from 0 up, got {value!r:.40}.")
         numbers[key] = float(value)
-    texts = {key: values[key] for key in ("name", "on", "topic") if key in values}
-    return Rule(**texts, **numbers)
+    rule = Rule(name=values["name"], on=kind, topic=values.get("topic", ""))
+    return replace(rule, **numbers)
 
 
 def _refuse_unknown(

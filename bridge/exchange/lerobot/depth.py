@@ -81,11 +81,13 @@ class DepthCoding:
 
     def encode(self, depth_mm: UInt16[np.ndarray, "height width"]) -> UInt16[np.ndarray, "h w"]:
         """Turn millimetres into codes; 0 stays 0."""
-        return _codes(self)[depth_mm]
+        codes: UInt16[np.ndarray, "h w"] = _codes(self)[depth_mm]
+        return codes
 
     def decode(self, codes: UInt16[np.ndarray, "height width"]) -> UInt16[np.ndarray, "h w"]:
         """Turn codes into millimetres; 0 stays 0, no measurement."""
-        return _depths_mm(self)[np.minimum(codes, MOST_CODE)]
+        depth_mm: UInt16[np.ndarray, "h w"] = _depths_mm(self)[np.minimum(codes, MOST_CODE)]
+        return depth_mm
 
 
 @cache
@@ -96,7 +98,9 @@ def _codes(coding: DepthCoding) -> UInt16[np.ndarray, " num_depths"]:
         position = (np.log(np.maximum(depth_m + coding.shift_m, 1e-9)) - low) / (high - low)
     else:
         position = (depth_m - coding.min_m) / (coding.max_m - coding.min_m)
-    codes = np.rint(position * MOST_CODE).clip(0, MOST_CODE).astype(np.uint16)
+    codes: UInt16[np.ndarray, " num_depths"] = (
+        np.rint(position * MOST_CODE).clip(0, MOST_CODE).astype(np.uint16)
+    )
     codes[0] = NO_MEASUREMENT
     return codes
 
