@@ -29,7 +29,7 @@ Advance = Callable[[int, str], None]
 
 
 class SyncError(BridgeError):
-    """A copy is not what it should be, or the other place refused it."""
+    """A copy is not what it should be, or the other side refused it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class SyncReport:
 
 
 @runtime_checkable
-class Place(Protocol):
+class Target(Protocol):
     """Where the copy goes."""
 
     def read(self, name: str) -> bytes | None:
@@ -67,14 +67,14 @@ class Place(Protocol):
         """Write behind what is there, or anew."""
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file its final name, in place of one that has it."""
+        """Give a file its final name, replacing one that has it."""
 
     @property
     def can_resume(self) -> bool:
         """Whether ``append`` can write behind what is there."""
 
 
-class FolderPlace:
+class FolderTarget:
     """A folder of this machine, or one that is mounted."""
 
     can_resume = True
@@ -115,11 +115,11 @@ class FolderPlace:
             os.fsync(stream.fileno())
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file its final name, in place of one that has it."""
+        """Give a file its final name, replacing one that has it."""
         (self._root / old).replace(self._root / new)
 
 
-class RemotePlace:
+class RemoteTarget:
     """Whatever fsspec can write to: ``s3://``, ``sftp://``, ``memory://`` ..."""
 
     can_resume = False
@@ -182,13 +182,13 @@ class RemotePlace:
                 stream.write(block)
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file its final name, in place of one that has it."""
+        """Give a file its final name, replacing one that has it."""
         if self.size(new) is not None:
             self._fs.rm_file(self._path(new))
         self._fs.mv(self._path(old), self._path(new))
 
 
-def open_place(destination: str, run: RunFolder) -> tuple[Place, str]:
+def open_target(destination: str, run: RunFolder) -> tuple[Target, str]:
     """Open the folder of a run at its destination, and say where that is.
 
     Args:
@@ -201,12 +201,12 @@ def open_place(destination: str, run: RunFolder) -> tuple[Place, str]:
     name = run.path.resolve().name
     if "://" in destination:
         url = f"{destination.rstrip('/')}/{name}"
-        return RemotePlace(url), url
+        return RemoteTarget(url), url
     root = Path(destination) / name
     if root.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(f"{root} lies in the run itself. Choose another folder.")
     try:
-        return FolderPlace(root), str(root)
+        return FolderTarget(root), str(root)
     except OSError as error:
         raise UsageError(f"cannot write {root}: {error.strerror}.") from error
 
@@ -239,8 +239,8 @@ def sync_run(
         UsageError: When nothing can be written there.
         SyncError: When the list of what was verified cannot be written.
     """
-    place, where = open_place(destination, run)
-    known = _manifest(place)
+    target, where = open_target(destination, run)
+    known = _manifest(target)
     copied, resumed, failed = [], [], {}
     unchanged = done = sent = 0
     for name in files_of(run):
@@ -249,15 +249,15 @@ def sync_run(
             before = path.stat()
             entry = {"size": before.st_size, "mtime_ns": before.st_mtime_ns}
             old = known.get(name, {})
-            if _is_there(place, name, entry, old, verify=verify):
+            if _is_there(target, name, entry, old, verify=verify):
                 unchanged += 1
             else:
-                digest, num_bytes, was_there = _copy(place, path, name)
+                digest, num_bytes, was_there = _copy(target, path, name)
                 if path.stat().st_mtime_ns != before.st_mtime_ns:
                     failed[name] = "it changed while it was copied"
                     continue
                 known[name] = {**entry, "sha256": digest}
-                _write_manifest(place, known)
+                _write_manifest(target, known)
                 copied.append(name)
                 sent += num_bytes
                 resumed += [name] if was_there else []
@@ -276,9 +276,9 @@ def sync_run(
     )
 
 
-def _manifest(place: Place) -> dict[str, dict[str, Any]]:
+def _manifest(target: Target) -> dict[str, dict[str, Any]]:
     try:
-        record = json.loads(place.read(MANIFEST) or b"{}")
+        record = json.loads(target.read(MANIFEST) or b"{}")
         files = record.get("files", {})
     except (ValueError, AttributeError, RecursionError):
         return {}  # damaged: everything is looked at again
@@ -287,46 +287,46 @@ def _manifest(place: Place) -> dict[str, dict[str, Any]]:
     return {name: entry for name, entry in files.items() if isinstance(entry, dict)}
 
 
-def _write_manifest(place: Place, files: dict[str, dict[str, Any]]) -> None:
+def _write_manifest(target: Target, files: dict[str, dict[str, Any]]) -> None:
     record = {"schema_version": 1, "files": dict(sorted(files.items()))}
-    place.write(MANIFEST, (json.dumps(record, indent=1) + "\n").encode())
+    target.write(MANIFEST, (json.dumps(record, indent=1) + "\n").encode())
 
 
 def _is_there(
-    place: Place, name: str, entry: dict[str, int], old: dict[str, Any], *, verify: bool
+    target: Target, name: str, entry: dict[str, int], old: dict[str, Any], *, verify: bool
 ) -> bool:
     """Whether a copy that was verified is still that of the file."""
     if any(old.get(key) != value for key, value in entry.items()):
         return False
-    if place.size(name) != entry["size"]:
+    if target.size(name) != entry["size"]:
         return False
-    return not verify or _hash(place.blocks(name)) == old.get("sha256")
+    return not verify or _hash(target.blocks(name)) == old.get("sha256")
 
 
-def _copy(place: Place, path: Path, name: str) -> tuple[str, int, bool]:
+def _copy(target: Target, path: Path, name: str) -> tuple[str, int, bool]:
     """Send a file, read it back, and give it its name.
 
     Returns:
         SHA-256, bytes sent, and whether a part of it was there.
     """
     partial = name + PARTIAL
-    at = _same_beginning(place, path, partial) if place.can_resume else 0
-    place.append(partial, _blocks(path, at), is_new=not at)
+    at = _same_beginning(target, path, partial) if target.can_resume else 0
+    target.append(partial, _blocks(path, at), is_new=not at)
     wanted = _hash(_blocks(path, 0))
-    if _hash(place.blocks(partial)) != wanted:
+    if _hash(target.blocks(partial)) != wanted:
         raise SyncError(f"{name}: what was written there reads back differently. Run it again.")
-    place.rename(partial, name)
+    target.rename(partial, name)
     return wanted, path.stat().st_size - at, at > 0
 
 
-def _same_beginning(place: Place, path: Path, partial: str) -> int:
+def _same_beginning(target: Target, path: Path, partial: str) -> int:
     """How many bytes of a part are those of the file; 0 where it is another file's."""
-    size = place.size(partial)
+    size = target.size(partial)
     if not size or size > path.stat().st_size:
         return 0
     theirs, ours = hashlib.sha256(), hashlib.sha256()
     with path.open("rb") as stream:
-        for block in place.blocks(partial):
+        for block in target.blocks(partial):
             theirs.update(block)
             ours.update(stream.read(len(block)))
     return size if theirs.digest() == ours.digest() else 0

@@ -16,7 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange import sync as syncing
-from bridge.exchange.sync import FolderPlace, SyncReport, sync_run
+from bridge.exchange.sync import FolderTarget, SyncReport, sync_run
 
 
 @pytest.fixture
@@ -126,13 +126,13 @@ def test_what_was_sent_before_is_not_sent_again(run: RunFolder, tmp_path: Path) 
 def test_a_disk_that_returns_other_bytes_is_noticed(
     run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = FolderPlace.append
+    real = FolderTarget.append
 
-    def flips(self: FolderPlace, name: str, blocks: Iterator[bytes], *, is_new: bool) -> None:
+    def flips(self: FolderTarget, name: str, blocks: Iterator[bytes], *, is_new: bool) -> None:
         broken = (bytes([block[0] ^ 1]) + block[1:] for block in blocks)
         real(self, name, broken if "t1" in name else blocks, is_new=is_new)
 
-    monkeypatch.setattr(FolderPlace, "append", flips)
+    monkeypatch.setattr(FolderTarget, "append", flips)
     report = sync(run, tmp_path / "there")
     assert list(report.failed) == ["episodes/t1.mcap"]
     assert "reads back differently" in report.failed["episodes/t1.mcap"]
