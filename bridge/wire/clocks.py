@@ -37,9 +37,6 @@ def announce(session: WireSession, *prefixes: str) -> None:
         session: It publishes with; its clock is the one of the stamps.
         prefixes: Beginnings of the source's topics without slash, such as ``lab/cam/side``.
     """
-    for prefix in prefixes:
-        session.declare_alive(f"{prefix}{ALIVE}")
-
     def answer(request: bytes) -> bytes:
         received_ns = session.now_ns()
         about = {
@@ -52,6 +49,8 @@ def announce(session: WireSession, *prefixes: str) -> None:
         return json.dumps({**about, **times}).encode()
 
     session.serve(f"{CLOCKS}/{key_from_topic(f'/{prefixes[0]}')}", answer)
+    for prefix in prefixes:  # last: whoever sees it can ask
+        session.declare_alive(f"{prefix}{ALIVE}")
 
 
 def ask_clocks(session: WireSession, *, timeout_s: float) -> list[ClockAnswer]:
