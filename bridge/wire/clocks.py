@@ -37,6 +37,7 @@ def announce(session: WireSession, *prefixes: str) -> None:
         session: It publishes with; its clock is the one of the stamps.
         prefixes: Beginnings of the source's topics without slash, such as ``lab/cam/side``.
     """
+
     def answer(request: bytes) -> bytes:
         received_ns = session.now_ns()
         about = {
