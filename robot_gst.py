@@ -62,8 +62,20 @@ COMMANDS: tuple[Command, ...] = (
     (
         "label",
         f"{EPISODES}:label",
-        "Set the outcome of a recorded episode.",
+        "Set the outcome of a recorded episode, or flag it.",
         "runs/demo trial_1 --result failure",
+    ),
+    (
+        "prune",
+        f"{EPISODES}:prune",
+        "Remove labelled episodes by age, size and quota.",
+        "runs/demo --quota-mb 50000",
+    ),
+    (
+        "sync",
+        f"{EXCHANGE}:sync",
+        "Copy a run elsewhere, verified by hash; resumes.",
+        "runs/monday /mnt/archive",
     ),
     (
         "rebuild",
@@ -249,6 +261,12 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 f"{EXCHANGE}:export_csv",
                 "Joints, poses, events ... as tidy CSV files.",
                 "runs/x DIR",
+            ),
+            (
+                "corrected",
+                f"{EXCHANGE}:export_corrected",
+                "An episode with its sources' clocks taken out of all stamps.",
+                "EPISODE OUT.mcap",
             ),
             (
                 "catalogue",

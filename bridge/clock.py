@@ -2,10 +2,15 @@
 
 import time
 from collections.abc import Callable
+from typing import Literal
 
 NS_PER_S = 1_000_000_000
 STEP_NS = 50_000_000
 """A system clock that moves this far at once was set, not trimmed."""
+
+
+ClockChoice = Literal["recorded", "corrected"]
+"""Stamps as each source's own clock made them, or in the time of the recorder's clock."""
 
 
 def ns_from_s(seconds: float) -> int:

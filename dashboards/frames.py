@@ -1,5 +1,6 @@
 """Camera frames of an episode: when they were taken, and their bytes as recorded."""
 
+import sys
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,12 +9,15 @@ from pathlib import Path
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import color_file_from_message
-from bridge.episode.reader import Episode
+from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.streams import image_messages
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
 """Before a camera's id: its images as the twin renders them."""
+FRAMES_BEFORE = (40, 400, sys.maxsize)
+"""How far back a video is read for one of its frames, in steps."""
 MEDIA_TYPES = ((b"\xff\xd8", "image/jpeg"), (b"\x89PNG\r\n\x1a\n", "image/png"))
 
 
@@ -50,6 +54,7 @@ def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
         for topic in (
             *episode.topics_of_type(schema.COMPRESSED_IMAGE),
             *episode.topics_of_type(schema.IMAGE),
+            *episode.topics_of_type(schema.COMPRESSED_VIDEO),
         )
         if (name := _camera_of(topic)) is not None
     }
@@ -81,7 +86,8 @@ def _camera_of(topic: str) -> str | None:
 def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     """Return the image nearest to an instant and its media type.
 
-    A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
+    A compressed image is given byte for byte as recorded; a raw one, or a frame of a video, becomes
+    JPEG. Frames before the first whole picture of a video show that picture.
 
     Args:
         path: The episode file.
@@ -94,15 +100,37 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
         text = f"{path.name} has no frames of camera {camera_id!r}. Cameras: {found}."
         raise NotHereError(text)
     track = tracks[camera_id]
-    index = track.nearest(stamp_ns)
-    log_ns = track.log_times_ns[index]
-    episode = Episode.open(path)
-    for message in episode.messages([track.topic], start_ns=log_ns, end_ns=log_ns + 1):
-        if message.publish_time_ns == track.stamps_ns[index]:
-            data = color_file_from_message(message.type_name, message.data).data
-            return data, media_type(data, path)
-    text = f"{path.name} changed while it was read; reload the page."
-    raise NotHereError(text)
+    message = _find(Episode.open(path), track, track.nearest(stamp_ns))
+    if message is None:
+        text = f"{path.name} changed while it was read; reload the page."
+        raise NotHereError(text)
+    data = color_file_from_message(message.type_name, message.data).data
+    return data, media_type(data, path)
+
+
+def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:
+    """The image of a track's frame. A video is read from further and further before it.
+
+    Its frames need those since the last whole picture, which most cameras send once a second.
+    """
+    wanted_ns = track.stamps_ns[index]
+    summary = episode.topics().get(track.topic)
+    is_video = summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
+    for before in FRAMES_BEFORE if is_video else (0,):
+        first = max(0, index - before)
+        last = index if first else max(index, min(before, len(track.stamps_ns) - 1))
+        span = {
+            "start_ns": min(track.log_times_ns[first : index + 1]),
+            "end_ns": max(track.log_times_ns[index : last + 1]) + 1,
+        }
+        earliest: RawMessage | None = None
+        for message in image_messages(episode, [track.topic], **span):
+            if message.publish_time_ns == wanted_ns:
+                return message
+            earliest = earliest or message
+        if not first and earliest is not None and earliest.publish_time_ns > wanted_ns:
+            return earliest
+    return None
 
 
 def media_type(data: bytes, path: Path) -> str:

@@ -321,7 +321,7 @@ def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> l
     stamps = []
     images = (
         color_file_from_message(message.type_name, message.data)
-        for message in episode.messages([topic])
+        for message in streams.image_messages(episode, [topic])
     )
     for batch in _batches(images):
         kept = []

@@ -2,13 +2,13 @@
 
 import textwrap
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
+from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery, RetentionPolicy
 from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
 from bridge.wire.config import DEFAULT_ENDPOINT
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
     from bridge.episode.metadata import Outcome
     from bridge.episode.recover import RecoveryReport
+    from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
 
@@ -55,6 +56,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         episode: An episode file, recorded or derived.
         output: How to talk.
     """
+    from bridge.episode.clocks import clocks_of
     from bridge.episode.contract import PRESENCE_RECORD, presence_lines
     from bridge.episode.reader import Episode
     from bridge.task.find import HASH_DIGITS
@@ -62,6 +64,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     opened = Episode.open(episode)
     topics = opened.topics()
     outcome = opened.outcome
+    clocks = clocks_of(opened)
     data = {
         "file": str(episode),
         "info": asdict(opened.info),
@@ -73,6 +76,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
+        "clocks": [clock.to_json() for clock in clocks],
         "topics": [asdict(item) for item in topics.values()],
     }
     about = opened.info
@@ -101,6 +105,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
     presence = opened.metadata_records.get(PRESENCE_RECORD, {})
     lines += [f"  {text}" for text in presence_lines(presence)]
+    lines += [f"  {text}" for clock in clocks for text in clock.sentences()]
     width = max((len(topic) for topic in topics), default=0)
     seen = presence.get("topics")
     shown = seen if isinstance(seen, dict) else {}
@@ -305,25 +310,36 @@ def ls(
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
     output: Output = OUTPUT,
 ) -> int:
-    """List the episodes of a run, or those that pass the filters.
+    """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
 
     Exit code 1 when one of them cannot be read.
     Example: robot-gst ls runs/demo --kind trial --outcome failure --sort start --reverse
+    Search: robot-gst ls runs --text "cube slipped" --cell lab --since 2026-03-01
 
     Args:
-        run: Run folder.
+        run: Run folder, or a folder of runs.
         query: Which, and in what order.
         output: How to talk.
     """
-    entries = _find(run, query, output)
-    lines = episode_table(entries) if entries else [f"no episode in {run} passes these filters"]
-    output.result({"episodes": [vars(entry) for entry in entries]}, "\n".join(lines))
+    from bridge.episode.catalogue import find_runs
+
+    runs = find_runs(run)
+    found = _find(runs, query, output)
+    entries = [entry for _, entry in found]
+    shown = entries
+    if len(runs) > 1:
+        names = [each.path.relative_to(run).as_posix() for each, _ in found]
+        shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
+    lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
+    data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
+    output.result({"episodes": data}, "\n".join(lines))
     return 1 if any(entry.error for entry in entries) else 0
 
 
-def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
-    from bridge.episode.catalogue import find_episodes
-    from bridge.episode.run_folder import RunFolder
+def _find(
+    runs: "list[RunFolder]", query: CatalogueQuery, output: Output
+) -> "list[tuple[RunFolder, Entry]]":
+    from bridge.episode.catalogue import find_in_runs
 
     with ExitStack() as stack:
         shown: list[Advance] = []
@@ -334,9 +350,9 @@ def _find(run: Path, query: CatalogueQuery, output: Output) -> "list[Entry]":
             for show in shown:
                 show(done, "")
 
-        opened = RunFolder.open(run)
-        opened.refuse_empty()
-        return find_episodes(opened, query, advance=advance)
+        if len(runs) == 1:
+            runs[0].refuse_empty()
+        return find_in_runs(runs, query, advance=advance)
 
 
 COLUMNS = ("episode", "kind", "condition", "outcome", "seconds", "MB")
@@ -393,6 +409,7 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:
         notes.append(f"unknown: {_shown(entry.cause)}")
+    notes += [f"flagged: {_shown(entry.flag)}"] if entry.flag else []
     if entry.presence:
         notes.append(_shown(entry.presence, 400))
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
@@ -411,14 +428,17 @@ def label(
     episode: str,
     /,
     *,
-    result: Literal["success", "failure", "unknown"],
+    result: Literal["success", "failure", "unknown"] | None = None,
     by: str = "operator",
     detail: str | None = None,
+    flag: str | None = None,
+    unflag: Annotated[bool, Parameter(negative=())] = False,
     output: Output = OUTPUT,
 ) -> int:
-    """Set the outcome of a recorded episode; kept in notes/, the episode is not rewritten.
+    """Set the outcome of a recorded episode, or flag it; kept in notes/, nothing is rewritten.
 
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
+    Keep it whatever happens: robot-gst label runs/monday trial_0003 --flag "look at the wrist"
 
     Args:
         run: Run folder.
@@ -426,15 +446,85 @@ def label(
         result: success, failure or unknown.
         by: Who says so.
         detail: What happened, in words.
+        flag: Why prune and --quota-mb must never remove it.
+        unflag: Take the flag away.
         output: How to talk.
     """
-    from bridge.episode.catalogue import label_episode
+    from bridge.episode.catalogue import flag_episode, label_episode
     from bridge.episode.metadata import Outcome
     from bridge.episode.run_folder import RunFolder
+    from bridge.errors import UsageError
 
-    outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
-    path = label_episode(RunFolder.open(run), episode, outcome)
-    output.result({"label": asdict(outcome), "file": str(path)}, f"{episode}: {result} ({path})")
+    if flag is not None and unflag:
+        raise UsageError("--flag and --unflag exclude each other.")
+    if result is None and flag is None and not unflag:
+        raise UsageError("say what to note: --result success, --flag WHY or --unflag.")
+    opened = RunFolder.open(run)
+    data: dict[str, object] = {}
+    said = []
+    if result is not None:
+        outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
+        path = label_episode(opened, episode, outcome)
+        data = {"label": asdict(outcome), "file": str(path)}
+        said.append(f"{result} ({path})")
+    if flag is not None or unflag:
+        flag_episode(opened, episode, flag)
+        data["flag"] = flag
+        said.append("no longer flagged" if flag is None else f"flagged: {flag}")
+    output.result(data, f"{episode}: {', '.join(said)}")
+    return 0
+
+
+POLICY = RetentionPolicy()
+
+
+def prune(
+    run: Path,
+    /,
+    *,
+    policy: Annotated[RetentionPolicy, Parameter(name="*")] = POLICY,
+    delete: Annotated[bool, Parameter(negative=())] = False,
+    output: Output = OUTPUT,
+) -> int:
+    """Remove labelled episodes by age, size and quota; without --delete it only lists them.
+
+    Never what nobody labelled, what is flagged (label --flag, or the tag keep), or what cannot be
+    read. What went stands in notes/removed.jsonl.
+    Example: robot-gst prune runs/monday --older-than-days 30 --outcome failure --quota-mb 50000
+
+    Args:
+        run: Run folder.
+        policy: What may go.
+        delete: Do it.
+        output: How to talk.
+    """
+    import time
+
+    from bridge.episode.catalogue import list_episodes
+    from bridge.episode.retention import choose, may_go, remove
+    from bridge.episode.run_folder import RunFolder
+    from bridge.errors import UsageError
+
+    if policy.is_empty:
+        raise UsageError(
+            "say what may go: --quota-mb 50000, --older-than-days 30 or --larger-than-mb 500."
+        )
+    opened = RunFolder.open(run)
+    opened.refuse_empty()
+    entries = list_episodes(opened)
+    now_ns = time.time_ns()
+    chosen = choose(entries, policy, now_ns=now_ns)
+    gone = [each for each in chosen if not delete or remove(opened, each, now_ns=now_ns)]
+    word = "removed" if delete else "would remove"
+    size_mb = sum(each.entry.size_bytes for each in gone) / 1e6
+    lines = [f"{word} {_shown(e.id)} ({e.outcome}): {reason}" for e, reason in gone]
+    kept = sum(not may_go(entry, policy) for entry in entries)
+    lines.append(
+        f"{word} {len(gone)} of {len(entries)} episodes, {size_mb:.1f} MB; "
+        f"{kept} can never go by these rules" + ("" if delete or not gone else "; do it: --delete")
+    )
+    data = [{"id": each.entry.id, "reason": each.reason} for each in gone]
+    output.result({"deleted": delete, "episodes": data, "size_mb": size_mb}, "\n".join(lines))
     return 0
 
 
@@ -457,8 +547,9 @@ def export_catalogue(
         output: How to talk.
     """
     from bridge.episode.catalogue import write_parquet
+    from bridge.episode.run_folder import RunFolder
 
-    entries = _find(run, query, output)
+    entries = [entry for _, entry in _find([RunFolder.open(run)], query, output)]
     write_parquet(entries, out)
     output.result({"file": str(out), "episodes": len(entries)}, f"{out}: {len(entries)} episodes")
     return 0

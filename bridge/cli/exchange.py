@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
+from bridge.clock import ClockChoice
 from bridge.episode.schema import StampedMessage
 from bridge.exchange.lerobot.layout import LeRobotConfig
 from bridge.sources.folder.config import FolderConfig
@@ -23,6 +24,7 @@ def export_tum(
     *,
     camera: str | None = None,
     color: Literal["recorded", "png"] = "recorded",
+    clock: ClockChoice = "recorded",
     force: bool = False,
     output: Output = OUTPUT,
 ) -> int:
@@ -36,13 +38,14 @@ def export_tum(
         out: The folder to make.
         camera: Only this camera.
         color: recorded keeps JPEG bytes as they are; png decodes them.
+        clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
         output: How to talk.
     """
-    from bridge.episode.reader import Episode
+    from bridge.episode.clocks import open_episode
     from bridge.exchange.rgbd import export_tum as write_tum
 
-    opened = Episode.open(episode)
+    opened = open_episode(episode, clock=clock)
     images = sum(item.count for topic, item in opened.topics().items() if topic.endswith("/image"))
     with output.progress("export", images) as advance:
         reports = write_tum(opened, out, camera=camera, color=color, force=force, advance=advance)
@@ -71,6 +74,7 @@ def export_csv(
     /,
     *,
     derived: bool = False,
+    clock: ClockChoice = "recorded",
     force: bool = False,
     output: Output = OUTPUT,
 ) -> int:
@@ -83,6 +87,7 @@ def export_csv(
         source: An episode file, or a run folder.
         out: The folder to make.
         derived: Also the replays and localisations of the run.
+        clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
         output: How to talk.
     """
@@ -91,7 +96,7 @@ def export_csv(
 
     files, _ = episode_files(source, derived=derived)
     with output.progress("export", len(files)) as advance:
-        rows = write_csv(source, out, derived=derived, force=force, advance=advance)
+        rows = write_csv(source, out, derived=derived, clock=clock, force=force, advance=advance)
     lines = [f"{out}: {len(files)} episodes"]
     lines += [f"  {name:<14} {count:>9} rows" for name, count in sorted(rows.items())]
     output.result({"out": str(out), "episodes": len(files), "rows": rows}, "\n".join(lines))
@@ -109,7 +114,7 @@ def export_lerobot(
 ) -> int:
     """Write a run's trials as a LeRobotDataset v3.0: Parquet tables and H.264 video.
 
-    Depth is left out, the format has no place for it. README.md in OUT says what each column is.
+    With --depth also depth, as lerobot 0.6 stores it. README.md in OUT says what each column is.
     Example: robot-gst export lerobot runs/demo datasets/demo --fps 30
 
     Args:
@@ -130,7 +135,8 @@ def export_lerobot(
     label = "with success labels" if report.labelled else "not every episode is labelled"
     text = (
         f"{out}: {report.episodes} episodes, {report.frames} rows at {report.fps} Hz, "
-        f"actions: {report.action.replace('_', ' ')}, {label}; depth left out"
+        f"actions: {report.action.replace('_', ' ')}, {label}; "
+        f"depth {'as 12-bit HEVC' if config.depth else 'left out'}"
     )
     output.result({"out": str(out), **asdict(report)}, text)
     return 0
@@ -170,6 +176,30 @@ def export_rosbag2(
     lines += [f"  left out: {topic} ({why})" for topic, why in report.left_out.items()]
     data = {"out": str(out), "topics": report.topics, "left_out": report.left_out}
     output.result({**data, "messages": report.messages}, "\n".join(lines))
+    return 0
+
+
+def export_corrected(episode: Path, out: Path, /, *, output: Output = OUTPUT) -> int:
+    """Write an episode anew with offset and drift of its sources' clocks taken out of all stamps.
+
+    For commands that read stamps as they are: rebuild, replay, evaluate. robot-gst info says what
+    is known of the clocks.
+    Example: robot-gst export corrected runs/lab/episodes/t1.mcap runs/lab_2/episodes/t1.mcap
+
+    Args:
+        episode: An episode file, the first part of a split one.
+        out: The file to make.
+        output: How to talk.
+    """
+    from bridge.episode.reader import Episode
+    from bridge.exchange.corrected import write_corrected
+
+    total = sum(item.count for item in Episode.open(episode).topics().values())
+    with output.progress("export", total) as advance:
+        moved = write_corrected(episode, out, advance=advance)
+    lines = [f"{out}: stamps of {sum(moved.values())} messages moved"]
+    lines += [f"  {topic}: {count}" for topic, count in moved.items()]
+    output.result({"out": str(out), "moved": moved}, "\n".join(lines))
     return 0
 
 
@@ -383,3 +413,42 @@ def import_rosbag2(
         f"of {len(report.files)} files",
     )
     return 0
+
+
+def sync(
+    run: Path,
+    destination: str,
+    /,
+    *,
+    verify: Annotated[bool, Parameter(negative=())] = False,
+    output: Output = OUTPUT,
+) -> int:
+    """Copy a run to another folder or to any target of fsspec, each file verified by SHA-256.
+
+    Finished files only; a copy that was interrupted goes on where it stopped. Nothing is removed.
+    Exit code 1: some files could not be copied; run it again.
+    Example: robot-gst sync runs/monday /mnt/archive
+    With fsspec and what the protocol needs: robot-gst sync runs/monday s3://lab-archive/runs
+
+    Args:
+        run: Run folder; the copy is a folder of the same name.
+        destination: Folder or URL that runs are copied into.
+        verify: Read every copy again, also those that were verified before.
+        output: How to talk.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from bridge.exchange.sync import files_of, sync_run
+
+    opened = RunFolder.open(run)
+    opened.refuse_empty()
+    total = sum((run / name).stat().st_size for name in files_of(opened))
+    with output.progress("copy", total) as advance:
+        report = sync_run(opened, destination, verify=verify, advance=advance)
+    lines = [f"failed: {name}: {why}" for name, why in report.failed.items()]
+    resumed = f" ({len(report.resumed)} of them went on)" if report.resumed else ""
+    lines.append(
+        f"{report.destination}: {len(report.copied)} files copied and verified{resumed}, "
+        f"{report.num_bytes / 1e6:.1f} MB sent, {report.unchanged} there already"
+    )
+    output.result(asdict(report), "\n".join(lines))
+    return 1 if report.failed else 0

@@ -8,12 +8,13 @@ import contextlib
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 from bridge.episode.catalogue_store import (
     FILE_NAME,
+    FLAG_SUFFIX,
     LABEL_SUFFIX,
     UNLABELLED,
     CatalogueQuery,
@@ -176,15 +177,63 @@ def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
         InvalidRecordError: When the outcome does not fit its schema.
     """
     path = sidecar_path(run, episode_id)
-    episode = run.episodes_dir / f"{episode_id}.mcap"
-    if not episode.is_file():
-        names = ", ".join(path.stem for path in run.episodes()[:10]) or "none"
-        raise PathNotFoundError(path=episode, what="episode", hint=f"Episodes here: {names}.")
+    _finished(run, episode_id)
     record = json.loads(json.dumps(asdict(outcome)))
     check_record(record, name="outcome")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
     return path
+
+
+def flag_of(run: RunFolder, path: Path) -> str:
+    """Why an episode was flagged; "" where nobody did.
+
+    Args:
+        run: The run whose ``notes/`` may hold a flag.
+        path: The episode's first file.
+    """
+    try:
+        data = (run.notes_dir / f"{path.stem}{FLAG_SUFFIX}").read_bytes()
+    except OSError:
+        return ""
+    try:
+        return str(json.loads(data)["text"]) or FLAGGED
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return FLAGGED  # damaged: rather kept than lost
+
+
+FLAGGED = "flagged"
+
+
+def flag_episode(run: RunFolder, episode_id: str, text: str | None) -> Path:
+    """Flag an episode, so that retention never removes it, or take the flag away.
+
+    Args:
+        run: The run that holds it.
+        episode_id: Id of a finished episode.
+        text: Why; None takes the flag away.
+
+    Raises:
+        PathNotFoundError: When there is no such episode.
+    """
+    path = run.notes_dir / f"{check_episode_id(episode_id)}{FLAG_SUFFIX}"
+    episode = _finished(run, episode_id)
+    if text is None:
+        path.unlink(missing_ok=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        record = {"schema_version": 1, "text": text}
+        write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
+    note_finished(run, episode)
+    return path
+
+
+def _finished(run: RunFolder, episode_id: str) -> Path:
+    episode = run.episodes_dir / f"{episode_id}.mcap"
+    if not episode.is_file():
+        names = ", ".join(path.stem for path in run.episodes()[:10]) or "none"
+        raise PathNotFoundError(path=episode, what="episode", hint=f"Episodes here: {names}.")
+    return episode
 
 
 _LARGEST = 2**63 - 1
@@ -205,13 +254,15 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         info, outcome = episode.info, outcome_of(run, episode)
         messages = sum(topic.count for topic in episode.topics().values())
     except GstError as error:
-        return Entry(**name, **_extent(parts), error=printable(str(error)))
+        flag = printable(flag_of(run, path))
+        return Entry(**name, **_extent(parts), flag=flag, error=printable(str(error)))
     records = episode.metadata_records
     return Entry(
         **name,
         **_extent(parts),
         kind=printable(info.kind),
         task=printable(info.task),
+        instruction=printable(info.instruction),
         condition=printable(info.condition),
         policy=printable(info.policy),
         start_id=None if info.start_id is None else printable(info.start_id),
@@ -229,6 +280,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
         presence=printable("; ".join(presence_lines(records.get(PRESENCE_RECORD, {})))),
+        flag=printable(flag_of(run, path)),
     )
 
 
@@ -260,6 +312,49 @@ def _fit(number: int) -> int:
 EVERYTHING = CatalogueQuery()
 NOTE_BUSY_S = 0.2
 """How long a recorder waits for another process that is writing the catalogue [s]."""
+
+
+RUNS_DEEP = 3
+"""How far below a folder its runs are looked for."""
+
+
+def find_runs(folder: Path) -> list[RunFolder]:
+    """Return a run, or all runs of a folder of runs, by name.
+
+    Raises:
+        PathNotFoundError: When there is no such folder.
+        UsageError: When there is none in it.
+    """
+    run = RunFolder.open(folder)
+    if run.episodes_dir.is_dir():
+        return [run]
+    patterns = ("/".join(["*"] * depth + ["episodes"]) for depth in range(1, RUNS_DEEP + 1))
+    found = {each.parent for pattern in patterns for each in folder.glob(pattern) if each.is_dir()}
+    runs = [RunFolder(path) for path in sorted(found) if not path.name.startswith(".")]
+    if not runs:
+        run.refuse_empty()
+    return runs
+
+
+def find_in_runs(
+    runs: Sequence[RunFolder], query: CatalogueQuery, *, advance: Advance | None = None
+) -> list[tuple[RunFolder, Entry]]:
+    """Return the episodes of several runs that pass all filters, in one order.
+
+    Args:
+        runs: Where to look.
+        query: What to look for.
+        advance: Called while files are read that a catalogue does not know yet.
+    """
+    found = [
+        (run, entry)
+        for run in runs
+        for entry in find_episodes(run, replace(query, limit=None), advance=advance)
+    ]
+    if len(runs) > 1:
+        key = query.sort_key
+        found.sort(key=lambda pair: (*key(pair[1]), str(pair[0].path)), reverse=query.reverse)
+    return found[: query.limit]
 
 
 def list_episodes(run: RunFolder) -> list[Entry]:

@@ -23,6 +23,8 @@ UNLABELLED = "nobody labelled it"
 """Why the outcome of a trial is unknown that has no label."""
 LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
+FLAG_SUFFIX = ".flag.json"
+"""Of the sidecar that says why an episode must be kept."""
 UNSETTLED_NS = 2_000_000_000
 """A file changed this recently may change again within one tick of the disk's clock [ns]."""
 
@@ -36,6 +38,7 @@ class Entry:
     id: str
     kind: str = ""
     task: str = ""
+    instruction: str = ""
     condition: str = ""
     policy: str = ""
     start_id: str | None = None
@@ -62,6 +65,8 @@ class Entry:
     """Its writer was killed, so its tail is missing."""
     presence: str = ""
     """Topics that broke the contract, fell silent, or whose losses nobody can see."""
+    flag: str = ""
+    """Why somebody flagged it; retention never removes it."""
     error: str = ""
 
 
@@ -71,14 +76,15 @@ class Trace:
 
     path: Path
     stamp: str
-    """Size, times and inode of each part and of the label; "" when it cannot be relied on."""
+    """Size, times and inode of each part, of the label and of the flag; "" when it cannot be relied
+    on."""
 
 
 def scan(run: RunFolder) -> dict[str, Trace]:
     """Look at every file once; by printable name of the first part, in name order."""
     now_ns = time.time_ns()
     names = _names(run.episodes_dir, ".mcap")
-    labels = set(_names(run.notes_dir, LABEL_SUFFIX))
+    labels = {*_names(run.notes_dir, LABEL_SUFFIX), *_names(run.notes_dir, FLAG_SUFFIX)}
     return {
         printable(name): trace(
             run,
@@ -116,9 +122,9 @@ def trace(
     """
     now_ns = time.time_ns() if now_ns is None else now_ns
     files = part_paths(path) if parts is None else [*parts]
-    label = f"{path.stem}{LABEL_SUFFIX}"
-    if labels is None or label in labels:
-        files.append(run.notes_dir / label)
+    for sidecar in (f"{path.stem}{LABEL_SUFFIX}", f"{path.stem}{FLAG_SUFFIX}"):
+        if labels is None or sidecar in labels:
+            files.append(run.notes_dir / sidecar)
     return Trace(path, stamp_of(files, now_ns))
 
 
@@ -156,6 +162,10 @@ _COLUMNS: dict[str, str] = {
 }
 
 
+_EXACT = ("kind", "task", "condition", "policy", "operator", "cell", "robot", "outcome")
+_SEARCHED = (*_EXACT, "id", "instruction", "tags", "cause", "presence", "flag", "error")
+
+
 @dataclass(frozen=True, kw_only=True)
 class CatalogueQuery:
     """Filters; an episode must pass all that are given. One given twice takes either value."""
@@ -170,10 +180,18 @@ class CatalogueQuery:
     """Name of the planner or policy."""
     operator: tuple[str, ...] = ()
     """Who was there."""
+    cell: tuple[str, ...] = ()
+    """Name of the cell."""
+    robot: tuple[str, ...] = ()
+    """Which robot."""
     outcome: tuple[str, ...] = ()
     """success, failure or unknown."""
     tag: tuple[str, ...] = ()
     """A tag; of several, all must be there."""
+    text: str | None = None
+    """These words, in whatever case, in name, task, instruction, tags, cause, flag ..."""
+    flagged: bool | None = None
+    """Only flagged ones; --no-flagged only the others."""
     since: str | None = None
     """Begun at or after this time, for example 2026-03-01 or 2026-03-01T14:30 (local)."""
     until: str | None = None
@@ -199,7 +217,7 @@ class CatalogueQuery:
         """Return what follows ``SELECT ... FROM episodes``, and its parameters."""
         terms: list[str] = []
         values: list[Any] = []
-        for name in ("kind", "task", "condition", "policy", "operator", "outcome"):
+        for name in _EXACT:
             wanted = getattr(self, name)
             if wanted:
                 terms.append(f"{name} IN ({', '.join('?' * len(wanted))})")
@@ -212,6 +230,11 @@ class CatalogueQuery:
             if instant_ns is not None:
                 terms.append(f"start_ns {sign} ?")
                 values.append(instant_ns)
+        if self.text is not None:
+            terms.append(f"holds({' || char(10) || '.join(_SEARCHED)}, ?)")
+            values.append(self.text)
+        if self.flagged is not None:
+            terms.append(f"(flag != '') = {int(self.flagged)}")
         if self.lost is not None:
             terms.append(f"(ifnull(lost, 0) > 0 OR recovered) = {int(self.lost)}")
         if self.error is not None:
@@ -224,6 +247,11 @@ class CatalogueQuery:
             text += " LIMIT ?"
             values.append(self.limit)
         return text, values
+
+    def sort_key(self, entry: Entry) -> tuple[bool, Any, str]:
+        """What an entry is ordered by, where the answers of several runs are put together."""
+        value = getattr(entry, _COLUMNS.get(self.sort, self.sort))
+        return value is not None, value, entry.file
 
 
 def _instant_ns(name: str, text: str | None) -> int | None:
@@ -238,8 +266,45 @@ def _instant_ns(name: str, text: str | None) -> int | None:
         ) from error
 
 
+LABELS = ("success", "failure")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetentionPolicy:
+    """What may go. Without a limit nothing does."""
+
+    quota_mb: float | None = None
+    """The run's episodes may take this much [MB]; the oldest go first."""
+    older_than_days: float | None = None
+    """Episodes that began longer ago than this [days]."""
+    larger_than_mb: float | None = None
+    """Only episodes larger than this [MB]; with --older-than-days both must hold."""
+    outcome: tuple[str, ...] = LABELS
+    """Only episodes with one of these labels: success, failure."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be asked.
+
+        Raises:
+            UsageError: For labels that are none.
+        """
+        names = ("quota_mb", "older_than_days", "larger_than_mb")
+        refuse_outside(self, dict.fromkeys(names, (0, float("inf"))))
+        unknown = [name for name in self.outcome if name not in LABELS]
+        if unknown:
+            raise UsageError(
+                f"--outcome {unknown[0]!r}: only episodes labelled {' or '.join(LABELS)} can go."
+            )
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it says of nothing that it may go."""
+        limits = (self.quota_mb, self.older_than_days, self.larger_than_mb)
+        return all(limit is None for limit in limits)
+
+
 FILE_NAME = "catalogue.sqlite"
-VERSION = 3
+VERSION = 4
 """Raise it whenever a column, or the way one is read from an episode, changes."""
 BUSY_S = 5.0
 
@@ -375,7 +440,14 @@ def _connect(path: Path | None, busy_s: float) -> sqlite3.Connection:
     connection.create_function(
         "has_tag", 2, lambda tags, tag: tag in json.loads(tags), deterministic=True
     )
+    connection.create_function("holds", 2, _holds, deterministic=True)
     return connection
+
+
+def _holds(text: str, words: str) -> bool:
+    """Whether all words are there, in any order and case."""
+    folded = text.casefold()
+    return all(word in folded for word in words.casefold().split())
 
 
 def _values(entry: Entry, stamp: str) -> list[Any]:

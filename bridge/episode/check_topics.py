@@ -142,6 +142,7 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.DIVERGENCE: lambda data: parse_record(data, name="divergence"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
     schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
+    schema.CLOCKS: lambda data: parse_record(data, name="clocks", package="bridge.episode"),
 }
 
 
@@ -261,6 +262,8 @@ class TopicWatch:
     result: TopicCheck = field(default_factory=TopicCheck)
     sequences: SequenceWatch = field(default_factory=SequenceWatch)
     presence: Presence = field(default_factory=Presence)
+    last_ns: dict[int, int] = field(default_factory=dict)
+    """By channel: two definitions of a topic may lie in different chunks, in another order."""
     latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
@@ -276,8 +279,9 @@ class TopicWatch:
         last_ns = self.presence.last_ns
         may_skip = self.pauses.lies_between(last_ns, head.log_time_ns)
         self.sequences.see(head.sequence, may_skip=may_skip)
-        if head.log_time_ns < last_ns:
+        if head.log_time_ns < self.last_ns.get(head.channel_id, 0):
             result.time_steps_back += 1
+        self.last_ns[head.channel_id] = head.log_time_ns
         self.presence.see(head.log_time_ns, self.pauses.spans)
         self.latencies_ns.append(head.log_time_ns - head.publish_time_ns)
         try:

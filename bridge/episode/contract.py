@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
-from bridge.episode.topics import DROPS, is_latched, is_truth
+from bridge.episode.topics import OF_RECORDER, is_latched, is_truth
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole
 
@@ -310,7 +310,7 @@ def judge(
             lost.get(topic, 0),
             by_habit=by_habit,
         )
-        for topic in sorted({*presences, *rules} - {DROPS})
+        for topic in sorted({*presences, *rules} - OF_RECORDER)
     }
 
 
@@ -451,7 +451,7 @@ def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
     rules = {
         topic: _learned(topic, presence)
         for topic, presence in sorted(presences.items())
-        if topic != DROPS and not is_truth(topic)
+        if topic not in OF_RECORDER and not is_truth(topic)
     }
     return Contract(topics=rules, cell=cell)
 

@@ -265,7 +265,8 @@ class Episode:
         self.files = files
         self.missing_parts = missing_parts
         """Parts of a split episode that are not there or cannot be read."""
-        self._texts = _joined_texts(files)
+        self.texts = _joined_texts(files)
+        """All metadata records by name, as they stand in the files."""
         self._records: dict[str, dict[str, Any]] = {}
         self._topics: dict[str, TopicSummary] | None = None
 
@@ -324,7 +325,7 @@ class Episode:
         return self._metadata("derived", metadata.Derived)
 
     def _metadata(self, name: str, of_type: type[Record]) -> Record | None:
-        if name not in self._texts:
+        if name not in self.texts:
             return None
         try:
             return metadata.build(of_type, self._record(name))
@@ -338,12 +339,12 @@ class Episode:
     @property
     def metadata_records(self) -> dict[str, dict[str, Any]]:
         """All metadata records by name, values parsed where they are JSON."""
-        return {name: self._record(name) for name in self._texts}
+        return {name: self._record(name) for name in self.texts}
 
     def _record(self, name: str) -> dict[str, Any]:
         """Parse a metadata record, once; empty where there is none."""
         if name not in self._records:
-            self._records[name] = metadata.from_strings(self._texts.get(name, {}))
+            self._records[name] = metadata.from_strings(self.texts.get(name, {}))
         return self._records[name]
 
     @property

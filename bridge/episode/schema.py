@@ -142,6 +142,7 @@ DIVERGENCE = "gst/Divergence"
 LOCALISATION = "gst/Localisation"
 EVENT = "gst/Event"
 DROPS = "recorder/Drops"
+CLOCKS = "recorder/Clocks"
 STATUS = "recorder/Status"
 ENTRY = "recorder/Entry"
 ADVICE = "gst/Advice"
@@ -158,6 +159,7 @@ _JSON_SCHEMAS = {
     LOCALISATION: ("bridge.task", "schemas/localisation.schema.json"),
     EVENT: ("bridge.episode", "schemas/event.schema.json"),
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
+    CLOCKS: ("bridge.episode", "schemas/clocks.schema.json"),
     STATUS: ("bridge.episode", "schemas/status.schema.json"),
     ENTRY: ("bridge.episode", "schemas/entry.schema.json"),
     ADVICE: ("bridge.episode", "schemas/advice.schema.json"),

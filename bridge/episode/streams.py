@@ -157,10 +157,22 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
     raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
 
 
-def image_messages(episode: Episode, topics: Iterable[str]) -> Iterator[RawMessage]:
+def image_messages(
+    episode: Episode,
+    topics: Iterable[str],
+    *,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Iterator[RawMessage]:
     """Yield messages as ``Episode.messages`` does, each frame of a video as a raw image.
 
     Frames before a video's first whole picture are passed over: they show nothing by themselves.
+
+    Args:
+        episode: Where they are.
+        topics: Topics wanted.
+        start_ns: First log time wanted [ns since 1970]; None: from the start.
+        end_ns: Log time to stop before [ns since 1970]; None: to the end.
 
     Raises:
         EpisodeError: When the file or a frame is damaged.
@@ -168,7 +180,8 @@ def image_messages(episode: Episode, topics: Iterable[str]) -> Iterator[RawMessa
     """
     decoders: dict[tuple[str, str], VideoDecoder] = {}
     waiting: dict[int, RawMessage] = {}
-    for number, message in enumerate(episode.messages(topics)):
+    found = episode.messages(topics, start_ns=start_ns, end_ns=end_ns)
+    for number, message in enumerate(found):
         if message.type_name != schema.COMPRESSED_VIDEO:
             yield message
             continue

@@ -18,6 +18,9 @@ TF = "/tf"
 TF_STATIC = "/tf_static"
 ROBOT_DESCRIPTION = "/robot_description"
 DROPS = "/recorder/drops"
+CLOCKS = "/recorder/clocks"
+OF_RECORDER = frozenset((DROPS, CLOCKS))
+"""What only a recorder writes."""
 TRUTH = "standin/truth"
 """Takes the place of the cell in topics that hold a stand-in cell's ground truth."""
 
@@ -86,6 +89,7 @@ _TYPES: tuple[tuple[str, str], ...] = (
     (f"{OBJECTS}[^/]+/nodes$", schema.POINT_CLOUD),
     (f"{LOCALISATION}$", schema.LOCALISATION),
     (f"^{DROPS}$", schema.DROPS),
+    (f"^{CLOCKS}$", schema.CLOCKS),
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 

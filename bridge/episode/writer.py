@@ -511,10 +511,15 @@ class EpisodeWriter:
         self._file.restore()
         return True
 
-    def continue_in(self, path: Path) -> "EpisodeWriter":
+    def continue_in(self, path: Path, *, is_hanging: bool = False) -> "EpisodeWriter":
         """Go on in another file, with everything that this one's disk has not taken.
 
         This writer ends; its ``.part`` file stays for recovery.
+
+        Args:
+            path: The other file.
+            is_hanging: This one's disk does not answer: do not wait for it, not even for the write
+                under way, which goes along.
 
         Raises:
             UsageError: When that episode exists.
@@ -527,6 +532,12 @@ class EpisodeWriter:
             other.discard()
             raise cannot_write(other.part_path, error) from error
         other._small, other._groups = self._small, self._groups
+        if is_hanging and self._queue is not None and other._queue is not None:
+            other._queue.add_all(self._queue.leave())
+            self._open = False
+            if self._sync is not None:
+                self._sync.stop(wait=False)
+            return other
         if self._queue is not None and other._queue is not None:
             other._queue.add_all(self._queue.give_up())
             self._queue.remove_journal()  # what it holds goes along

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
 
-from bridge.clock import NS_PER_S
+from bridge.clock import NS_PER_S, ClockChoice
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.cdr.messages import JointSample, PoseSample
+from bridge.episode.clocks import open_episode
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, is_truth
@@ -273,7 +274,13 @@ def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
 
 
 def export_csv(
-    source: Path, out: Path, *, derived: bool, force: bool, advance: Advance
+    source: Path,
+    out: Path,
+    *,
+    derived: bool,
+    clock: ClockChoice = "recorded",
+    force: bool,
+    advance: Advance,
 ) -> dict[str, int]:
     """Write ``episodes.csv`` and one CSV file per family of topics that has messages.
 
@@ -281,6 +288,7 @@ def export_csv(
         source: An episode file, or a run folder.
         out: The folder to make.
         derived: Also the replays and localisations of a run.
+        clock: Whose clock stamps are read in.
         force: Replace an earlier export.
         advance: Told how many episodes are done.
 
@@ -302,7 +310,7 @@ def export_csv(
             sheets["episodes"] = _Sheet(folder / "episodes.csv", list(EPISODE_COLUMNS), stack)
             for done, path in enumerate(files, start=1):
                 name = path.relative_to(base).as_posix()
-                episode = Episode.open(path)
+                episode = open_episode(path, clock=clock)
                 sheets["episodes"].write(_episode_cells(name, episode, run))
                 _write_messages(name, episode, sheets)
                 advance(done, name)
@@ -317,7 +325,7 @@ def export_csv(
             folder,
             made_by="export csv",
             sources=files,
-            choices={"columns": columns, "stand_in_truth": "left out"},
+            choices={"columns": columns, "stand_in_truth": "left out", "clock": clock},
         )
     return rows
 

@@ -48,9 +48,14 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
+    quota_mb: int = 0
+    """What the run's episodes may take [MB]: beyond it the oldest ones go that are labelled and not
+    flagged; 0: no quota."""
     failover: Path | None = None
     """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
     DIR`` joins the halves."""
+    hang_s: float = 5.0
+    """With --failover: a disk that has been at one write for longer has failed [s]."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0
@@ -62,9 +67,10 @@ class DiskConfig:
 
     def __post_init__(self) -> None:
         """Refuse negative sizes and times."""
-        refuse_outside(self, dict.fromkeys(("min_free_mb", "footer_mb"), (0, UNBOUNDED)))
+        sizes = ("min_free_mb", "footer_mb", "quota_mb")
+        refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
-        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
+        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s", "hang_s"), (0.01, UNBOUNDED)))
 
     @property
     def backlog_bytes(self) -> int:
@@ -84,6 +90,9 @@ class RecorderConfig:
     contract: str | None = None
     """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
     ``cell.toml`` holds, if there is one."""
+    triggers: Path | None = None
+    """Rules that record by themselves (TOML); they need --preroll-s. Without it the run folder's
+    ``triggers.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
     jpeg_quality: int = 90

@@ -23,12 +23,14 @@ from bridge.episode.contract import (
 )
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import part_name
-from bridge.episode.topics import DROPS, EVENT, cell_topic
+from bridge.episode.topics import CLOCKS, DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
+from bridge.record.clocks import StampJumps
 from bridge.record.config import BYTES_PER_MB, DiskConfig, RecorderConfig
 from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.ledger import Ledger
+from bridge.record.presence import News
 from bridge.record.queue import Command, Dropped, Item, second_of
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import TaskFile
@@ -269,8 +271,13 @@ class EpisodeFiles:
         self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
         self._finisher.start()
 
-    def fail_over(self, folder: Path, cause: str) -> Path:
+    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
         """Go on in another folder, with all that the disk has not taken.
+
+        Args:
+            folder: Where episodes lie on the other disk.
+            cause: What the disk said.
+            is_hanging: It says nothing, and is not waited for.
 
         Raises:
             UsageError: When the part exists there.
@@ -279,7 +286,7 @@ class EpisodeFiles:
         """
         before = self.writer
         path = folder / part_name(self._info.id, self.index + 1)
-        self.writer = before.continue_in(path)
+        self.writer = before.continue_in(path, is_hanging=is_hanging)
         self.index += 1
         self._is_split = True
         self._paths.append(path)
@@ -361,6 +368,7 @@ class EpisodeRecording:
         others: Mapping[str, Callable[[], object]],
         contract: Contract | None = None,
         task: TaskFile | None = None,
+        clocks: Iterable[dict[str, Any]] = (),
     ) -> None:
         """Create the episode file and say in it who and what it is.
 
@@ -373,6 +381,7 @@ class EpisodeRecording:
             others: What else goes into the ``recorder`` record, by name; asked at the end.
             contract: What the topics promise.
             task: The task file, to be attached.
+            clocks: Readings of the sources' clocks made before.
 
         Raises:
             UsageError: When the episode exists already.
@@ -386,6 +395,9 @@ class EpisodeRecording:
         """By topic, when it was there; known at the end."""
         self.failovers: list[dict[str, str]] = []
         """Where it went on when a disk failed."""
+        self.news: list[News] = []
+        """What it noticed and a person should hear of."""
+        self._jumps = StampJumps()
         self._contract = contract
         self._config = config
         self._latched = latched
@@ -400,6 +412,8 @@ class EpisodeRecording:
         self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract, task)
         try:
             self._repeat_latched(start_ns)
+            for record in clocks:
+                self.write_clock(record, start_ns)
         except OSError as error:
             self._parts.discard()
             raise BridgeError(
@@ -420,9 +434,9 @@ class EpisodeRecording:
         """Write the file anew where somebody removed it; raises OSError when that fails."""
         return self._parts.writer.keep_name()
 
-    def fail_over(self, folder: Path, cause: str) -> Path:
+    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
         """Go on in another folder; see ``EpisodeFiles.fail_over``."""
-        path = self._parts.fail_over(folder, cause)
+        path = self._parts.fail_over(folder, cause, is_hanging=is_hanging)
         self.failovers.append({"path": str(path), "cause": cause})
         self.ledger.warn(f"the disk failed ({cause}); the rest is in {path}")
         return path
@@ -507,7 +521,9 @@ class EpisodeRecording:
         self._parts.tick()
 
     def _write_ledger(self, before: int | None, now_ns: int, health: dict[str, int]) -> None:
-        closed = self.ledger.close_seconds(before)
+        closed = list(self.ledger.close_seconds(before))
+        if not self.info.stand_in:  # its clock may stand
+            self.news += self._jumps.look(closed)
         self._records.extend({**record, **health} for record in closed)
         while self._records:
             self._write_json(DROPS, self._records[0], schema.DROPS, now_ns)
@@ -518,6 +534,15 @@ class EpisodeRecording:
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
         self._parts.writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+
+    def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
+        """Append readings of a source's clock.
+
+        Args:
+            record: As ``bridge.episode.clocks.to_record`` makes it.
+            stamp_ns: Now, by the recorder's clock [ns since 1970].
+        """
+        self._write_json(CLOCKS, record, schema.CLOCKS, stamp_ns)
 
     def write_event(
         self,

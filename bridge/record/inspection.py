@@ -5,13 +5,12 @@ the first and last bytes of a JPEG. ``robot-gst check`` decodes everything after
 """
 
 import json
-import re
 import struct
 from collections.abc import Callable
 from enum import StrEnum
 from functools import lru_cache, partial
 
-from bridge.clock import NS_PER_S, join_ns
+from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
@@ -88,12 +87,9 @@ def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] 
         return None
     if record.name in schema.PROTOBUF_MEMBERS and record.message_encoding == "protobuf":
         return partial(_protobuf_stamp_ns, record.name)
-    if record.schema_encoding == "ros2msg" and _FIRST_IS_HEADER.match(record.data):
+    if record.schema_encoding == "ros2msg" and codec.begins_with_header(record.data):
         return _header_stamp_ns
     return None
-
-
-_FIRST_IS_HEADER = re.compile(rb"(?:\s*(?:#[^\n]*)?\n)*\s*std_msgs/(?:msg/)?Header\s+header\b")
 
 
 def _protobuf_stamp_ns(type_name: str, data: bytes) -> int | None:
@@ -104,16 +100,9 @@ def _protobuf_stamp_ns(type_name: str, data: bytes) -> int | None:
 
 
 def _header_stamp_ns(data: bytes) -> int | None:
-    """The stamp stands behind the 4 bytes of encapsulation; one of 0 was never set."""
-    if len(data) < _STAMPED_BYTES or data[1] not in (0, 1):
-        return None
-    sec, nanosec = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
-    if sec < 0 or nanosec >= NS_PER_S:
-        return None
-    return join_ns(sec, nanosec) or None
-
-
-_STAMPED_BYTES = 12
+    """A stamp of 0 was never set."""
+    stamp = codec.header_stamp(data)
+    return None if stamp is None else join_ns(*stamp) or None
 
 
 def _inspect_protobuf(type_name: str, data: bytes) -> MessageState:

@@ -18,6 +18,7 @@ from bridge.errors import GstError, UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
+from bridge.record.presence import News
 from bridge.record.queue import (
     OVERHEAD_BYTES,
     Command,
@@ -148,6 +149,8 @@ def _size(entry: Item | Dropped) -> int:
 
 
 Answer = dict[str, Any]
+UNANSWERED_S = 1.0
+"""A disk that has been at one write for so long is not asked for anything else [s]."""
 
 
 class Lifecycle:
@@ -179,6 +182,8 @@ class Lifecycle:
         """What others have to say of each episode, by name."""
         self.contract: Contract | None = None
         """What the topics of the next episode promise."""
+        self.earlier_clocks: Callable[[], list[Answer]] = list
+        """Readings of the sources' clocks made before an episode."""
         self.ring = PreRoll(
             seconds=config.preroll_s,
             max_bytes=config.preroll_mb * BYTES_PER_MB,
@@ -247,6 +252,13 @@ class Lifecycle:
         if self.take is not None:
             self.take.tick(now_ns, self._health())
 
+    def take_news(self) -> list[News]:
+        """What the open episode has noticed since the last call."""
+        if self.take is None:
+            return []
+        news, self.take.news = self.take.news, []
+        return news
+
     def look_at_file(self) -> str:
         """Return what happened to the open file from outside, or ""; raises OSError."""
         take = self.take
@@ -254,8 +266,25 @@ class Lifecycle:
             return ""
         return f"{take.part_path} was removed while it was written; it was written there anew"
 
-    def fail_over(self, cause: str) -> str:
+    def hangs(self) -> str:
+        """Say that the disk does not answer while another one could take over; else ""."""
+        disk, take = self._config.disk, self.take
+        if disk.failover is None or take is None or self._has_failed_over:
+            return ""
+        busy_s = take.disk["busy_s"]
+        return f"the disk has not answered for {busy_s:.1f} s" if busy_s > disk.hang_s else ""
+
+    @property
+    def may_ask_disk(self) -> bool:
+        """Whether the disk answers, so that asking it for names and space holds nobody up."""
+        return self.take is None or self.take.disk["busy_s"] < UNANSWERED_S
+
+    def fail_over(self, cause: str, *, is_hanging: bool = False) -> str:
         """Let another disk take over the open episode and all later ones.
+
+        Args:
+            cause: What the disk said.
+            is_hanging: It says nothing, and is not waited for.
 
         Returns:
             What happened, in words; "" when there is no other disk, or it fails as well.
@@ -267,11 +296,12 @@ class Lifecycle:
         before = self.take.part_path
         try:
             run = RunFolder.create(folder)
-            path = self.take.fail_over(run.episodes_dir, cause)
+            path = self.take.fail_over(run.episodes_dir, cause, is_hanging=is_hanging)
         except (GstError, OSError):
             return ""
         self._run = run
-        self._reserve.release()
+        if not is_hanging:  # closing a file there would hang as well
+            self._reserve.release()
         self._reserve = DiskReserve(run.episodes_dir, self._config.disk.footer_mb)
         with contextlib.suppress(NoSpaceError):  # then there is none to hold back
             self._reserve.hold()
@@ -379,6 +409,7 @@ class Lifecycle:
             others=self.others,
             contract=self.contract,
             task=task,
+            clocks=self.earlier_clocks(),
         )
         take.ledger.begin(held[0].ticket if held else command.ticket)
         return take

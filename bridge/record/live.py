@@ -31,15 +31,18 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.salvage import RecoveryReport
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
-from bridge.record.config import RecorderConfig
+from bridge.record.clocks import ClockAsker
+from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
 from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
+from bridge.record.triggers import TriggerError, Triggers, find_triggers
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
+from bridge.wire.clocks import ALIVE
 from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
@@ -149,11 +152,10 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
 
 
 # Publishers that left are noticed, so that nothing they said is repeated in later episodes. A
-# source of ours declares ``<prefix>/alive``; with it go the latched messages under ``/<prefix>/``.
+# source of ours declares ``<prefix>/alive``; with it go the latched messages under ``/<prefix>/``,
+# but not those of a longer prefix that is still there: the cameras of an arm that left.
 # A ROS 2 publisher has a token; with the last one of a topic go that topic's latched messages. What
 # a source without either has said is remembered until the recorder ends.
-
-ALIVE = "/alive"
 
 
 class PublisherLiveliness:
@@ -165,6 +167,7 @@ class PublisherLiveliness:
         self._presence: PresenceMonitor = recorder.presence
         self._lock = threading.Lock()
         self._tokens: dict[str, str] = {}
+        self._prefixes: set[str] = set()
         self._watching: list[Subscriber] = [
             session.watch_alive(f"**{ALIVE}", self._on_source),
             session.watch_alive(rmw.TOKENS, self._on_ros),
@@ -179,9 +182,12 @@ class PublisherLiveliness:
         if key.startswith("rec/"):
             return
         prefix = f"/{key.removesuffix(ALIVE)}/"
-        self._presence.publisher(prefix, is_there=alive)
+        with self._lock:
+            (self._prefixes.add if alive else self._prefixes.discard)(prefix)
+            others = tuple(each for each in self._prefixes if each.startswith(prefix))
+        self._presence.publisher(prefix, is_there=alive, others=others)
         if not alive:
-            self._recorder.forget(prefix)
+            self._recorder.forget(prefix, others)
 
     def _on_ros(self, key: str, alive: bool) -> None:
         endpoint = rmw.parse_token(key)
@@ -215,6 +221,7 @@ class LiveRecorder:
         config: RecorderConfig,
         say: Callable[[str], None],
         task: TaskFile | None = None,
+        about: EpisodeAbout | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
 
@@ -224,6 +231,7 @@ class LiveRecorder:
             config: Settings.
             say: Told what a person should know.
             task: The task file of episodes that name this task or none.
+            about: What episodes are that triggers record.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
@@ -232,6 +240,9 @@ class LiveRecorder:
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         find_contract(run.path, config.contract)  # the same
+        rules = find_triggers(run.path, config.triggers)
+        if rules and not config.preroll_s:
+            raise TriggerError("triggers need the seconds before: add --preroll-s 5.")
         self.run = run
         self._folder_lock = _lock_folder(run)
         self._recorder = config.recorder
@@ -249,6 +260,7 @@ class LiveRecorder:
         self._previews = previews
         self._ended = threading.Event()
         session.collect_definitions()
+        self._triggers = Triggers(core, rules, about or EpisodeAbout(), say) if rules else None
         self._subscribers = [
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics
@@ -256,10 +268,15 @@ class LiveRecorder:
         self._departures = PublisherLiveliness(session, core)
         self._graph = watch_ros2(session, core, config.msg_folder)
         core.also_tell("ros2_warnings", self._graph.warnings)
+        core.also_tell("clocks", core.clocks.status)
         core.also_tell("receive_errors", lambda: session.receive_errors)
         core.also_tell("last_receive_error", lambda: session.last_receive_error)
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
+        self._clocks = ClockAsker(session, core.clocks)
+        if self._triggers is not None:
+            core.also_tell("triggers", self._triggers.status)
+            self._triggers.begin()
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -274,6 +291,8 @@ class LiveRecorder:
     def _take(self, sample: WireSample) -> None:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
+            if self._triggers is not None:
+                self._triggers.receive(sample)
 
     def _on_link(self, is_open: bool) -> None:
         if not is_open:
@@ -373,6 +392,9 @@ class LiveRecorder:
         self._ended.set()
         self.core.news_arrived.set()
         self._heartbeat.close()
+        self._clocks.close()
+        if self._triggers is not None:
+            self._triggers.close()
         if self.core.error is not None:  # whoever listens hears why, before the next second
             with contextlib.suppress(WireError):
                 self._say_status()

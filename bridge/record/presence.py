@@ -57,6 +57,8 @@ class News:
 
     text: str
     data: dict[str, Any]
+    warns: bool = False
+    """Also kept among the episode's warnings, which ``check`` shows."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -71,6 +73,10 @@ class _Topic:
     is_told: bool = False
     is_expected: bool = True
     """False for one that was silent when the episode began."""
+
+
+def _is_of(topic: str, prefix: str, others: tuple[str, ...]) -> bool:
+    return topic.startswith(prefix) and not topic.startswith(others)
 
 
 class PresenceMonitor:
@@ -98,8 +104,8 @@ class PresenceMonitor:
         self._now_s = now_s
         self._lock = threading.Lock()
         self._topics: dict[str, _Topic] = {}
-        self._gone: dict[str, None] = {}
-        """Beginnings of topics whose publisher left."""
+        self._gone: dict[str, tuple[str, ...]] = {}
+        """Beginnings of topics whose publisher left; with each, longer ones that were there."""
         self._link_closed_s: float | None = None
         self._is_recording = False
         self._by_habit = True
@@ -203,7 +209,7 @@ class PresenceMonitor:
 
     def _silence(self, name: str, topic: _Topic) -> Silence:
         cause = ""
-        if any(name.startswith(prefix) for prefix in self._gone):
+        if any(_is_of(name, prefix, others) for prefix, others in self._gone.items()):
             cause = "its publisher left"
         elif (
             self._link_closed_s is not None
@@ -236,15 +242,21 @@ class PresenceMonitor:
         with self._lock:
             self._is_recording = False
 
-    def publisher(self, prefix: str, *, is_there: bool) -> None:
-        """Note that the publisher of topics that begin so came or left."""
+    def publisher(self, prefix: str, *, is_there: bool, others: tuple[str, ...] = ()) -> None:
+        """Note that the publisher of topics that begin so came or left.
+
+        Args:
+            prefix: Beginning of its topics.
+            is_there: False where it left.
+            others: Longer beginnings, whose publishers are there.
+        """
         news = []
         with self._lock:
             if is_there:
                 self._gone.pop(prefix, None)
             else:
-                self._gone[prefix] = None
-                if any(name.startswith(prefix) for name in self._topics):
+                self._gone[prefix] = others
+                if any(_is_of(name, prefix, others) for name in self._topics):
                     text = f"the publisher of {prefix} left"
                     news = self._while_recording(text, {"kind": "left", "topic": prefix})
         for each in news:
@@ -263,6 +275,11 @@ class PresenceMonitor:
                 for name, topic in self._topics.items()
                 if self._is_silent(name, topic)
             ]
+
+    def quiet(self) -> dict[str, float]:
+        """How long each topic has been silent, as far as the recorder could hear it [s]."""
+        with self._lock:
+            return {name: topic.quiet_s for name, topic in self._topics.items()}
 
     def missing(self, contract: Contract | None) -> list[str]:
         """Sentences on the topics that a contract requires and that are not there now."""

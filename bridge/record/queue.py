@@ -16,7 +16,7 @@ from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import transforms_from_cdr
-from bridge.episode.topics import DROPS, TF_STATIC, is_latched
+from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.episode.writer import LARGE_BYTES
 from bridge.record.config import BYTES_PER_MB, QueueConfig
 from bridge.record.inspection import MessageState, resolve_type
@@ -72,9 +72,15 @@ class LatchedMessages:
         for key in keys:
             self._bytes -= len(self._kept.pop(key).data)
 
-    def forget(self, prefix: str) -> None:
-        """Drop the messages of topics that begin so: their publisher has gone."""
-        self._drop([key for key in self._kept if key[0].startswith(prefix)])
+    def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
+        """Drop the messages of topics that begin so: their publisher has gone.
+
+        Args:
+            prefix: Beginning of the topics.
+            but: Longer beginnings whose publisher is there.
+        """
+        gone = [key for key in self._kept if key[0].startswith(prefix)]
+        self._drop([key for key in gone if not key[0].startswith(but)])
 
     def all(self) -> list[WireSample]:
         """What to write at the start of an episode, oldest first."""
@@ -246,7 +252,7 @@ class Flow:
     type_name: str
     is_image: bool
     is_ledger: bool
-    """The topic on which a recorder says what it lost; nobody else may."""
+    """A topic of which only a recorder speaks; nobody else may."""
     is_bulk: bool
     """Takes space from the budget of images, and waits for the disk with them; also video, which
     goes past the encoders."""
@@ -353,7 +359,7 @@ class InputQueue:
             type_name,
             is_image=type_name in IMAGE_TYPES,
             is_bulk=type_name in IMAGE_TYPES or type_name == schema.COMPRESSED_VIDEO,
-            is_ledger=topic == DROPS,
+            is_ledger=topic in OF_RECORDER,
         )
         self._flows[sample.topic, sample.type_name] = flow
         return flow

@@ -18,8 +18,10 @@ from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
 from bridge.episode.contract import find_contract
+from bridge.episode.retention import keep_quota
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
+from bridge.record.clocks import ClockBook
 from bridge.record.config import RecorderConfig
 from bridge.record.encoders import EncoderThreads, ImageEncoder, Preview
 from bridge.record.errors import (
@@ -85,7 +87,9 @@ class Recorder:
         self._life = Lifecycle(
             run, self.config, lambda: self.input_queue.queued_bytes, self.input_queue.latched
         )
-        self.presence = PresenceMonitor(self.input_queue.seen, tell=self._note)
+        self.presence = PresenceMonitor(self.input_queue.seen, tell=self.note)
+        self.clocks = ClockBook(tell=self.note, write=self._write_clock)
+        self._life.earlier_clocks = self.clocks.earlier
         self.news: deque[str] = deque(maxlen=MAX_NEWS)
         """What a person should hear of at once, for one reader who takes it out."""
         self.news_arrived = threading.Event()
@@ -111,6 +115,12 @@ class Recorder:
     def is_paused(self) -> bool:
         """Say whether the open episode is paused."""
         return self._life.is_paused and self._life.take is not None
+
+    @property
+    def recording(self) -> str | None:
+        """Id of the episode that is being recorded."""
+        take = self._life.take
+        return None if take is None else take.info.id
 
     @property
     def last_episode(self) -> str | None:
@@ -194,17 +204,33 @@ class Recorder:
             )
         return answer
 
-    def _note(self, news: News) -> None:
+    def note(self, news: News) -> None:
         """Tell people of something, and write it into the open episode."""
-        self.news.append(news.text)
-        self.news_arrived.set()
+        self._say(news.text)
 
         def act(command: Command) -> None:
             take = self._life.take
             if take is not None and not self._life.is_finishing:
                 stamp_ns = command.received_ns
                 take.write_event("note", stamp_ns=stamp_ns, text=news.text, data=news.data)
+                if news.warns:
+                    take.ledger.warn(news.text)
 
+        self._aside(act)
+
+    def _write_clock(self, record: Answer) -> None:
+        """Write a reading of a source's clock into the open episode."""
+
+        def act(command: Command) -> None:
+            take = self._life.take
+            if take is not None and not self._life.is_finishing:
+                take.write_clock(record, command.received_ns)
+
+        if self._life.take is not None:
+            self._aside(act)
+
+    def _aside(self, act: Callable[[Command], None]) -> None:
+        """Have the writer thread do something in its place; nobody waits for it."""
         command = Command(
             action=lambda command: self._guard(lambda: act(command)),
             received_ns=self._now_ns(),
@@ -240,6 +266,12 @@ class Recorder:
         path = self._run.episodes_dir / part_name(episode_id, 1)
         note_finished(self._run, path)
         self._tell(path)
+        if quota_mb := self.config.disk.quota_mb:
+            keep_quota(self._run, float(quota_mb), now_ns=self._now_ns(), say=self._say)
+
+    def _say(self, text: str) -> None:
+        self.news.append(text)
+        self.news_arrived.set()
 
     def mark(self, text: str) -> Answer:
         """Note this instant in the episode; does not wait for images in work."""
@@ -317,11 +349,16 @@ class Recorder:
         """Begin later episodes with the last message of a topic; its publisher says so."""
         self.input_queue.latched.declare(topic)
 
-    def forget(self, prefix: str) -> None:
-        """Repeat no latched message of topics that begin so: their publisher has gone."""
+    def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
+        """Repeat no latched message of topics that begin so: their publisher has gone.
+
+        Args:
+            prefix: Beginning of the topics.
+            but: Longer beginnings whose publisher is there.
+        """
 
         def act(command: Command) -> None:
-            self._life.latched.forget(prefix)
+            self._life.latched.forget(prefix, but)
 
         self.input_queue.put_command(Command(action=act, received_ns=0, is_barrier=False))
 
@@ -451,6 +488,8 @@ class Recorder:
     def _tick(self) -> None:
         now_ns, now_s = self._now_ns(), time.monotonic()
         self._status.beat()
+        if cause := self._life.hangs():
+            self._take_over(cause, is_hanging=True)
         self._life.tick(now_ns)
         if now_s >= self._next_second_s:
             self._next_second_s = now_s + SECOND_S
@@ -458,8 +497,13 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
+            for news in self._life.take_news():  # of clocks that were set, by the stamps
+                if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
+                    self.note(news)
+            if not self._life.may_ask_disk:
+                return
             if happened := self._life.look_at_file():
-                self._note(News(text=happened, data={"kind": "file_removed"}))
+                self.note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
             if cause and not self._status.failing and not self._take_over(cause):
                 self._end_because(cause)
@@ -474,13 +518,13 @@ class Recorder:
         self._status.failing = cause
         self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
-    def _take_over(self, cause: str) -> bool:
+    def _take_over(self, cause: str, *, is_hanging: bool = False) -> bool:
         """Let another disk take over, if there is one."""
-        happened = self._life.fail_over(cause)
+        happened = self._life.fail_over(cause, is_hanging=is_hanging)
         if not happened:
             return False
         self._run = self._life.run
-        self._note(News(text=happened, data={"kind": "failover"}))
+        self.note(News(text=happened, data={"kind": "failover"}))
         return True
 
     def _fail(self, error: OSError) -> DiskError | None:

@@ -15,6 +15,8 @@ from bridge.record.queue import InputQueue
 
 SLOW_LAG_S = 0.5
 """A status line says so when small messages have waited longer than this for the disk."""
+FAR_CLOCK_MS = 50.0
+"""A status line names clocks that are further from the recorder's."""
 STALLED_S = 1.0
 """A writer that has not moved for this long is waiting for its disk."""
 
@@ -141,6 +143,11 @@ def _hearing(status: dict[str, Any]) -> str:
         told += f", DEAF: the recorder has not heard even itself for {status['deaf_s']:.1f} s"
     if status.get("receive_errors"):
         told += f", {status['receive_errors']} messages could not be received"
+    for clock in status.get("clocks", ()):
+        if abs(clock["offset_ms"]) > FAR_CLOCK_MS:
+            side = "ahead" if clock["offset_ms"] > 0 else "behind"
+            offset_s = abs(clock["offset_ms"]) / 1e3
+            told += f", clock of {clock['source']} on {clock['host']} {offset_s:.3g} s {side}"
     silent = [Silence(**silence) for silence in status["silent"]]
     named = {silence.topic for silence in silent}
     missing = [text for text in status["missing"] if text.split(" ")[0] not in named]

@@ -11,6 +11,7 @@ from bridge.episode.topics import type_of_topic
 from bridge.record.inspection import GOOD, MessageState, inspect, resolve_type, stamp_reader
 from bridge.record.sequence import SequenceTracker
 from bridge.wire import rmw
+from bridge.wire.clocks import ALIVE
 from bridge.wire.session import WireSample, WireSession
 
 RATE_TOLERANCE = 0.1
@@ -19,7 +20,6 @@ FAR_NS = NS_PER_S
 """Stamps further than this from the time of arrival are of another clock or another unit."""
 MAX_OFFSETS = 10_000
 _UNITS = {"microseconds": 10**3, "milliseconds": 10**6, "seconds": 10**9}
-ALIVE = "/alive"
 
 Kind = Literal["wrong", "missing"]
 

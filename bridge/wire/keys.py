@@ -56,6 +56,13 @@ def key_from_topic(topic: str) -> str:
     return key
 
 
+def topic_pattern(expression: str) -> re.Pattern[str]:
+    """Turn a key expression (``lab/*/image``, ``lab/**``) into a pattern of whole topics."""
+    parts = expression.strip("/").split("/")
+    named = {"**": "(?:/[^/]+)*", "*": "/[^/]+"}
+    return re.compile("".join(named.get(part, "/" + re.escape(part)) for part in parts))
+
+
 @lru_cache(maxsize=4096)
 def read_key(key: str) -> NamedKey:
     """Tell the topic of a key, and type and hash when it is one of rmw_zenoh."""

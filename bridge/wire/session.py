@@ -236,7 +236,14 @@ class WireSession:
         self._services: list[Service] = []
         self._alive: list[AliveToken] = []
         self._definitions: dict[tuple[str, str], schema.Schema] = {}
+        self.topics: set[str] = set()
+        """What it has publishers for."""
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
+
+    @property
+    def identity(self) -> str:
+        """Zenoh's id of this session; no other one has it."""
+        return str(self._inner.zid())
 
     def now_ns(self) -> int:
         """The clock that stamps ``received_ns``; it never runs backwards."""
@@ -274,6 +281,7 @@ class WireSession:
             )
         except zenoh.ZError as error:
             raise BadTopicError(topic=topic, found=cause_of(error)) from error
+        self.topics.add(topic)
         return WirePublisher(inner, self._pool if qos.shared_memory else None)
 
     def subscribe(

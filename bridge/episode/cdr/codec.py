@@ -5,13 +5,15 @@ Layout: OMG DDS-XTypes 1.3, section 7.4.3: every primitive is aligned to its siz
 the end of the 4-byte encapsulation header.
 """
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from bridge.clock import NS_PER_S
 from bridge.episode.schema import DEFINITIONS, full_name
 from bridge.errors import BridgeError
 
@@ -487,3 +489,34 @@ def _byte_order(type_name: str, data: Buffer) -> str:
         found = f"{len(data)} bytes without a CDR encapsulation header"
         raise MalformedMessageError(type_name=type_name, found=found)
     return "<" if data[1] == 1 else ">"
+
+
+_FIRST_IS_HEADER = re.compile(rb"(?:\s*(?:#[^\n]*)?\n)*\s*std_msgs/(?:msg/)?Header\s+header\b")
+_STAMPS = {"<": struct.Struct("<iI"), ">": struct.Struct(">iI")}
+
+
+@lru_cache(maxsize=1024)
+def begins_with_header(definition: bytes) -> bool:
+    """Say whether the first field of a ``ros2msg`` definition is a header."""
+    return _FIRST_IS_HEADER.match(definition) is not None
+
+
+def header_stamp(data: Buffer) -> tuple[int, int] | None:
+    """Read seconds and nanoseconds of the header a message begins with; None for no time."""
+    if len(data) < ORIGIN + 8 or data[1] not in (0, 1):
+        return None
+    sec, nanosec = _STAMPS["<" if data[1] else ">"].unpack_from(data, ORIGIN)
+    return None if sec < 0 or nanosec >= NS_PER_S else (sec, nanosec)
+
+
+def with_header_stamp(data: Buffer, sec: int, nanosec: int) -> bytes:
+    """Put another time into the header a message begins with.
+
+    Args:
+        data: A message that ``header_stamp`` can read.
+        sec: Whole seconds since 1970.
+        nanosec: The rest.
+    """
+    out = bytearray(data)
+    _STAMPS["<" if data[1] else ">"].pack_into(out, ORIGIN, sec, nanosec)
+    return bytes(out)

@@ -190,10 +190,11 @@ class BackgroundSync:
                 return
             synced = offset
 
-    def stop(self) -> None:
-        """End the thread and wait for a sync under way."""
+    def stop(self, *, wait: bool = True) -> None:
+        """End the thread; ``wait`` for a sync under way."""
         self._stop.set()
-        self._thread.join()
+        if wait:
+            self._thread.join()
 
 
 def open_part(path: Path, *, replace_dead: bool) -> PartFile:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8, UInt16
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.cdr.messages import DepthImage, color_from_message
+from bridge.episode.clocks import open_episode
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import (
@@ -28,9 +29,10 @@ from bridge.episode.streams import (
     joint_track,
     plans,
 )
-from bridge.episode.topics import GRIPPER_STATE
+from bridge.episode.topics import COLOR_IMAGE, DEPTH_IMAGE, GRIPPER_STATE
 from bridge.errors import EpisodeError, UsageError
 from bridge.exchange.lerobot import layout
+from bridge.exchange.lerobot.depth import SUFFIX
 from bridge.exchange.lerobot.layout import LeRobotConfig
 from bridge.exchange.lerobot.writer import DatasetShape, DatasetWriter
 from bridge.exchange.output import message_named, new_folder, safe_names, write_note
@@ -38,6 +40,8 @@ from bridge.task.plan import Plan
 from bridge.terminal import Advance
 
 ActionKind = Literal["plan", "next_state"]
+Sizes = dict[str, tuple[int, int]]
+"""Height and width by camera."""
 DEFAULT_FPS = 30
 """Rate of an episode without cameras."""
 
@@ -55,6 +59,8 @@ class Samples:
     images: dict[str, Int[np.ndarray, " num_rows"]]
     """By camera: which of its images belongs to each row."""
     max_image_offset_ns: dict[str, int]
+    depths: dict[str, Int[np.ndarray, " num_rows"]]
+    """By camera: which of its depth images belongs to each row."""
 
     def action(self, kind: ActionKind) -> Float[np.ndarray, "num_rows num_joints"]:
         """Return the actions; the last row of ``next_state`` repeats its own state."""
@@ -72,12 +78,13 @@ def choose_fps(episode: Episode) -> int:
     return DEFAULT_FPS
 
 
-def sample(episode: Episode, fps: int) -> Samples:
+def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
     """Put an episode on the grid, over the time in which joints and all cameras are there.
 
     Args:
         episode: Must have joints; gripper and cameras are taken where they are there.
         fps: Rows per second.
+        depth: Also the depth of the cameras that have it.
 
     Raises:
         EpisodeError: When it has no joints, or its streams never overlap.
@@ -109,6 +116,20 @@ def sample(episode: Episode, fps: int) -> Samples:
         nearest = _nearest(stamps, stamps_ns)
         images[camera] = numbers[nearest]
         offsets[camera] = int(np.abs(stamps[nearest] - stamps_ns).max())
+    depths = {}
+    for camera in cameras if depth else ():
+        if find_camera_topic(episode, camera, DEPTH_IMAGE[1:]) is None:
+            continue
+        stamps, numbers = _image_stamps(episode, camera, DEPTH_IMAGE)
+        if not len(stamps):
+            raise EpisodeError(
+                path=episode.path,
+                found=f"camera {camera} has a depth topic and no depth images",
+                hint="Leave --depth out, or the episode.",
+            )
+        nearest = _nearest(stamps, stamps_ns)
+        depths[camera] = numbers[nearest]
+        offsets[f"{camera}{SUFFIX}"] = int(np.abs(stamps[nearest] - stamps_ns).max())
     names = tuple(name for track in tracks for name in track.names)
     return Samples(
         names=names,
@@ -117,6 +138,7 @@ def sample(episode: Episode, fps: int) -> Samples:
         command=_commands(episode, tracks, stamps_ns + NS_PER_S // fps),
         images=images,
         max_image_offset_ns=offsets,
+        depths=depths,
     )
 
 
@@ -152,21 +174,45 @@ def row_images(
             row += 1
 
 
-def _topic(episode: Episode, camera: str) -> str:
-    topic = find_camera_topic(episode, camera, "color/image")
+def row_depths(
+    episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
+) -> Iterator[UInt16[np.ndarray, "height width"]]:
+    """Yield the depth of each row [mm]; ``wanted`` never decreases.
+
+    Args:
+        episode: Where the images are.
+        camera: Its id in the topics.
+        wanted: Number of the depth image that each row takes, counted from 0 in log order.
+    """
+    row = 0
+    for number, message in enumerate(episode.messages([_topic(episode, camera, DEPTH_IMAGE)])):
+        if row == len(wanted):
+            return
+        if number != wanted[row]:
+            continue
+        with message_named(episode, message.topic, number + 1):
+            depth_mm = DepthImage.from_message(message.type_name, message.data).depth_mm
+        while row < len(wanted) and number == wanted[row]:
+            yield depth_mm
+            row += 1
+
+
+def _topic(episode: Episode, camera: str, ending: str = COLOR_IMAGE) -> str:
+    topic = find_camera_topic(episode, camera, ending[1:])
     assert topic is not None  # noqa: S101  # camera_ids found it
     return topic
 
 
 def _image_stamps(
-    episode: Episode, camera: str
+    episode: Episode, camera: str, ending: str = COLOR_IMAGE
 ) -> tuple[Int[np.ndarray, " num_images"], Int[np.ndarray, " num_images"]]:
     """Stamps of a camera's images and their place in the file; those out of order left out."""
     stamps: list[int] = []
     numbers: list[int] = []
-    for number, message in enumerate(image_messages(episode, [_topic(episode, camera)])):
+    read = color_from_message if ending == COLOR_IMAGE else DepthImage.from_message
+    for number, message in enumerate(image_messages(episode, [_topic(episode, camera, ending)])):
         with message_named(episode, message.topic, number + 1):
-            stamp_ns = color_from_message(message.type_name, message.data).stamp_ns
+            stamp_ns = read(message.type_name, message.data).stamp_ns
         if not stamps or stamp_ns > stamps[-1]:
             stamps.append(stamp_ns)
             numbers.append(number)
@@ -242,6 +288,11 @@ configs:
 ---
 
 """
+_DEPTH_LINE = (
+    f"- Depth (`...{SUFFIX}`) as lerobot 0.6 and later store it: 12-bit codes on a logarithmic "
+    "scale from 0.01 to 10 m, HEVC without further loss; at most 2 mm off up to 10 m, code 0 is "
+    "no measurement. Statistics are in millimetres, of what was measured.\n"
+)
 _ACTIONS = {
     "plan": (
         "what the executed plan commands for the time of the next row (joints interpolated "
@@ -284,7 +335,8 @@ def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]
         f"- Cameras: {cameras}. A row has the image nearest in time, re-encoded as H.264 "
         f"(crf {shape.crf}, lossy).\n"
         f"- `{layout.DONE}` is true in the last row. {success}\n"
-        "- Left out: depth (the format's videos hold 8-bit colour), plans, events, verdicts.\n"
+        f"{_DEPTH_LINE if shape.depths else ''}"
+        f"- Left out: {'' if shape.depths else 'depth, '}plans, events, verdicts.\n"
         "- Image statistics look at every fourth pixel of both axes.\n"
     )
 
@@ -361,15 +413,16 @@ def export_lerobot(
     run = RunFolder(source) if source.is_dir() else None
     with new_folder(out, force=force) as folder:
         layout.parquet()  # says what is missing before the long look
-        first = Episode.open(files[0])
+        first = open_episode(files[0], clock=config.clock)
         fps = config.fps or choose_fps(first)
         success = [_success(run, Episode.open(path)) for path in files]
-        kind, sizes = _look(files, fps, config, advance)
+        kind, sizes, depth_sizes = _look(files, fps, config, advance)
         cameras = safe_names(sizes)
         shape = DatasetShape(
             fps=fps,
             names=sample(first, fps).names,
             cameras={safe: sizes[camera] for camera, safe in cameras.items()},
+            depths={cameras[camera] + SUFFIX: size for camera, size in depth_sizes.items()},
             robot_type=first.info.robot or first.info.cell,
             labelled=None not in success,
             crf=config.crf,
@@ -377,7 +430,7 @@ def export_lerobot(
         writer = DatasetWriter(folder, shape)
         try:
             table = []
-            for row in _add_all(writer, files, success, kind, cameras, shape):
+            for row in _add_all(writer, files, success, kind, cameras, shape, config):
                 table.append(row)
                 advance(len(files) + len(table), str(row["id"]))
             writer.close()
@@ -405,11 +458,18 @@ def _add_all(
     kind: ActionKind,
     cameras: dict[str, str],
     shape: DatasetShape,
+    config: LeRobotConfig,
 ) -> Iterator[dict[str, Any]]:
     """Write one episode after another; yields what there is to say of each."""
     for number, path in enumerate(files):
-        episode = Episode.open(path)
-        samples = sample(episode, shape.fps)
+        episode = open_episode(path, clock=config.clock)
+        samples = sample(episode, shape.fps, depth=config.depth)
+        depths = {
+            cameras[camera] + SUFFIX: _depths(
+                episode, camera, wanted, shape.depths[cameras[camera] + SUFFIX]
+            )
+            for camera, wanted in samples.depths.items()
+        }
         writer.add(
             task=_task(episode),
             state=samples.state,
@@ -418,43 +478,51 @@ def _add_all(
             images={
                 safe: _images(episode, camera, samples.images[camera], shape.cameras[safe])
                 for camera, safe in cameras.items()
-            },
+            }
+            | depths,
         )
         yield _row(number, episode, samples, success[number])
 
 
 def _look(
     files: Sequence[Path], fps: int, config: LeRobotConfig, advance: Advance
-) -> tuple[ActionKind, dict[str, tuple[int, int]]]:
-    """Check that all episodes agree before anything is written; decide what the actions are."""
+) -> tuple[ActionKind, Sizes, Sizes]:
+    """Check that all episodes agree before anything is written; decide what the actions are.
+
+    Returns:
+        The actions, and the sizes of images and of depth by camera.
+    """
     names: tuple[str, ...] = ()
-    sizes: dict[str, tuple[int, int]] = {}
+    sizes: Sizes = {}
+    depth_sizes: Sizes = {}
     without_plan: list[Path] = []
     for number, path in enumerate(files):
-        episode = Episode.open(path)
-        samples = sample(episode, fps)
+        episode = open_episode(path, clock=config.clock)
+        samples = sample(episode, fps, depth=config.depth)
         found = {camera: _size(episode, camera, samples) for camera in samples.images}
+        found_depth = {camera: _depth_size(episode, camera, samples) for camera in samples.depths}
         if number == 0:
-            names, sizes = samples.names, found
-        if (samples.names, found) != (names, sizes):
+            names, sizes, depth_sizes = samples.names, found, found_depth
+        if (samples.names, found, found_depth) != (names, sizes, depth_sizes):
             raise EpisodeError(
                 path=path,
-                found=f"joints {', '.join(samples.names)} and cameras {_words(found)}, but "
-                f"{files[0].name} has {', '.join(names)} and {_words(sizes)}",
+                found=f"joints {', '.join(samples.names)}, cameras {_words(found)}, depth "
+                f"{_words(found_depth)}, but {files[0].name} has {', '.join(names)}, "
+                f"{_words(sizes)}, {_words(depth_sizes)}",
                 hint="One dataset has one robot and one set of cameras; choose with --episodes.",
             )
         if samples.command is None:
             without_plan.append(path)
         advance(number + 1, path.stem)
     if config.action == "next-state" or (config.action == "auto" and without_plan):
-        return "next_state", sizes
+        return "next_state", sizes, depth_sizes
     if without_plan:
         raise EpisodeError(
             path=without_plan[0],
             found="no executed plan that says every joint and the gripper's width",
             hint="Leave --action plan out; the next state is the action then.",
         )
-    return "plan", sizes
+    return "plan", sizes, depth_sizes
 
 
 def _words(sizes: dict[str, tuple[int, int]]) -> str:
@@ -466,17 +534,36 @@ def _size(episode: Episode, camera: str, samples: Samples) -> tuple[int, int]:
     return image_u8.shape[0], image_u8.shape[1]
 
 
+def _depth_size(episode: Episode, camera: str, samples: Samples) -> tuple[int, int]:
+    depth_mm = next(row_depths(episode, camera, samples.depths[camera][:1]))
+    return depth_mm.shape[0], depth_mm.shape[1]
+
+
+def _depths(
+    episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"], size: tuple[int, int]
+) -> Iterator[UInt16[np.ndarray, "height width"]]:
+    for row, depth_mm in enumerate(row_depths(episode, camera, wanted)):
+        _refuse_size(episode, f"depth of {camera}", row, depth_mm, size)
+        yield depth_mm
+
+
+def _refuse_size(
+    episode: Episode, what: str, row: int, pixels: np.ndarray, size: tuple[int, int]
+) -> None:
+    if pixels.shape[:2] != size:
+        raise EpisodeError(
+            path=episode.path,
+            found=f"camera {what}, row {row}: {pixels.shape[1]} x {pixels.shape[0]} "
+            f"pixels, before {size[1]} x {size[0]}",
+            hint="A video has one size; leave the episode out.",
+        )
+
+
 def _images(
     episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"], size: tuple[int, int]
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     for row, image_u8 in enumerate(row_images(episode, camera, wanted)):
-        if image_u8.shape[:2] != size:
-            raise EpisodeError(
-                path=episode.path,
-                found=f"camera {camera}, row {row}: {image_u8.shape[1]} x {image_u8.shape[0]} "
-                f"pixels, before {size[1]} x {size[0]}",
-                hint="A video has one size; leave the episode out.",
-            )
+        _refuse_size(episode, camera, row, image_u8, size)
         yield image_u8
 
 
@@ -512,7 +599,7 @@ def _write_about(
     choices = {
         "format": f"LeRobotDataset {layout.VERSION}",
         "action": kind,
-        "left_out": ["depth: the format's videos hold 8-bit colour"],
+        "left_out": [] if shape.depths else ["depth"],
         "episodes": table,
     }
     write_note(folder, made_by="export lerobot", sources=files, choices=choices)

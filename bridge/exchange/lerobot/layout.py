@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from bridge.clock import ClockChoice
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
+from bridge.exchange.lerobot.depth import DepthCoding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,10 @@ class LeRobotConfig:
     """Only the episodes with these ids, of any kind."""
     crf: int = 23
     """Quality of the H.264 video, lower is better."""
+    depth: bool = False
+    """Also depth, as lerobot 0.6 and later store it: 12-bit HEVC without further loss."""
+    clock: ClockChoice = "recorded"
+    """corrected takes offset and drift of the sources' clocks out of all stamps."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense."""
@@ -76,6 +82,8 @@ class Feature:
     shape: tuple[int, ...]
     names: tuple[str, ...]
     """One per number; made up where the dataset names none."""
+    depth: DepthCoding | None = None
+    """Of a depth video."""
 
     @property
     def is_numeric_vector(self) -> bool:
@@ -194,7 +202,11 @@ def _feature(key: str, record: dict[str, Any]) -> Feature:
         last = key.rsplit(".", 1)[-1]
         if len(names) != shape[0] or len(set(names)) != len(names):
             names = [last] if shape[0] == 1 else [f"{last}_{i}" for i in range(shape[0])]
-    return Feature(key=key, dtype=str(record["dtype"]), shape=shape, names=tuple(names))
+    found = record.get("info") or record.get("video_info") or {}
+    depth = DepthCoding.from_info(found) if record["dtype"] == "video" else None
+    return Feature(
+        key=key, dtype=str(record["dtype"]), shape=shape, names=tuple(names), depth=depth
+    )
 
 
 def _flat_names(names: object) -> list[str]:

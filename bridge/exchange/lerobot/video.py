@@ -1,16 +1,20 @@
-"""H.264 video files: frames in, and frames out at given times. PyAV (the extra [video]) does it."""
+"""Video files: frames in, and frames out at given times. PyAV (the extra [video]) does it.
+
+Colour is H.264, depth HEVC of 12 bits without loss.
+"""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from bridge.errors import MissingDependencyError
+from bridge.exchange.lerobot.depth import PIX_FMT
 from bridge.exchange.lerobot.layout import LeRobotFormatError
 
-CODEC = "libx264"
+CODEC, DEPTH_CODEC = "libx264", "libx265"
+RGB = "rgb24"
 KEYFRAME_EVERY = 2
 """Training reads single frames at random, so every second one can be decoded alone."""
 
@@ -28,8 +32,22 @@ def _av() -> Any:
 class VideoWriter:
     """Append frames to one MP4 file at a constant rate."""
 
-    def __init__(self, path: Path, *, fps: int, width: int, height: int, crf: int) -> None:
-        """Create the file; sizes that are odd get full chroma, for the usual one needs even."""
+    def __init__(
+        self, path: Path, *, fps: int, width: int, height: int, crf: int, is_depth: bool = False
+    ) -> None:
+        """Create the file; sizes that are odd get full chroma, for the usual one needs even.
+
+        Args:
+            path: The file; its folder is made where needed.
+            fps: Frames per second.
+            width: Of every frame [px].
+            height: Of every frame [px].
+            crf: Quality of colour, lower is better.
+            is_depth: Frames are 12-bit codes, kept without loss.
+
+        Raises:
+            MissingDependencyError: Without PyAV, or with one that has no encoder for this.
+        """
         av = _av()
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
@@ -37,32 +55,42 @@ class VideoWriter:
         self._frame_class = av.VideoFrame
         self._intra = av.video.frame.PictureType.I
         self._container = av.open(str(path), "w")
-        options = {
-            "crf": str(crf),
-            "g": str(KEYFRAME_EVERY),
-            "bf": "0",
-            "preset": "veryfast",
-            "forced-idr": "1",
-        }
-        self._stream = self._container.add_stream(CODEC, rate=fps, options=options)
+        options = {"g": str(KEYFRAME_EVERY), "bf": "0", "preset": "veryfast", "forced-idr": "1"}
+        if is_depth:
+            options["x265-params"] = "lossless=1:bframes=0:log-level=none"
+        else:
+            options["crf"] = str(crf)
+        codec = DEPTH_CODEC if is_depth else CODEC
+        if codec not in av.codecs_available:
+            raise MissingDependencyError(
+                package=f"av with {codec}", extra="video", purpose="video in LeRobot datasets"
+            )
+        self._stream = self._container.add_stream(codec, rate=fps, options=options)
         self._stream.width, self._stream.height = width, height
-        self.pix_fmt = "yuv420p" if width % 2 == 0 and height % 2 == 0 else "yuv444p"
+        is_even = width % 2 == 0 and height % 2 == 0
+        self.pix_fmt = PIX_FMT if is_depth else "yuv420p" if is_even else "yuv444p"
         self._stream.pix_fmt = self.pix_fmt
+        self._format = PIX_FMT if is_depth else RGB
 
-    def write(self, image_u8: UInt8[np.ndarray, "height width 3"], *, first: bool) -> None:
+    def write(self, pixels: np.ndarray, *, first: bool) -> None:
         """Append one frame; the first of an episode can be decoded without those before it.
 
         Args:
-            image_u8: RGB.
+            pixels: RGB, height x width x 3 of uint8; of depth codes, height x width of uint16.
             first: It begins an episode, so it is written as a key frame.
         """
-        frame = self._frame_class.from_ndarray(image_u8, format="rgb24")
+        frame = self._frame_class.from_ndarray(pixels, format=self._format)
         if first:
             frame.pict_type = self._intra
         frame.pts = self.num_frames
         for packet in self._stream.encode(frame):
             self._container.mux(packet)
         self.num_frames += 1
+
+    @property
+    def size_bytes(self) -> int:
+        """How large the file is; 0 while the encoder holds everything."""
+        return self.path.stat().st_size if self.path.is_file() else 0
 
     def close(self) -> None:
         """Write what the encoder still holds, and the index."""
@@ -72,14 +100,15 @@ class VideoWriter:
 
 
 def read_frames(
-    path: Path, times_s: Sequence[float], tolerance_s: float
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    path: Path, times_s: Sequence[float], tolerance_s: float, pixels: str = RGB
+) -> Iterator[np.ndarray]:
     """Yield the frame nearest to each time; times ascend [s].
 
     Args:
         path: The video file.
         times_s: From the start of the file [s].
         tolerance_s: How far a frame may be from the time it stands for [s].
+        pixels: ``rgb24``, or ``gray12le`` of depth codes.
 
     Raises:
         LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder
@@ -102,7 +131,9 @@ def read_frames(
                     stream=stream,
                     backward=True,
                 )
-            yield from _nearest(path, container.decode(stream), times_s, tolerance_s)
+            decoded = container.decode(stream)
+            for frame in _nearest(path, decoded, times_s, tolerance_s):
+                yield frame.to_ndarray(format=pixels)
     except (av.FFmpegError, OSError) as error:
         raise LeRobotFormatError(
             path=path,
@@ -113,7 +144,7 @@ def read_frames(
 
 def _nearest(
     path: Path, frames: Iterator[Any], times_s: Sequence[float], tolerance_s: float
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+) -> Iterator[Any]:
     before: Any = None
     after: Any = next(frames, None)
     for number, wanted_s in enumerate(times_s):
@@ -128,4 +159,4 @@ def _nearest(
                 found=f"no frame {number} of the episode at {wanted_s:.4f} s, {there}",
                 hint="The video does not fit meta/episodes; restore both from the dataset.",
             )
-        yield best.to_ndarray(format="rgb24")
+        yield best

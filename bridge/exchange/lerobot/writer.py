@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from bridge.errors import MissingDependencyError
 from bridge.exchange.lerobot import layout
+from bridge.exchange.lerobot.depth import DepthCoding
 from bridge.exchange.lerobot.layout import parquet
 from bridge.exchange.lerobot.video import VideoWriter
 
@@ -74,15 +75,21 @@ class RunningStats:
 
 @dataclass(kw_only=True)
 class ImageStats:
-    """The same over the pixels of images, per channel, scaled to 0..1; counts images."""
+    """The same over the pixels of images, per channel; counts images.
+
+    Colour is scaled to 0..1; depth is in millimetres, where something was measured.
+    """
 
     pixels: RunningStats = field(default_factory=RunningStats)
     images: int = 0
 
-    def add(self, image_u8: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Add one image."""
-        thinned = image_u8[::PIXEL_STRIDE, ::PIXEL_STRIDE].reshape(-1, 3)
-        self.pixels.add(thinned.astype(np.float64) / 255.0)
+    def add(self, pixels: np.ndarray) -> None:
+        """Add one image: height x width x 3 of uint8, or height x width of depth in uint16 [mm]."""
+        thinned = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+        if pixels.ndim == 3:
+            self.pixels.add(thinned.reshape(-1, 3).astype(np.float64) / 255.0)
+        else:
+            self.pixels.add(thinned[thinned > 0].reshape(-1, 1).astype(np.float64))
         self.images += 1
 
     def merge(self, other: "ImageStats") -> None:
@@ -112,6 +119,8 @@ class DatasetShape:
     """Joints of state and action."""
     cameras: dict[str, tuple[int, int]]
     """Height and width by camera."""
+    depths: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Height and width of the depth of those cameras that have it, by the feature's name."""
     robot_type: str
     labelled: bool
     """Whether ``next.success`` is written."""
@@ -128,6 +137,12 @@ class DatasetShape:
             features[layout.IMAGES + camera] = {
                 "dtype": "video",
                 "shape": [height, width, 3],
+                "names": ["height", "width", "channels"],
+            }
+        for camera, (height, width) in self.depths.items():
+            features[layout.IMAGES + camera] = {
+                "dtype": "video",
+                "shape": [height, width, 1],
                 "names": ["height", "width", "channels"],
             }
         flags = (layout.DONE, layout.SUCCESS) if self.labelled else (layout.DONE,)
@@ -172,7 +187,8 @@ class DatasetWriter:
         self._data: Any = None
         self._episodes: Any = None
         self._rows: list[dict[str, Any]] = []
-        self._videos = {camera: _Video() for camera in shape.cameras}
+        self._coding = DepthCoding()
+        self._videos = {camera: _Video() for camera in (*shape.cameras, *shape.depths)}
         self._stats: dict[str, RunningStats | ImageStats] = {}
 
     def add(
@@ -182,7 +198,7 @@ class DatasetWriter:
         state: Float[np.ndarray, "num_rows num_joints"],
         action: Float[np.ndarray, "num_rows num_joints"],
         success: bool | None,
-        images: Mapping[str, Iterable[UInt8[np.ndarray, "height width 3"]]],
+        images: Mapping[str, Iterable[np.ndarray]],
     ) -> None:
         """Append one episode.
 
@@ -191,7 +207,7 @@ class DatasetWriter:
             state: Measured joints.
             action: Commanded joints.
             success: Only written where all episodes are labelled.
-            images: By camera, one per row.
+            images: By camera, one per row: RGB, or depth [mm].
         """
         length = len(state)
         columns = self._columns(task, state, action, success)
@@ -279,22 +295,23 @@ class DatasetWriter:
     def _write_video(
         self,
         camera: str,
-        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+        frames: Iterable[np.ndarray],
         stats: dict[str, RunningStats | ImageStats],
     ) -> dict[str, int | float]:
         video, key = self._videos[camera], layout.IMAGES + camera
         if video.writer is None:
             path = self._folder / layout.VIDEO_PATH.format(video_key=key, **vars(video.place))
-            height, width = self._shape.cameras[camera]
-            video.writer = VideoWriter(
-                path, fps=self._shape.fps, width=width, height=height, crf=self._shape.crf
-            )
+            is_depth = camera in self._shape.depths
+            height, width = (self._shape.depths if is_depth else self._shape.cameras)[camera]
+            shape = {"width": width, "height": height, "crf": self._shape.crf}
+            video.writer = VideoWriter(path, fps=self._shape.fps, is_depth=is_depth, **shape)
             video.pix_fmt = video.writer.pix_fmt
         first = video.writer.num_frames
         found = ImageStats()
-        for image_u8 in frames:
-            video.writer.write(image_u8, first=found.images == 0)
-            found.add(image_u8)
+        for pixels in frames:
+            coded = self._coding.encode(pixels) if camera in self._shape.depths else pixels
+            video.writer.write(coded, first=found.images == 0)
+            found.add(pixels)
         stats[key] = found
         used: dict[str, int | float] = {
             f"videos/{key}/chunk_index": video.place.chunk_index,
@@ -302,7 +319,7 @@ class DatasetWriter:
             f"videos/{key}/from_timestamp": first / self._shape.fps,
             f"videos/{key}/to_timestamp": video.writer.num_frames / self._shape.fps,
         }
-        if video.writer.path.stat().st_size >= layout.VIDEO_FILE_MB * MB:
+        if video.writer.size_bytes >= layout.VIDEO_FILE_MB * MB:
             video.writer.close()
             video.writer = None
             video.place.advance()
@@ -356,16 +373,18 @@ class DatasetWriter:
     def _info(self) -> dict[str, Any]:
         features = self._shape.features()
         for camera, video in self._videos.items():
-            height, width = self._shape.cameras[camera]
+            is_depth = camera in self._shape.depths
+            height, width, channels = features[layout.IMAGES + camera]["shape"]
             features[layout.IMAGES + camera]["info"] = {
                 "video.height": height,
                 "video.width": width,
-                "video.codec": "h264",
+                "video.codec": "hevc" if is_depth else "h264",
                 "video.pix_fmt": video.pix_fmt,
                 "video.is_depth_map": False,
                 "video.fps": self._shape.fps,
-                "video.channels": 3,
+                "video.channels": channels,
                 "has_audio": False,
+                **(self._coding.to_info() if is_depth else {}),
             }
         return {
             "codebase_version": layout.VERSION,

@@ -19,6 +19,7 @@ from bridge.sources.folder.config import FolderConfig
 from bridge.sources.folder.frames import FolderIndex
 from bridge.sources.folder.messages import folder_messages, frame_times_ns, num_frames
 from bridge.terminal import Output
+from bridge.wire.clocks import announce
 from bridge.wire.session import WirePublisher, WireSession
 
 
@@ -56,6 +57,7 @@ class FolderSource:
             Frames and messages sent, and messages by topic.
         """
         index, config = self.index, self.config
+        announce(session, camera_topic(config.cell, config.camera)[1:])
         publishers: dict[str, WirePublisher] = {}
         sent: dict[str, int] = {}
         frames, total = 0, num_frames(index, config)

@@ -1,11 +1,11 @@
 """What of an episode is played back, how fast, and under which names. Imports nothing heavy."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.wire.keys import topic_pattern
 
 ARROW = ":="
 """Between the old and the new name of a topic, as ROS 2 writes it."""
@@ -59,19 +59,12 @@ def choose_topics(patterns: Sequence[str], there: Sequence[str]) -> list[str]:
         return list(there)
     chosen: set[str] = set()
     for pattern in patterns:
-        matches = re.compile(_regular(pattern)).fullmatch
+        matches = topic_pattern(pattern).fullmatch
         found = {topic for topic in there if matches(topic)}
         if not found:
             raise UsageError(f"--topics {pattern!r} names no topic of the episode. {_hint(there)}")
         chosen |= found
     return [topic for topic in there if topic in chosen]
-
-
-def _regular(pattern: str) -> str:
-    """A key expression as a regular expression of topics."""
-    parts = pattern.strip("/").split("/")
-    named = {"**": "(?:/[^/]+)*", "*": "/[^/]+"}
-    return "".join(named.get(part, "/" + re.escape(part)) for part in parts)
 
 
 def rename_topics(pairs: Sequence[str], chosen: Sequence[str]) -> dict[str, str]:

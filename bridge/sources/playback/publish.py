@@ -22,7 +22,7 @@ from bridge.clock import NS_PER_S, ns_from_s
 from bridge.episode import schema
 from bridge.episode.mcap.messages import Selection, Stored, merged
 from bridge.episode.reader import Episode
-from bridge.episode.topics import DROPS, TF_STATIC, is_latched
+from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.errors import UsageError
 from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename_topics
 from bridge.terminal import Output
@@ -199,7 +199,7 @@ class EpisodeSource:
         self._defined: set[str] = set()
         self.pace = Pace(config.rate, paused=config.paused)
         counts = {topic: each.count for topic, each in self.episode.topics().items()}
-        there = [topic for topic in counts if topic != DROPS]
+        there = [topic for topic in counts if topic not in OF_RECORDER]
         self.names = rename_topics(config.remap, choose_topics(config.topics, there))
         for name in self.names.values():
             _check_name(path, name)

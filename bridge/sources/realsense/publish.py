@@ -23,6 +23,7 @@ from bridge.sources.realsense.config import (
 from bridge.sources.realsense.device import CameraDevice, describe_device, rs, serial_of
 from bridge.sources.realsense.messages import CameraMessages, ColorFrame, Frame, Mount, read_mounts
 from bridge.terminal import Output
+from bridge.wire.clocks import announce
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
 
@@ -204,6 +205,7 @@ class RealSenseSource:
         config = self._config
         mounts = {} if config.mounts is None else read_mounts(config.mounts, list(self._wanted))
         announcer = Announcer(session)
+        announce(session, *(camera_topic(config.cell, name)[1:] for name in self._wanted))
         workers = [
             CameraWorker(
                 camera,

@@ -30,6 +30,7 @@ from bridge.sources.ur import messages
 from bridge.sources.ur.config import ControllerError, UrConfig
 from bridge.sources.ur.rtde import RtdeClient, Sample, Wish
 from bridge.terminal import Output
+from bridge.wire.clocks import announce
 from bridge.wire.qos import Qos
 from bridge.wire.session import WireSession
 
@@ -231,6 +232,7 @@ class UrSource:
         urdf = read_urdf(config)
         robot = _robot(config, urdf)
         client: RtdeClient | None = _connect(session, host, config, output)
+        announce(session, config.cell)
         announcer = Announcer(session)
         if urdf is not None:
             announcer.fact("urdf", _description(urdf, session.now_ns()))

@@ -34,6 +34,7 @@ from bridge.sources.realsense.device import CameraDevice  # noqa: E402
 from bridge.sources.realsense.messages import ColorFrame, DepthFrame  # noqa: E402
 from bridge.sources.realsense.publish import RealSenseSource, choose_cameras  # noqa: E402
 from bridge.terminal import Output  # noqa: E402
+from bridge.wire.clocks import ask_clocks  # noqa: E402
 
 QUIET = Output(quiet=True)
 ANSWER_S = 20.0
@@ -250,6 +251,10 @@ def test_two_cameras_are_recorded_and_check_clean(
     running = Running(joined, config, lambda: [side.device, wrist.device])
     running.wait("/lab/cam/side/depth/info", 1)
     running.wait("/lab/cam/wrist/depth/info", 1)
+    alive = {key for key in joined.client.query_alive("**") if "/cam/" in key}
+    assert alive == {"lab/cam/side/alive", "lab/cam/wrist/alive"}
+    (clock,) = ask_clocks(joined.client, timeout_s=ANSWER_S)
+    assert {"/lab/cam/side/color/image", "/lab/cam/wrist/depth/image"} <= clock.topics
     begin_ms = time.time() * 1e3
     for number in range(12):
         for camera in (side, wrist):

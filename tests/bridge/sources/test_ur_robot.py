@@ -20,6 +20,7 @@ from bridge.episode.topics import DROPS
 from bridge.sources.ur.config import UrConfig
 from bridge.sources.ur.publish import UrSource
 from bridge.terminal import Output
+from bridge.wire.clocks import ask_clocks
 from bridge.wire.session import WireSample
 
 QUIET = Output(quiet=True)
@@ -85,6 +86,10 @@ def test_an_arm_is_recorded_whole_and_checks_clean(joined: Joined, server: RtdeS
     joined.control.start("t1", {"kind": "trial", "cell": "lab"})
     running = Running(joined, config)
     running.reach(550)
+    assert "lab/alive" in joined.client.query_alive("**")
+    (clock,) = ask_clocks(joined.client, timeout_s=ANSWER_S)
+    assert clock.source == "lab"
+    assert {"/lab/joint_states", "/tf"} <= clock.topics
     joined.control.stop({"result": "success"})  # a source that ends first has an unknown tail
     result = running.end()
     path = joined.episode_path("t1")

@@ -23,6 +23,7 @@ from cryptography.x509.oid import NameOID
 
 from bridge.episode import schema
 from bridge.record.control import RecorderClient
+from bridge.wire.clocks import announce, ask_clocks
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import NoPeerError, NoReplyError
 from bridge.wire.qos import Qos
@@ -190,6 +191,23 @@ def test_publishers_of_ours_work_behind_the_rules(
     end_s = time.monotonic() + 5.0
     while not publisher.has_subscribers():
         assert time.monotonic() < end_s
+
+
+@pytest.mark.parametrize("name", ["cell", "camera", "stranger"])
+def test_sources_behind_the_rules_are_seen_and_tell_their_clock(
+    guarded: WireSession, join: Callable[[str], WireSession], name: str
+) -> None:
+    alive: list[str] = []
+    guarded.watch_alive("**/alive", lambda key, there: alive.append(key))
+    witness, session = join("cell"), join(name)
+    announce(session, "lab/cam/a")
+    announce(witness, "lab")
+    end_s = time.monotonic() + 5.0
+    while "lab/alive" not in alive:
+        assert time.monotonic() < end_s
+    sources = {answer.source for answer in ask_clocks(guarded, timeout_s=5.0)}
+    assert sources == {"lab", *(["lab/cam/a"] if name != "stranger" else [])}
+    assert ("lab/cam/a/alive" in alive) == (name != "stranger")
 
 
 def test_only_the_operator_controls_the_recorder(

@@ -129,7 +129,7 @@ def test_a_disk_that_breaks_is_named_and_another_takes_over(cell: FaultCell) -> 
     recorder.wait_for("The recording goes on in ")
     assert "Input/output error (the disk, or the connection to it, is failing)" in recorder.said()
     flow.answer()
-    answer = asker.ask("stop")["ok"]
+    answer = flow.ask("stop")["ok"]  # in line behind the last message
     assert (answer["lost"], answer["parts"]) == (0, 2)
     assert asker.ask("start", {"id": "t2", "info": {"cell": "cell"}})["ok"]["ok"]
     assert asker.ask("stop")["ok"]["ok"]
@@ -142,6 +142,35 @@ def test_a_disk_that_breaks_is_named_and_another_takes_over(cell: FaultCell) -> 
     nothing_invented(found, flow.sent())
     assert len(found) == len(flow.sent())
     assert check_code(cell.path("t1")) == 3
+
+
+@pytest.mark.parametrize("answers", [False, True])
+def test_another_disk_takes_over_from_one_that_hangs(cell: FaultCell, answers: bool) -> None:
+    """Law: joined, both halves hold every message once, whether the first disk answers or not."""
+    other = cell.folder / "other"
+    recorder = cell.record(
+        "--episode", "t1", "--cell", "cell", "--failover", str(other), "--hang-s", "1",
+        program=str(HERE / "hanging_recorder.py"),
+    )  # fmt: skip
+    flow, asker = cell.publisher(), cell.publisher()
+    flow.flow(4.0, *MIX)
+    wait_for_messages(asker, 300)
+    recorder.send(signal.SIGUSR1)
+    recorder.wait_for("The recording goes on in ")
+    assert "the disk has not answered for 1." in recorder.said()
+    if answers:
+        recorder.send(signal.SIGUSR2)
+    flow.answer()
+    answer = flow.ask("stop")["ok"]  # in line behind the last message
+    assert (answer["lost"], answer["parts"]) == (0, 2)
+    recorder.finish()
+    assert robot_gst.run(["recover", str(cell.run), str(other), "-q"]) == 0
+    parts = Episode.open(cell.path("t1")).parts
+    assert [part.name for part in parts] == ["t1.mcap", "t1.2.mcap"]
+    found = [item for part in parts for item in read(part)]
+    nothing_invented(found, flow.sent())
+    assert len(found) == len(flow.sent())
+    assert not list(cell.path("t1").parent.glob("*.journal"))
 
 
 def test_a_disk_that_breaks_without_another_ends_the_recorder_with_clear_words(

@@ -1,0 +1,505 @@
+"""Clocks of the hosts that published: measured by round trips, fitted, and taken out of stamps.
+
+A reading of a round trip holds the true offset between its two ends (Cristian 1989), whatever the
+network did. From those the recorder wrote into the episode follows a straight line for each source:
+offset, drift, and how far the truth can be from the line. A reading that agrees with none before
+it means that the clock was set: a new line begins there.
+"""
+
+import contextlib
+import json
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap import records
+
+from bridge.clock import NS_PER_S, ClockChoice, join_ns, split_ns
+from bridge.episode import protobuf, schema
+from bridge.episode.cdr import codec
+from bridge.episode.cdr.messages import VideoFrame
+from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.topics import CLOCKS
+from bridge.errors import EpisodeError
+
+SLEW = 500e-6
+"""A clock that is trimmed gains or loses at most this part of the time that passes (adjtime)."""
+SMALLEST_JUMP_NS = 1_000_000
+COMPARED = 30
+"""Readings before it that a new one must agree with."""
+DRIFT_SPAN_S = 20.0
+"""Readings of a shorter time say nothing of drift."""
+LIVE_NS = 60 * NS_PER_S
+"""Stamps further from the present are no live clock: somebody plays an episode back."""
+STAMP_JUMP_NS = 50_000_000
+"""Stamps that move ahead by this much moved with their clock: no way becomes so much shorter."""
+STAMP_LAG_NS = 1_000_000_000
+"""Stamps that fall behind by less may also have waited for the network."""
+
+
+class Reading(NamedTuple):
+    """One round trip: recorder, source, recorder."""
+
+    at_ns: int
+    """Its middle, by the recorder's clock."""
+    offset_ns: int
+    """Source minus recorder; the truth is within ``error_ns`` of it."""
+    error_ns: int
+    """Half of what the network took, both ways together."""
+
+
+class Jump(NamedTuple):
+    """A clock that was set."""
+
+    at_ns: int
+    """When it was noticed, by the recorder's clock."""
+    by_ns: int
+    """How far, ahead is positive."""
+
+
+def read_round_trip(*, asked_ns: int, received_ns: int, sent_ns: int, back_ns: int) -> Reading:
+    """Turn the four times of a round trip into an offset and its bound.
+
+    Args:
+        asked_ns: When the recorder asked, by its clock.
+        received_ns: When the source received that, by the source's clock.
+        sent_ns: When the source answered, by the source's clock.
+        back_ns: When the answer arrived, by the recorder's clock.
+    """
+    most_ns, least_ns = received_ns - asked_ns, sent_ns - back_ns
+    return Reading(
+        at_ns=(asked_ns + back_ns) // 2,
+        offset_ns=(most_ns + least_ns) // 2,
+        error_ns=max(1, (most_ns - least_ns + 1) // 2),
+    )
+
+
+def jump_of(before: Sequence[Reading], new: Reading) -> Jump | None:
+    """Say whether a reading contradicts those before it; None where it agrees with all.
+
+    Args:
+        before: Readings since the clock was last set, in order.
+        new: The next one.
+    """
+    for old in before[-COMPARED:]:
+        allowed_ns = old.error_ns + new.error_ns + SLEW * abs(new.at_ns - old.at_ns)
+        if abs(new.offset_ns - old.offset_ns) > allowed_ns + SMALLEST_JUMP_NS:
+            best = min(before[-COMPARED:], key=lambda reading: reading.error_ns)
+            return Jump(new.at_ns, new.offset_ns - best.offset_ns)
+    return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockLine:
+    """Offset of one source's clock over a time in which nobody set it."""
+
+    start_ns: int
+    """First and last reading, by the recorder's clock."""
+    end_ns: int
+    offset_ns: float
+    """At the middle of that time; the source is ahead where it is positive."""
+    drift: float | None
+    """Seconds gained in a second; None where the time was too short to tell."""
+    uncertainty_ns: float
+    """The truth is at most this far from the line at each reading that was used."""
+    readings: int
+    """Round trips measured."""
+
+    def offset_at(self, at_ns: int) -> float:
+        """Source minus recorder at a time of the recorder's clock [ns]."""
+        middle_ns = (self.start_ns + self.end_ns) // 2
+        return self.offset_ns + (self.drift or 0.0) * (at_ns - middle_ns)
+
+
+def fit_line(readings: Sequence[Reading]) -> ClockLine:
+    """Fit offset and drift to the quicker half of the readings, the quickest counting most.
+
+    Args:
+        readings: At least one, of a clock that was not set meanwhile.
+    """
+    limit_ns = statistics.median_low(reading.error_ns for reading in readings)
+    used = [reading for reading in readings if reading.error_ns <= limit_ns]
+    start_ns = min(reading.at_ns for reading in readings)
+    end_ns = max(reading.at_ns for reading in readings)
+    middle_ns = (start_ns + end_ns) // 2
+    weights = [1.0 / reading.error_ns**2 for reading in used]
+    total = sum(weights)
+    pairs = [(reading.at_ns - middle_ns, reading.offset_ns) for reading in used]
+    mean_t = sum(w * t for w, (t, _) in zip(weights, pairs, strict=True)) / total
+    mean_o = sum(w * o for w, (_, o) in zip(weights, pairs, strict=True)) / total
+    spread = sum(w * (t - mean_t) ** 2 for w, (t, _) in zip(weights, pairs, strict=True))
+    drift = None
+    span_ns = max(t for t, _ in pairs) - min(t for t, _ in pairs)
+    if span_ns >= DRIFT_SPAN_S * NS_PER_S:
+        shared = zip(weights, pairs, strict=True)
+        drift = sum(w * (t - mean_t) * (o - mean_o) for w, (t, o) in shared) / spread
+    offset_ns = mean_o - (drift or 0.0) * mean_t
+    off_ns = [abs(offset_ns + (drift or 0.0) * t - o) for t, o in pairs]
+    return ClockLine(
+        start_ns=start_ns,
+        end_ns=end_ns,
+        offset_ns=offset_ns,
+        drift=drift,
+        uncertainty_ns=max(d + r.error_ns for d, r in zip(off_ns, used, strict=True)),
+        readings=len(readings),
+    )
+
+
+@dataclass(kw_only=True)
+class SourceClock:
+    """What is known of the clock of one source."""
+
+    source: str
+    """Beginning of its topics, such as ``lab`` or ``lab/cam/side``."""
+    host: str
+    topics: frozenset[str] = frozenset()
+    """What it publishes."""
+    spans: list[list[Reading]] = field(default_factory=list)
+    """Readings, a new list each time the clock was set."""
+    jumps: list[Jump] = field(default_factory=list)
+
+    def add(self, reading: Reading) -> Jump | None:
+        """Take a reading, later than those before; return the jump it shows."""
+        if not self.spans:
+            self.spans.append([reading])
+            return None
+        jump = jump_of(self.spans[-1], reading)
+        if jump is None:
+            self.spans[-1].append(reading)
+        else:
+            self.spans.append([reading])
+            self.jumps.append(jump)
+        return jump
+
+    def lines(self) -> list[ClockLine]:
+        """A line for each time between two jumps."""
+        return [fit_line(span) for span in self.spans]
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, for machines."""
+        return {
+            "source": self.source,
+            "host": self.host,
+            "topics": sorted(self.topics),
+            "lines": [asdict(line) for line in self.lines()],
+            "jumps": [jump._asdict() for jump in self.jumps],
+        }
+
+    def sentences(self) -> list[str]:
+        """What people are told."""
+        line = self.lines()[-1]
+        side = "ahead of" if line.offset_ns >= 0 else "behind"
+        drift = "" if line.drift is None else f", drift {line.drift * 1e6:+.1f} ppm"
+        text = (
+            f"clock of {self.source} on {self.host}: {_in_words(abs(line.offset_ns))} {side} the "
+            f"recorder's, within {_in_words(line.uncertainty_ns)}{drift}"
+        )
+        return [text, *(told_jump(self.source, self.host, jump) for jump in self.jumps)]
+
+
+def told_jump(source: str, host: str, jump: Jump) -> str:
+    """Name a clock that was set.
+
+    Args:
+        source: Beginning of the source's topics.
+        host: Where it runs.
+        jump: When, and how far.
+    """
+    sign = "ahead" if jump.by_ns > 0 else "back"
+    return f"the clock of {source} on {host} was set {sign} by {_in_words(abs(jump.by_ns))}"
+
+
+def _in_words(time_ns: float | int) -> str:
+    return f"{time_ns / 1e9:.3f} s" if time_ns >= NS_PER_S else f"{time_ns / 1e6:.3f} ms"
+
+
+class StampWatch:
+    """Notices a clock that was set by the stamps alone, from the least delay in each second.
+
+    For publishers that nobody can ask. A topic's level before and after the step must each last two
+    seconds, so that neither a stall nor a playback at another rate is taken for one.
+    """
+
+    def __init__(self) -> None:
+        """Know no topic."""
+        self._levels: dict[str, list[int]] = {}
+
+    def see(self, topic: str, delay_ns: int) -> int:
+        """Take the least (arrival - stamp) of the next second; return how far stamps jumped.
+
+        Args:
+            topic: Whose messages.
+            delay_ns: The smallest one of a second [ns].
+
+        Returns:
+            Ahead is positive; 0 where there was no jump.
+        """
+        levels = self._levels.setdefault(topic, [])
+        levels.append(delay_ns)
+        del levels[:-4]
+        if len(levels) < 4:  # two seconds before, two after
+            return 0
+        first, second, third, fourth = levels
+        ahead_ns = second - third
+        is_step = abs(first - second) < STAMP_JUMP_NS and abs(third - fourth) < STAMP_JUMP_NS
+        is_far = ahead_ns > STAMP_JUMP_NS or ahead_ns < -STAMP_LAG_NS
+        is_live = min(abs(second), abs(third)) < LIVE_NS
+        return ahead_ns if is_step and is_far and is_live else 0
+
+
+# In the episode
+
+
+def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) -> dict[str, Any]:
+    """Make the record of ``/recorder/clocks``.
+
+    Args:
+        clock: The source.
+        identity: Of its process; another one has another clock.
+        readings: Those that the episode does not have yet.
+    """
+    return {
+        "schema_version": 1,
+        "source": clock.source,
+        "id": identity,
+        "host": clock.host,
+        "topics": sorted(clock.topics),
+        "readings": [list(reading) for reading in readings],
+    }
+
+
+def source_clocks(records: Iterable[dict[str, Any]]) -> list[SourceClock]:
+    """Put together what an episode says of clocks, by source.
+
+    Args:
+        records: Those of ``/recorder/clocks``, in log order; what is no such record is left out.
+    """
+    found: dict[tuple[str, str], SourceClock] = {}
+    for record in records:
+        try:
+            key = (str(record["source"]), str(record["id"]))
+            readings = [Reading(*map(int, values)) for values in record["readings"]]
+            topics = frozenset(map(str, record["topics"]))
+        except (KeyError, TypeError, ValueError):
+            continue
+        clock = found.get(key)
+        if clock is None:
+            host = str(record.get("host", ""))
+            clock = found[key] = SourceClock(source=key[0], host=host)
+        clock.topics |= topics
+        for reading in readings:
+            clock.add(reading)
+    return [clock for clock in found.values() if clock.spans]
+
+
+def parse_clock_record(data: bytes) -> dict[str, Any]:
+    """Read one message of ``/recorder/clocks``; empty where it is damaged."""
+    try:
+        record = json.loads(data)
+    except (ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+class StampCorrection:
+    """Turns stamps of the sources' clocks into times of the recorder's clock."""
+
+    def __init__(self, clocks: Sequence[SourceClock]) -> None:
+        """Prepare the lines by topic."""
+        self._lines: dict[str, list[tuple[SourceClock, ClockLine]]] = {}
+        for clock in clocks:
+            for line in clock.lines():
+                for topic in clock.topics:
+                    self._lines.setdefault(topic, []).append((clock, line))
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Topics whose source answered."""
+        return frozenset(self._lines)
+
+    def shift_ns(self, topic: str, publish_ns: int, log_ns: int) -> int:
+        """What must be added to a stamp; 0 where nobody knows the topic's clock.
+
+        Of several lines the one that holds at the time counts; between two, the one that puts the
+        message closest to its arrival. Sources that share a topic and differ are left alone.
+
+        Args:
+            topic: Of the message.
+            publish_ns: Its time by the source's clock.
+            log_ns: When it arrived, by the recorder's clock.
+        """
+        known = self._lines.get(topic)
+        if not known:
+            return 0
+        holding = [pair for pair in known if pair[1].start_ns <= log_ns <= pair[1].end_ns]
+        if holding:
+            offsets = [line.offset_at(log_ns) for _, line in holding]
+            bound_ns = sum(line.uncertainty_ns for _, line in holding)
+            if max(offsets) - min(offsets) > bound_ns:
+                return 0
+            best = min((line for _, line in holding), key=lambda line: line.uncertainty_ns)
+            return -round(best.offset_at(log_ns))
+        away = [_away_ns(line, log_ns) for _, line in known]
+        near = [line for (_, line), far in zip(known, away, strict=True) if far <= _next(away)]
+        return min(
+            (-round(line.offset_at(log_ns)) for line in near),
+            key=lambda shift_ns: abs(log_ns - (publish_ns + shift_ns)),
+        )
+
+
+def _away_ns(line: ClockLine, at_ns: int) -> int:
+    return max(line.start_ns - at_ns, at_ns - line.end_ns)
+
+
+def _next(away: Sequence[int]) -> int:
+    """The second smallest: at most the lines before and after a jump are asked."""
+    return sorted(away)[:2][-1]
+
+
+def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: int) -> RawMessage:
+    """Move the time of a message, and the time it holds itself, where its type has one.
+
+    Args:
+        message: As stored.
+        definition: Of its type; None where there is none.
+        shift_ns: What is added [ns]; times that were never set stay 0.
+    """
+    publish_ns = max(0, message.publish_time_ns + shift_ns)
+    data = message.data
+    with contextlib.suppress(codec.MalformedMessageError):
+        data = _restamped_data(message.type_name, definition, data, shift_ns)
+    return message._replace(publish_time_ns=publish_ns, data=data)
+
+
+def _restamped_data(
+    type_name: str, definition: records.Schema | None, data: bytes, shift_ns: int
+) -> bytes:
+    if type_name == schema.TF_MESSAGE:
+        message = codec.decode(type_name, data)
+        for item in message["transforms"]:
+            stamp = item["header"]["stamp"]
+            stamp["sec"], stamp["nanosec"] = _moved(stamp["sec"], stamp["nanosec"], shift_ns)
+        return codec.encode(type_name, message)
+    if type_name == schema.COMPRESSED_VIDEO:
+        return _restamped_video(data, shift_ns)
+    if definition is None:
+        return data
+    if definition.encoding == "jsonschema":
+        return _restamped_json(data, shift_ns)
+    if definition.encoding != "ros2msg" or not codec.begins_with_header(definition.data):
+        return data
+    stamp = codec.header_stamp(data)
+    return data if stamp is None else codec.with_header_stamp(data, *_moved(*stamp, shift_ns))
+
+
+def _moved(sec: int, nanosec: int, shift_ns: int) -> tuple[int, int]:
+    stamp_ns = join_ns(sec, nanosec)
+    return split_ns(max(0, stamp_ns + shift_ns)) if stamp_ns else (sec, nanosec)
+
+
+def _restamped_json(data: bytes, shift_ns: int) -> bytes:
+    record = parse_clock_record(data)
+    stamp_ns = record.get("stamp_ns")
+    if not isinstance(stamp_ns, int) or isinstance(stamp_ns, bool) or stamp_ns <= 0:
+        return data
+    return json.dumps({**record, "stamp_ns": max(0, stamp_ns + shift_ns)}).encode()
+
+
+def _restamped_video(data: bytes, shift_ns: int) -> bytes:
+    frame = VideoFrame.from_protobuf(data)
+    sec, nanosec = _moved(*split_ns(frame.stamp_ns), shift_ns)
+    stamp = protobuf.number_field(1, sec) + protobuf.number_field(2, nanosec)
+    parts = [protobuf.bytes_field(1, stamp)]
+    for number, value in protobuf.fields(memoryview(data)):
+        if number != 1 and not isinstance(value, int):
+            parts.append(protobuf.bytes_field(number, bytes(value)))
+    return b"".join(parts)
+
+
+def clocks_of(episode: Episode) -> list[SourceClock]:
+    """What an episode says of the clocks of its sources; empty where nobody measured them."""
+    messages = episode.messages([CLOCKS]) if CLOCKS in episode.topics() else ()
+    return source_clocks(parse_clock_record(message.data) for message in messages)
+
+
+class CorrectedEpisode(Episode):
+    """An episode whose sources' stamps are read in the time of the recorder's clock."""
+
+    def __init__(self, episode: Episode) -> None:
+        """Use ``open_episode``."""
+        super().__init__(episode.files, episode.missing_parts)
+        self._correction = StampCorrection(clocks_of(episode))
+        self._definitions: dict[tuple[str, str], records.Schema] = {}
+        for file in self.files:
+            for channel in file.summary.channels.values():
+                record = file.schema_of(channel)
+                if record is not None:
+                    self._definitions[channel.topic, record.name] = record
+
+    @property
+    def corrected(self) -> frozenset[str]:
+        """Topics whose stamps are moved."""
+        return self._correction.topics & frozenset(self.topics())
+
+    def shift_ns(self, message: RawMessage) -> int:
+        """What must be added to the stamps of a message as it was recorded [ns]."""
+        return self._correction.shift_ns(
+            message.topic, message.publish_time_ns, message.log_time_ns
+        )
+
+    def messages(
+        self,
+        topics: Iterable[str] | None = None,
+        *,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[RawMessage]:
+        """Yield messages as ``Episode.messages`` does, with moved stamps.
+
+        Args:
+            topics: Topics wanted; None for all.
+            start_ns: First log time wanted [ns since 1970]; None: from the start.
+            end_ns: Log time to stop before [ns since 1970]; None: to the end.
+        """
+        for message in super().messages(topics, start_ns=start_ns, end_ns=end_ns):
+            shift_ns = self.shift_ns(message)
+            if shift_ns:
+                definition = self._definitions.get((message.topic, message.type_name))
+                yield restamped(message, definition, shift_ns)
+            else:
+                yield message
+
+    def payloads(self, *groups: Iterable[str]) -> list[list[bytes]]:
+        """Return the bytes of all messages of each group of topics, in log order."""
+        wanted = [frozenset(topics) for topics in groups]
+        found: list[list[bytes]] = [[] for _ in wanted]
+        for message in self.messages(frozenset[str]().union(*wanted)):
+            for topics, payloads in zip(wanted, found, strict=True):
+                if message.topic in topics:
+                    payloads.append(message.data)
+        return found
+
+
+def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
+    """Open an episode as ``Episode.open`` does, with the clock a person asked for.
+
+    Args:
+        path: The file, the first part of a split one.
+        clock: ``corrected`` takes the sources' offset and drift out of all stamps.
+
+    Raises:
+        EpisodeError: When nobody measured the clocks, or the file cannot be read.
+    """
+    episode = Episode.open(path)
+    if clock == "recorded":
+        return episode
+    corrected = CorrectedEpisode(episode)
+    if not corrected.corrected:
+        raise EpisodeError(
+            path=path,
+            found=f"it holds no clock readings ({CLOCKS}), so that stamps cannot be corrected",
+            hint="Read it with --clock recorded.",
+        )
+    return corrected

@@ -1,0 +1,178 @@
+"""Asks every source for its clock, once a second, and says which clock was set.
+
+The readings go into the open episode on ``/recorder/clocks``; ``bridge.episode.clocks`` fits them.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Collection
+from typing import Any
+
+from bridge.episode.clocks import (
+    STAMP_JUMP_NS,
+    Reading,
+    SourceClock,
+    StampWatch,
+    to_record,
+    told_jump,
+)
+from bridge.record.presence import News
+from bridge.wire.clocks import ClockAnswer, ask_clocks
+from bridge.wire.errors import WireError
+from bridge.wire.session import WireSession
+
+PERIOD_S = 1.0
+MAX_SOURCES = 200
+KEPT = 600
+"""Readings kept of each source."""
+EARLIER = 60
+"""Of those made before an episode, at most so many begin it: the best of each stretch."""
+
+Record = dict[str, Any]
+
+
+class ClockBook:
+    """What the recorder knows of its sources' clocks; may be used by several threads."""
+
+    def __init__(
+        self,
+        *,
+        tell: Callable[[News], None] = lambda news: None,
+        write: Callable[[Record], None] = lambda record: None,
+    ) -> None:
+        """Know no source.
+
+        Args:
+            tell: Called with each clock that was set.
+            write: Called with each record for the open episode.
+        """
+        self._tell = tell
+        self._write = write
+        self._lock = threading.Lock()
+        self._clocks: dict[tuple[str, str], SourceClock] = {}
+
+    def take(self, answer: ClockAnswer) -> None:
+        """Enter what a source answered."""
+        key = (answer.source, answer.identity)
+        with self._lock:
+            clock = self._clocks.get(key)
+            if clock is None:
+                if len(self._clocks) >= MAX_SOURCES:
+                    del self._clocks[next(iter(self._clocks))]
+                clock = self._clocks[key] = SourceClock(source=answer.source, host=answer.host)
+            clock.topics = answer.topics
+            jump = clock.add(answer.reading)
+            del clock.spans[-1][:-KEPT]
+            record = to_record(clock, answer.identity, [answer.reading])
+        self._write(record)
+        if jump is not None:
+            text = told_jump(clock.source, clock.host, jump)
+            data = {"kind": "clock_jump", "source": clock.source, "host": clock.host}
+            self._tell(News(text=text, data={**data, "by_ns": jump.by_ns}, warns=True))
+
+    def earlier(self) -> list[Record]:
+        """Records of what was measured before an episode, to begin it with."""
+        with self._lock:
+            return [
+                to_record(clock, identity, _best(clock.spans[-1]))
+                for (_, identity), clock in self._clocks.items()
+            ]
+
+    def has_named(self, topics: Collection[str], by_ns: int) -> bool:
+        """Say whether the jump that stamps show is one that their source's answers have shown.
+
+        Args:
+            topics: Whose stamps jumped.
+            by_ns: How far.
+        """
+        with self._lock:
+            return any(
+                clock.topics.issuperset(topics) and abs(jump.by_ns - by_ns) < STAMP_JUMP_NS
+                for clock in self._clocks.values()
+                for jump in clock.jumps[-1:]
+            )
+
+    def status(self) -> list[Record]:
+        """What goes into the recorder's status, by source."""
+        told = []
+        with self._lock:
+            for clock in self._clocks.values():
+                line = clock.lines()[-1]
+                told.append(
+                    {
+                        "source": clock.source,
+                        "host": clock.host,
+                        "offset_ms": round(line.offset_ns / 1e6, 3),
+                        "uncertainty_ms": round(line.uncertainty_ns / 1e6, 3),
+                        "drift_ppm": None if line.drift is None else round(line.drift * 1e6, 2),
+                        "jumps": len(clock.jumps),
+                    }
+                )
+        return told
+
+
+def _best(readings: list[Reading]) -> list[Reading]:
+    """The surest reading of each stretch of equally many, in order."""
+    size = -(-len(readings) // EARLIER)
+    stretches = (readings[at : at + size] for at in range(0, len(readings), size))
+    return [min(stretch, key=lambda reading: reading.error_ns) for stretch in stretches]
+
+
+class ClockAsker:
+    """Asks all sources on a thread of its own."""
+
+    def __init__(self, session: WireSession, book: ClockBook) -> None:
+        """Begin to ask."""
+        self._session = session
+        self._book = book
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._ask, name="clocks", daemon=True)
+        self._thread.start()
+
+    def _ask(self) -> None:
+        while not self._ended.is_set():
+            with contextlib.suppress(WireError):  # the session is closing
+                for answer in ask_clocks(self._session, timeout_s=PERIOD_S):
+                    self._book.take(answer)
+            self._ended.wait(PERIOD_S)
+
+    def close(self) -> None:
+        """Stop."""
+        self._ended.set()
+        self._thread.join(timeout=2 * PERIOD_S)
+
+
+class StampJumps:
+    """Clocks that were set, by the stamps of an episode's messages; one line for each."""
+
+    def __init__(self) -> None:
+        """Begin an episode."""
+        self._watch = StampWatch()
+
+    def look(self, records: list[Record]) -> list[News]:
+        """Look through the drop records of some seconds.
+
+        Args:
+            records: In the order of their seconds.
+        """
+        found: dict[tuple[int, bool], dict[str, int]] = {}
+        for record in records:
+            delay_ns = record["clock_offset_ns"]
+            by_ns = 0 if delay_ns is None else self._watch.see(record["topic"], delay_ns)
+            if by_ns:
+                at = (record["second"], by_ns > 0)
+                found.setdefault(at, {})[record["topic"]] = by_ns
+        return [_told_stamps(jumped) for jumped in found.values()]
+
+
+def _told_stamps(jumped: dict[str, int]) -> News:
+    topics = sorted(jumped)
+    by_ns = jumped[topics[0]]
+    more = f" and {len(topics) - 1} more" if len(topics) > 1 else ""
+    side = "ahead" if by_ns > 0 else "back"
+    text = (
+        f"the stamps of {topics[0]}{more} jumped {side} by {abs(by_ns) / 1e9:.3f} s: the clock of "
+        "their publisher was set"
+    )
+    data = {"kind": "stamp_jump", "topics": topics, "by_ns": by_ns}
+    return News(text=text, data=data, warns=True)
