@@ -173,6 +173,7 @@ def calibrate(
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
     Physics: robot-gst calibrate runs/monday --physics
+    From trials: robot-gst calibrate runs/monday --belief
 
     Args:
         run: Run folder.
@@ -183,9 +184,22 @@ def calibrate(
     from bridge.errors import UsageError
 
     run_folder = RunFolder.open(run)
-    if config.cameras == config.physics:
-        message = "say what to calibrate: robot-gst calibrate RUN --cameras, or --physics."
+    if config.cameras + config.physics + config.belief != 1:
+        message = "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --belief."
         raise UsageError(message)
+    if config.belief:
+        from bridge.process_pool import default_size
+        from twin.calibrate.belief import calibrate_belief, describe_belief
+
+        workers = config.workers or default_size()
+        belief, calibration_id = calibrate_belief(
+            run_folder, num_draws=config.draws, workers=workers, output=output
+        )
+        output.result(
+            {**belief, "calibration_id": calibration_id},
+            describe_belief(belief, calibration_id),
+        )
+        return 0
     if config.physics:
         from twin.calibrate.physics.run import calibrate_physics, describe_physics
 
