@@ -26,7 +26,7 @@ BEFORE, AFTER = 4, 4
 """Trials that a gate with default settings judges, and those judged with a belief from them."""
 SAMPLES = 16
 DRAWS = 32
-MIN_P = 0.5
+MIN_P = 0.65
 ITERATIONS = 100
 READY_S, ENDS_S = 300.0, 60.0
 ROUNDS = 2

@@ -247,8 +247,8 @@ class Sample:
     accepted: bool | None
     first_failing: str | None
     reason: str | None
-    chance: float = 0.0
-    """Of success in the real cell, now that this replay has said so."""
+    chance: float | None = None
+    """Of success in the real cell now that this replay has said so; None: the replay is believed."""
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst sample v1 record, checked against its schema."""
@@ -310,10 +310,9 @@ def _sample(
         accepted, failing, reason = verdict.accepted, verdict.first_failing, verdict.reason
     except GstError as error:  # this variation cannot be replayed; the others can
         reason = str(error)
-    believed = config.variation.believed(halving(index))
-    wrong_yes, wrong_no = (
-        (0.0, 0.0) if believed is None else (believed.wrong_yes, believed.wrong_no)
-    )
+    believed, chance = config.variation.believed(halving(index)), None
+    if believed is not None:
+        chance = 1.0 - believed.wrong_yes if accepted is True else believed.wrong_no
     return Sample(
         plan_id=plan_id,
         index=index,
@@ -321,7 +320,7 @@ def _sample(
         accepted=accepted,
         first_failing=failing,
         reason=reason,
-        chance=1.0 - wrong_yes if accepted is True else wrong_no,
+        chance=chance,
     )
 
 
@@ -340,9 +339,13 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
 
     k, n = sum(sample.accepted is True for sample in samples), len(samples)
-    value = sum(sample.chance for sample in samples) / n
+    value = sum(_chance(sample) for sample in samples) / n
     z = float(norm.ppf(0.5 + LEVEL / 2))
     centre = (value + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
-    low, high = max(0.0, centre - half), min(1.0, centre + half)
+    low, high = max(0.0, min(centre - half, value)), min(1.0, max(centre + half, value))
     return replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
+
+
+def _chance(sample: Sample) -> float:
+    return float(sample.accepted is True) if sample.chance is None else sample.chance
