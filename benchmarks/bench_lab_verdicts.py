@@ -8,11 +8,12 @@ Ctrl-C and started again it goes on; ``--report`` only prints what there is.
 
 import argparse
 import json
+import os
 import queue
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ TASKS = (
 FIRST, PER_TASK = 8100, 10
 """Unused seeds; the development seeds of the cell are 1000000 to 1000999."""
 RESAMPLES = 10_000
+NAME = "lab_verdicts"
 PARTS = {"before": "default settings", "after": "with the session's first four trials"}
+RESULT = Path(os.environ.get("GST_BENCH_RESULTS", ROOT / "benchmarks" / "results"), NAME + ".json")
 Rows = Sequence[dict[str, Any]]
 
 
@@ -57,12 +60,21 @@ def sessions_of(asked: argparse.Namespace) -> list[LabSession]:
     return found
 
 
+def stored_rows() -> dict[tuple[str, int], list[dict[str, Any]]]:
+    """Complete sessions of an interim result, whose recordings need not be there any more."""
+    if not RESULT.is_file():
+        return {}
+    found: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for row in json.loads(RESULT.read_text())["rows"]:
+        found.setdefault((row["task"], row["seed"]), []).append(row)
+    return found
+
+
 def record_all(sessions: Sequence[LabSession], side_by_side: int) -> None:
     """Record those that are not complete; one that fails does not stop the others."""
     todo: queue.SimpleQueue[LabSession] = queue.SimpleQueue()
     for session in sessions:
-        if not session.rows_file.is_file():
-            todo.put(session)
+        todo.put(session)
 
     stopping = threading.Event()
 
@@ -90,6 +102,21 @@ def record_all(sessions: Sequence[LabSession], side_by_side: int) -> None:
         stopping.set()
         end_all()
         raise
+
+
+def complete(session: LabSession, found: Mapping[tuple[str, int], Any]) -> bool:
+    """Whether a session is recorded, here or in the stored result."""
+    return session.rows_file.is_file() or (session.task, session.seed) in found
+
+
+def rows_of_session(
+    session: LabSession, found: Mapping[tuple[str, int], list[dict[str, Any]]]
+) -> list[dict[str, Any]]:
+    """Rows of a complete session, from its folder where it is there."""
+    if session.rows_file.is_file():
+        rows: list[dict[str, Any]] = json.loads(session.rows_file.read_text())
+        return rows
+    return found[session.task, session.seed]
 
 
 def judged(rows: Rows) -> Rows:
@@ -267,10 +294,11 @@ def main() -> None:
     """Record, then report."""
     asked = arguments()
     sessions = sessions_of(asked)
+    known = stored_rows()
     if not asked.report:
-        record_all(sessions, asked.side_by_side)
-    done = [session for session in sessions if session.rows_file.is_file()]
-    rows = [row for session in done for row in json.loads(session.rows_file.read_text())]
+        record_all([each for each in sessions if not complete(each, known)], asked.side_by_side)
+    done = [session for session in sessions if complete(session, known)]
+    rows = [row for session in done for row in rows_of_session(session, known)]
     with_first_trials(rows)
     targets, details = [], {}
     for part, label in PARTS.items():
@@ -289,7 +317,7 @@ def main() -> None:
         f"{'' if asked.development is None else ', development seeds'}"
     )
     if whole or asked.store:
-        report_targets("lab_verdicts", targets, note=note, complete=whole, parts=details, rows=rows)
+        report_targets(NAME, targets, note=note, complete=whole, parts=details, rows=rows)
     else:
         print(note)
         print_targets(targets)

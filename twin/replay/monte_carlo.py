@@ -248,7 +248,7 @@ class Sample:
     first_failing: str | None
     reason: str | None
     chance: float | None = None
-    """Of success in the real cell now that this replay has said so; None: the replay is believed."""
+    """Of success in the real cell now that this replay has said so; None: it is believed."""
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst sample v1 record, checked against its schema."""
