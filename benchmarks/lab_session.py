@@ -1,8 +1,8 @@
 """One session in the laboratory with the real commands, each a process of its own, as a user does.
 
 A scan, ``rebuild``, a gate with default settings and four trials that it judges and does not stop;
-then ``calibrate --belief`` from those four, and a gate that knows it judges four more starts. What
-is done is kept: started again, a session goes on where it was.
+then ``calibrate --posterior`` from those four, and a gate that knows it judges four more starts.
+What is done is kept: started again, a session goes on where it was.
 """
 
 import json
@@ -23,7 +23,7 @@ from measure import ROOT
 
 CELL = "lab"
 BEFORE, AFTER = 4, 4
-"""Trials that a gate with default settings judges, and those judged with a belief from them."""
+"""Trials that a gate with default settings judges, and those judged with a posterior from them."""
 SAMPLES = 16
 DRAWS = 32
 MIN_P = 0.65
@@ -71,10 +71,10 @@ class LabSession:
             if not (self.run / "scene" / "sdf.npz").is_file():
                 command = ["rebuild", str(self.run), "--iterations", str(ITERATIONS)]
                 self._do("rebuild", [*command, "--threads", "1"])
-            if not self._belief():
+            if not self._posterior():
                 self._trials("before", endpoint, BEFORE, [])
-                believe = ["calibrate", str(self.run), "--belief", "--draws", str(DRAWS)]
-                self._do("belief", [*believe, "--workers", "1"])
+                weigh = ["calibrate", str(self.run), "--posterior", "--draws", str(DRAWS)]
+                self._do("posterior", [*weigh, "--workers", "1"])
             self._trials("after", endpoint, BEFORE + AFTER, ["--min-p-success", str(MIN_P)])
         rows = rows_of(self)
         self.rows_file.write_text(json.dumps(rows, indent=1) + "\n")
@@ -83,9 +83,9 @@ class LabSession:
     def _logs(self) -> Path:
         return self.run / "notes" / "logs"
 
-    def _belief(self) -> bool:
+    def _posterior(self) -> bool:
         path = self.run / "scene" / "calibration.json"
-        return path.is_file() and "belief" in json.loads(path.read_text())
+        return path.is_file() and "posterior" in json.loads(path.read_text())
 
     def _publish(self, endpoint: str) -> list[str]:
         about = ["--task", self.task, "--cell", CELL, "--seed", str(self.seed)]

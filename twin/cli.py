@@ -173,7 +173,7 @@ def calibrate(
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
     Physics: robot-gst calibrate runs/monday --physics
-    From trials: robot-gst calibrate runs/monday --belief
+    From trials: robot-gst calibrate runs/monday --posterior
 
     Args:
         run: Run folder.
@@ -184,20 +184,22 @@ def calibrate(
     from bridge.errors import UsageError
 
     run_folder = RunFolder.open(run)
-    if config.cameras + config.physics + config.belief != 1:
-        message = "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --belief."
+    if config.cameras + config.physics + config.posterior != 1:
+        message = (
+            "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --posterior."
+        )
         raise UsageError(message)
-    if config.belief:
+    if config.posterior:
         from bridge.process_pool import default_size
-        from twin.calibrate.belief import calibrate_belief, describe_belief
+        from twin.replay.posterior import calibrate_posterior, describe_posterior
 
         workers = config.workers or default_size()
-        belief, calibration_id = calibrate_belief(
+        posterior, calibration_id = calibrate_posterior(
             run_folder, num_draws=config.draws, workers=workers, output=output
         )
         output.result(
-            {**belief, "calibration_id": calibration_id},
-            describe_belief(belief, calibration_id),
+            {**posterior, "calibration_id": calibration_id},
+            describe_posterior(posterior, calibration_id),
         )
         return 0
     if config.physics:

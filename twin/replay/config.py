@@ -18,7 +18,7 @@ RIGID_MASSES = "masses of rigid objects"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Believed:
+class PosteriorDraw:
     """One draw of what nobody measured and all trials of a session have in common."""
 
     finger_pair_friction: float
@@ -72,7 +72,7 @@ class VariationConfig:
     """Fields of ``PhysicsConfig``, and the masses of rigid objects, with the spread of their
     logarithm that calibration found; they replace the priors above. No flag: read from the scene's
     calibration."""
-    belief: Annotated[tuple[Believed, ...], Parameter(parse=False)] = ()
+    posterior: Annotated[tuple[PosteriorDraw, ...], Parameter(parse=False)] = ()
     """What the session's own trials left of wide priors; samples draw frictions, force, masses and
     a common shift of all poses from it instead of from the spreads above. No flag: read from the
     scene's calibration."""
@@ -94,16 +94,16 @@ class VariationConfig:
             },
         )
 
-    def believed(self, share: float) -> Believed | None:
-        """The draw at a share of the belief's weight, 0 to 1; None: there is no belief."""
-        if not self.belief:
+    def draw_at(self, share: float) -> PosteriorDraw | None:
+        """The draw at a share of the posterior's weight, 0 to 1; None: there is no posterior."""
+        if not self.posterior:
             return None
         below = 0.0
-        for draw in self.belief:
+        for draw in self.posterior:
             below += draw.weight
             if share < below:
                 return draw
-        return self.belief[-1]
+        return self.posterior[-1]
 
     def physics_spreads(self) -> dict[str, float]:
         """Spread of the logarithm per field of ``PhysicsConfig``, in a fixed order.

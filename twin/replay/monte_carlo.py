@@ -19,7 +19,7 @@ from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
 from bridge.task.verdict import Verdict
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import Believed, ReplayConfig, VariationConfig
+from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
@@ -80,10 +80,10 @@ def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
 
 
-def as_believed(
-    draw: Believed, scene: ReplayScene, config: ReplayConfig
+def with_draw(
+    draw: PosteriorDraw, scene: ReplayScene, config: ReplayConfig
 ) -> tuple[ReplayScene, ReplayConfig]:
-    """A start and settings as one draw of a belief has them.
+    """A start and settings as one draw of a posterior has them.
 
     The objects' own friction stays: what a draw has is that of both surfaces together.
 
@@ -127,8 +127,8 @@ def draw_variation(
 ) -> Variation:
     """Draw poses from the localisation's covariance and physics from the priors.
 
-    Where there is a belief, what it knows of comes from its draws: the samples take turns, so that
-    each has as many as its weight says.
+    Where there is a posterior, what it knows of comes from its draws: the samples take turns, so
+    that each has as many as its weight says.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -138,12 +138,12 @@ def draw_variation(
         rng: Of this sample; see ``sample_rng``.
         scene: Nominal poses, their covariances and the task's objects.
         config: Nominal physics, and how far to vary around it.
-        index: Number of the sample; says which draw of a belief is its.
+        index: Number of the sample; says which draw of a posterior is its.
     """
     settings = config.variation
-    believed = settings.believed(halving(index))
-    if believed is not None:
-        scene, config = as_believed(believed, scene, config)
+    drawn = settings.draw_at(halving(index))
+    if drawn is not None:
+        scene, config = with_draw(drawn, scene, config)
         settings = replace(settings, friction_log=0.0, grip_force_log=0.0, mass_log=0.0)
     factors = {
         name: float(np.exp(spread * rng.standard_normal()))
@@ -247,8 +247,8 @@ class Sample:
     accepted: bool | None
     first_failing: str | None
     reason: str | None
-    chance: float | None = None
-    """Of success in the real cell now that this replay has said so; None: it is believed."""
+    probability: float | None = None
+    """Of success in the real cell now that this replay has said so; None: taken at its word."""
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst sample v1 record, checked against its schema."""
@@ -310,9 +310,9 @@ def _sample(
         accepted, failing, reason = verdict.accepted, verdict.first_failing, verdict.reason
     except GstError as error:  # this variation cannot be replayed; the others can
         reason = str(error)
-    believed, chance = config.variation.believed(halving(index)), None
-    if believed is not None:
-        chance = 1.0 - believed.wrong_yes if accepted is True else believed.wrong_no
+    drawn, probability = config.variation.draw_at(halving(index)), None
+    if drawn is not None:
+        probability = 1.0 - drawn.wrong_yes if accepted is True else drawn.wrong_no
     return Sample(
         plan_id=plan_id,
         index=index,
@@ -320,7 +320,7 @@ def _sample(
         accepted=accepted,
         first_failing=failing,
         reason=reason,
-        chance=chance,
+        probability=probability,
     )
 
 
@@ -328,7 +328,7 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     """Add the share of accepted samples with its Wilson interval; without samples nothing.
 
     A sample that could not be decided counts among those that were not accepted. Where there is a
-    belief, each sample counts with the chance that its answer is right in this session.
+    posterior, each sample counts with the chance that its answer is right in this session.
 
     Args:
         verdict: Of the nominal replay.
@@ -339,7 +339,7 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
 
     k, n = sum(sample.accepted is True for sample in samples), len(samples)
-    value = sum(_chance(sample) for sample in samples) / n
+    value = sum(_probability(sample) for sample in samples) / n
     z = float(norm.ppf(0.5 + LEVEL / 2))
     centre = (value + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
@@ -347,5 +347,5 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     return replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
 
 
-def _chance(sample: Sample) -> float:
-    return float(sample.accepted is True) if sample.chance is None else sample.chance
+def _probability(sample: Sample) -> float:
+    return float(sample.accepted is True) if sample.probability is None else sample.probability

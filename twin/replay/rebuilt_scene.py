@@ -22,7 +22,7 @@ from bridge.task.task_file import ObjectModel, Task
 from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, shifted
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import RIGID_MASSES, Believed, ReplayConfig
+from twin.replay.config import RIGID_MASSES, PosteriorDraw, ReplayConfig
 from twin.replay.scene import ReplayScene, StartState
 from twin.scene.shape.from_training import with_heights
 from twin.scene.shape.lattice import Lattice
@@ -32,8 +32,8 @@ from twin.scene.store.folder import read_record
 from twin.scene.store.npz import UnreadableArraysError
 
 
-class UnreadableBeliefError(TwinError):
-    """What calibration.json says of a belief is none; make it again: calibrate RUN --belief."""
+class UnreadablePosteriorError(TwinError):
+    """The posterior of calibration.json is none; make it again: calibrate RUN --posterior."""
 
 
 INTERVAL_SIGMAS = 2 * 1.96
@@ -157,24 +157,24 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     masses = _mass_spread(calibration)
     if masses is not None:
         spreads += ((RIGID_MASSES, masses),)
-    variation = replace(config.variation, calibrated=spreads, belief=belief_of(calibration))
+    variation = replace(config.variation, calibrated=spreads, posterior=posterior_of(calibration))
     return replace(config, physics=physics, variation=variation)
 
 
-def belief_of(calibration: Calibration) -> tuple[Believed, ...]:
-    """The draws that a run's trials left some weight; empty where there is no belief.
+def posterior_of(calibration: Calibration) -> tuple[PosteriorDraw, ...]:
+    """The draws that a run's trials left some weight; empty where there is no posterior.
 
     Raises:
-        UnreadableBeliefError: When one lacks a number.
+        UnreadablePosteriorError: When one lacks a number.
     """
-    draws = _mapping(calibration.record, "belief").get("draws", [])
+    draws = _mapping(calibration.record, "posterior").get("draws", [])
     try:
         return tuple(
-            Believed(**{**draw, "bias_m": tuple(float(value) for value in draw["bias_m"])})
+            PosteriorDraw(**{**draw, "bias_m": tuple(float(value) for value in draw["bias_m"])})
             for draw in draws
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise UnreadableBeliefError(f"the belief of calibration.json: {error!r}") from error
+        raise UnreadablePosteriorError(f"the posterior of calibration.json: {error!r}") from error
 
 
 def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:

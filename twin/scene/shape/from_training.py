@@ -231,6 +231,19 @@ def rim_height_m(
     return float(np.percentile(seen, TOP_PERCENTILE)) if len(seen) >= FEWEST_POINTS else None
 
 
+def _rim_heights_m(
+    views: Sequence[TrainingView], task: Task, Ts_base_object: Poses
+) -> dict[str, float]:
+    """Of the containers whose walls the views show."""
+    found = {}
+    for key, T in Ts_base_object.items():
+        if task.objects[key].wall_m > 0:
+            height_m = rim_height_m(views, task.objects[key], T)
+            if height_m is not None:
+                found[key] = height_m
+    return found
+
+
 def with_heights(task: Task, heights_m: Mapping[str, float]) -> Task:
     """A task whose containers are as high as they were seen to be.
 
@@ -267,15 +280,12 @@ def write_static(
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
-    heights_m = {}
-    for key, T in Ts_base_object.items() if task is not None else ():
-        if task.objects[key].wall_m > 0:
-            heights_m[key] = rim_height_m(views, task.objects[key], T)
-    heights_m = {key: height for key, height in heights_m.items() if height is not None}
+    heights_m = {} if task is None else _rim_heights_m(views, task, Ts_base_object)
+    seen = None if task is None else with_heights(task, heights_m)
     objects = [
-        partial(from_outside_m, model=with_heights(task, heights_m).objects[key], T_base_object=T)
+        partial(from_outside_m, model=seen.objects[key], T_base_object=T)
         for key, T in Ts_base_object.items()
-        if task is not None
+        if seen is not None
     ]
     try:
         static = static_sdf(views, None if task is None else 0.0, objects, config)

@@ -152,14 +152,14 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
     return _store(run, {**kept, "physics": current, "physics_history": history})
 
 
-def write_belief(run: RunFolder, belief: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what the run's trials say of what nobody measured; an earlier belief is replaced.
+def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, Any]:
+    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced.
 
     Args:
         run: Run folder; ``scene/`` is made where needed.
-        belief: The record, with ``draws`` and the trials they were weighed by.
+        posterior: The record, with ``draws`` and the trials they were weighed by.
     """
-    return _store(run, {**_kept(run), "belief": belief})
+    return _store(run, {**_kept(run), "posterior": posterior})
 
 
 def _kept(run: RunFolder) -> dict[str, Any]:

@@ -14,8 +14,18 @@ from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
-from twin.calibrate import belief
-from twin.calibrate.belief import (
+from twin.replay import posterior
+from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
+from twin.replay.monte_carlo import (
+    Sample,
+    draw_variation,
+    halving,
+    replay_samples,
+    sample_rng,
+    with_draw,
+    with_probability,
+)
+from twin.replay.posterior import (
     BIAS_M,
     FRICTION,
     WRONG,
@@ -23,26 +33,16 @@ from twin.calibrate.belief import (
     NoTrialsError,
     Record,
     Trial,
-    calibrate_belief,
-    describe_belief,
+    calibrate_posterior,
+    describe_posterior,
     draw_beforehand,
     effective,
     log_nearness,
     weighed,
 )
-from twin.replay.config import Believed, ReplayConfig, VariationConfig
-from twin.replay.monte_carlo import (
-    Sample,
-    as_believed,
-    draw_variation,
-    halving,
-    replay_samples,
-    sample_rng,
-    with_probability,
-)
-from twin.replay.rebuilt_scene import UnreadableBeliefError, belief_of, calibrated
+from twin.replay.rebuilt_scene import UnreadablePosteriorError, calibrated, posterior_of
 from twin.replay.scene import ReplayScene
-from twin.scene.store.calibration import Calibration, read_calibration, write_belief
+from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
 
 QUIET = Output(quiet=True)
 TASK = load_task("slippery_block_into_box")
@@ -90,7 +90,7 @@ def trial(*, success: bool, end_m: tuple[float, float] = (0.5, 0.2)) -> Trial:
 def holds_from(limit: float) -> object:
     """A world in which a block is held from a friction on."""
 
-    def end_of(tried: Trial, draw: Believed) -> Ended:
+    def end_of(tried: Trial, draw: PosteriorDraw) -> Ended:
         held = draw.finger_pair_friction * draw.grip_scale / draw.mass_scale > limit
         end_m = np.array([0.5, 0.2]) if held else tried.scene.Ts_base_object["block"][:2, 3]
         return Ended(success=held, ends_m={"block": end_m})
@@ -127,11 +127,11 @@ def test_how_far_an_answer_is_trusted_is_the_integral_over_all_rates(
 
     record = Record(right=right, wrong=wrong)
     assert np.exp(record.log_likelihood) == pytest.approx(weigh(0), rel=1e-4)
-    assert record.chance_wrong == pytest.approx(weigh(1) / weigh(0), rel=1e-4)
+    assert record.probability_wrong == pytest.approx(weigh(1) / weigh(0), rel=1e-4)
 
 
 def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(belief, "end_of", holds_from(0.3))
+    monkeypatch.setattr(posterior, "end_of", holds_from(0.3))
     draws = draw_beforehand(64)
     start = scene().Ts_base_object["block"][:2, 3]
     fell = [trial(success=False, end_m=tuple(start)) for _ in range(3)]
@@ -144,7 +144,7 @@ def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_no_draw_explains_makes_every_yes_doubtful(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(belief, "end_of", holds_from(-1.0))  # the twin always says yes
+    monkeypatch.setattr(posterior, "end_of", holds_from(-1.0))  # the twin always says yes
     draws = draw_beforehand(8)
     doubtful = weighed(draws, [trial(success=False)] * 4, workers=1, output=QUIET)
     sure = weighed(draws, [trial(success=True)] * 4, workers=1, output=QUIET)
@@ -167,7 +167,7 @@ def test_an_end_elsewhere_counts_against_a_draw_but_not_without_bound() -> None:
 def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None:
     draw = replace(draw_beforehand(2)[1], bias_m=(0.004, -0.002), mass_scale=1.5)
     before, config = scene(), ReplayConfig()
-    after, settings = as_believed(draw, before, config)
+    after, settings = with_draw(draw, before, config)
     for name, T in before.Ts_base_object.items():
         np.testing.assert_allclose(after.Ts_base_object[name][:2, 3] - T[:2, 3], draw.bias_m)
     own = settings.physics.object_friction
@@ -184,7 +184,7 @@ def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
     few = [
         replace(draw, weight=w) for draw, w in zip(draw_beforehand(2), (0.75, 0.25), strict=True)
     ]
-    config = ReplayConfig(variation=VariationConfig(belief=tuple(few)))
+    config = ReplayConfig(variation=VariationConfig(posterior=tuple(few)))
     frictions = [
         draw_variation(sample_rng(0, "s", k), scene(), config, index=k).physics.finger_friction
         for k in range(16)
@@ -195,7 +195,7 @@ def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
 
 def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() -> None:
     draw = replace(draw_beforehand(2)[0], weight=1.0, wrong_yes=0.4, wrong_no=0.1)
-    config = ReplayConfig(samples=4, variation=VariationConfig(belief=(draw,)))
+    config = ReplayConfig(samples=4, variation=VariationConfig(posterior=(draw,)))
     answers = iter([True, True, False, None])
 
     def replay(there: ReplayScene, settings: ReplayConfig) -> Verdict:
@@ -209,7 +209,7 @@ def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() ->
     assert p["low"] < p["value"] < p["high"]
 
 
-def test_without_a_belief_the_interval_is_wilsons() -> None:
+def test_without_a_posterior_the_interval_is_wilsons() -> None:
     samples = [
         Sample(
             plan_id="p",
@@ -227,7 +227,7 @@ def test_without_a_belief_the_interval_is_wilsons() -> None:
     assert (p["low"], p["high"]) == pytest.approx((wilson.low, wilson.high))
 
 
-def test_replays_read_the_belief_that_was_written(tmp_path: Path) -> None:
+def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
     record = {
         "draws": [draw.to_record() for draw in draws],
@@ -235,26 +235,26 @@ def test_replays_read_the_belief_that_was_written(tmp_path: Path) -> None:
         "sources": {"trial_0001": {"sha256": "0", "success": True}},
         "skipped": {"trial_0002": "nobody said how it ended"},
     }
-    before = write_belief(run, record)["calibration_id"]
+    before = write_posterior(run, record)["calibration_id"]
     known = read_calibration(run)
     assert known is not None
-    assert calibrated(ReplayConfig(), known).variation.belief == tuple(draws)
-    told = describe_belief(record, str(before))
+    assert calibrated(ReplayConfig(), known).variation.posterior == tuple(draws)
+    told = describe_posterior(record, str(before))
     assert "4 draws weighed by 1 trials, 1 of which succeeded" in told
     assert "trial_0002 not used" in told
-    write_belief(run, {**record, "draws": record["draws"][:2]})
+    write_posterior(run, {**record, "draws": record["draws"][:2]})
     again = read_calibration(run)
     assert again is not None
     assert again.calibration_id != before
-    damaged: Mapping[str, object] = {**known.record, "belief": {"draws": [{"weight": 1.0}]}}
-    with pytest.raises(UnreadableBeliefError, match="bias_m"):
-        belief_of(Calibration(record=damaged, cameras={}))
+    damaged: Mapping[str, object] = {**known.record, "posterior": {"draws": [{"weight": 1.0}]}}
+    with pytest.raises(UnreadablePosteriorError, match="bias_m"):
+        posterior_of(Calibration(record=damaged, cameras={}))
 
 
 def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     with pytest.raises(NoTrialsError, match="no executed trial"):
-        calibrate_belief(run, num_draws=2, workers=1, output=QUIET)
+        calibrate_posterior(run, num_draws=2, workers=1, output=QUIET)
     assert not (run.scene_dir / "calibration.json").exists()
 
 
@@ -262,5 +262,5 @@ def test_only_one_thing_is_calibrated_at_a_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = RunFolder.create(tmp_path / "run")
-    assert robot_gst.run(["calibrate", str(run.path), "--belief", "--physics"]) == 2
-    assert "--belief" in capsys.readouterr().err
+    assert robot_gst.run(["calibrate", str(run.path), "--posterior", "--physics"]) == 2
+    assert "--posterior" in capsys.readouterr().err

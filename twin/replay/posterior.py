@@ -26,15 +26,15 @@ from bridge.process_pool import Failed, ProcessPool
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.terminal import Output
-from twin.replay.config import Believed, ReplayConfig
+from twin.replay.config import PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
-from twin.replay.monte_carlo import as_believed
+from twin.replay.monte_carlo import with_draw
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
-from twin.scene.store.calibration import Calibration, read_calibration, write_belief
+from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
 from twin.scene.store.folder import scene_hash_of
 
 FRICTION = (0.05, 1.2)
@@ -80,7 +80,7 @@ class Ended:
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
 
 
-def draw_beforehand(count: int) -> list[Believed]:
+def draw_beforehand(count: int) -> list[PosteriorDraw]:
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
@@ -91,15 +91,15 @@ def draw_beforehand(count: int) -> list[Believed]:
     frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
     factors = np.exp(FACTOR_LOG * z[:, 2:4])
     return [
-        Believed(
+        PosteriorDraw(
             finger_pair_friction=float(finger),
             surface_pair_friction=float(surface),
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
             weight=1.0 / count,
-            wrong_yes=Record(right=0, wrong=0).chance_wrong,
-            wrong_no=Record(right=0, wrong=0).chance_wrong,
+            wrong_yes=Record(right=0, wrong=0).probability_wrong,
+            wrong_no=Record(right=0, wrong=0).probability_wrong,
         )
         for (finger, surface), (mass, grip), bias in zip(
             frictions, factors, BIAS_M * z[:, 4:], strict=True
@@ -159,7 +159,7 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    config = for_task(calibrated(ReplayConfig(), _without_belief(run)), task)
+    config = for_task(calibrated(ReplayConfig(), _without_posterior(run)), task)
     return Trial(
         episode=episode.info.id,
         sha256=episode.sha256(),
@@ -173,24 +173,24 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     )
 
 
-def _without_belief(run: RunFolder) -> Calibration | None:
+def _without_posterior(run: RunFolder) -> Calibration | None:
     """Of the run's calibration, all but what is made anew."""
     known = read_calibration(run)
     if known is None:
         return None
     return replace(
-        known, record={key: known.record[key] for key in known.record if key != "belief"}
+        known, record={key: known.record[key] for key in known.record if key != "posterior"}
     )
 
 
-def end_of(trial: Trial, draw: Believed) -> Ended:
+def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
     """Replay a trial's plan as a draw would have it.
 
     Args:
         trial: Begins where its objects were localised, moved by the draw's bias.
         draw: What is not known.
     """
-    scene, config = as_believed(draw, trial.scene, trial.config)
+    scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
     scene = free_start(scene, soft_models(scene), config.start_overlap_m)
     path, _, _ = path_of_plan(trial.plan, robot, config)
@@ -238,13 +238,13 @@ class Record:
         return float(betaln(a + self.wrong, b + self.right) - betaln(a, b))
 
     @property
-    def chance_wrong(self) -> float:
+    def probability_wrong(self) -> float:
         """That the next such answer is wrong."""
         a, b = WRONG
         return (a + self.wrong) / (a + b + self.wrong + self.right)
 
 
-Piece = tuple[int, Trial, Believed]
+Piece = tuple[int, Trial, PosteriorDraw]
 
 
 def _ended(piece: Piece) -> Ended:
@@ -256,8 +256,8 @@ def _ended(piece: Piece) -> Ended:
 
 
 def weighed(
-    draws: Sequence[Believed], trials: Sequence[Trial], *, workers: int, output: Output
-) -> list[Believed]:
+    draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int, output: Output
+) -> list[PosteriorDraw]:
     """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
 
     Args:
@@ -281,7 +281,9 @@ def weighed(
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     return [
-        replace(draw, weight=float(w), wrong_yes=yes.chance_wrong, wrong_no=no.chance_wrong)
+        replace(
+            draw, weight=float(w), wrong_yes=yes.probability_wrong, wrong_no=no.probability_wrong
+        )
         for draw, w, (no, yes) in zip(draws, weights, answers, strict=True)
     ]
 
@@ -297,18 +299,18 @@ def _answers(pieces: Sequence[Piece], workers: int) -> Any:
             yield piece, answer
 
 
-def effective(draws: Sequence[Believed]) -> float:
+def effective(draws: Sequence[PosteriorDraw]) -> float:
     """How many equal draws would know as much: 1 / sum of squared weights (Kong 1992)."""
     return 1.0 / float(np.sum(np.square([draw.weight for draw in draws])))
 
 
-def calibrate_belief(
+def calibrate_posterior(
     run: RunFolder, *, num_draws: int, workers: int, output: Output
 ) -> tuple[dict[str, Any], str]:
     """Weigh draws by a run's trials and write them to ``calibration.json``.
 
     Args:
-        run: Whose trials are read, and in whose scene folder the belief goes.
+        run: Whose trials are read, and in whose scene folder the posterior goes.
         num_draws: From the priors.
         workers: Processes.
         output: Shows progress.
@@ -330,21 +332,21 @@ def calibrate_belief(
         "skipped": skipped,
     }
     record["id"] = provenance.hash_settings(record)
-    return record, str(write_belief(run, record)["calibration_id"])
+    return record, str(write_posterior(run, record)["calibration_id"])
 
 
-def describe_belief(record: Mapping[str, Any], calibration_id: str) -> str:
+def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
     """Say what the trials left of the priors.
 
     Args:
-        record: As ``calibrate_belief`` makes it.
+        record: As ``calibrate_posterior`` makes it.
         calibration_id: Of the calibration that holds now.
     """
     draws, trials = record["draws"], record["sources"]
     good = sum(item["success"] for item in trials.values())
     lines = [
-        f"belief: {len(draws)} draws weighed by {len(trials)} trials, {good} of which succeeded; "
-        f"as much as {record['effective_draws']:.1f} equal ones; calibration {calibration_id}"
+        f"posterior: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
+        f"succeeded; as much as {record['effective_draws']:.1f} equal ones; calibration {calibration_id}"
     ]
     weights = np.array([draw["weight"] for draw in draws])
     for name in (key for key in draws[0] if key != "weight"):
