@@ -346,7 +346,8 @@ def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
     good = sum(item["success"] for item in trials.values())
     lines = [
         f"posterior: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
-        f"succeeded; as much as {record['effective_draws']:.1f} equal ones; calibration {calibration_id}"
+        f"succeeded; as much as {record['effective_draws']:.1f} equal ones; "
+        f"calibration {calibration_id}"
     ]
     weights = np.array([draw["weight"] for draw in draws])
     for name in (key for key in draws[0] if key != "weight"):
