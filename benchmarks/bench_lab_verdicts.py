@@ -37,7 +37,7 @@ RESULT = Path(os.environ.get("GST_BENCH_RESULTS", ROOT / "benchmarks" / "results
 Rows = Sequence[dict[str, Any]]
 
 
-def arguments() -> argparse.Namespace:
+def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=ROOT / "runs" / "lab_verdicts")
     parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=TASKS)
@@ -46,7 +46,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--side-by-side", type=int, default=1)
     parser.add_argument("--report", action="store_true", help="record nothing")
     parser.add_argument("--store", action="store_true", help="keep the result, complete or not")
-    return parser.parse_args()
+    return parser.parse_args(given)
 
 
 def sessions_of(asked: argparse.Namespace) -> list[LabSession]:

@@ -197,7 +197,7 @@ def _row(path: Path, task: Any) -> dict[str, Any]:
         "detail": None if outcome is None else outcome.detail,
         "planned": bool(plans),
         "said": None if verdict is None else verdict["accepted"],
-        "nominal": _nominal(verdict),
+        "nominal": nominal_of(verdict),
         "p_success": None if p is None else p["value"],
         "samples": None if p is None else p["n"],
         "reason": None if verdict is None else verdict["reason"],
@@ -205,7 +205,7 @@ def _row(path: Path, task: Any) -> dict[str, Any]:
     }
 
 
-def _nominal(verdict: dict[str, Any] | None) -> bool | None:
+def nominal_of(verdict: dict[str, Any] | None) -> bool | None:
     """What the nominal replay alone says; what its samples took away is given back."""
     if verdict is None:
         return None
