@@ -165,14 +165,15 @@ def rows_of(session: LabSession) -> list[dict[str, Any]]:
     task, first = load_task(session.task), session.seed * SEEDS_PER_SESSION
     rows = []
     for path in sorted((session.run / "episodes").glob("trial_*.mcap")):
-        row = _row(path, task)
+        row = row_of(path, task)
         start = row.pop("start_seed") - first
         part = "before" if start < BEFORE else "after"
         rows.append({"task": task.name, "seed": session.seed, "start": start, "part": part, **row})
     return rows
 
 
-def _row(path: Path, task: Any) -> dict[str, Any]:
+def row_of(path: Path, task: Any) -> dict[str, Any]:
+    """What one trial's recording says of its plan, its verdict and its end."""
     from bridge.episode import streams
     from bridge.episode.reader import Episode
     from bridge.geometry import se3
