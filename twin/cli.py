@@ -221,6 +221,7 @@ def calibrate(
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
     Physics: robot-gst calibrate runs/monday --physics
+    From trials: robot-gst calibrate runs/monday --posterior
 
     Args:
         run: Run folder.
@@ -231,9 +232,24 @@ def calibrate(
     from bridge.errors import UsageError
 
     run_folder = RunFolder.open(run)
-    if config.cameras == config.physics:
-        message = "say what to calibrate: robot-gst calibrate RUN --cameras, or --physics."
+    if config.cameras + config.physics + config.posterior != 1:
+        message = (
+            "say what to calibrate: robot-gst calibrate RUN --cameras, --physics or --posterior."
+        )
         raise UsageError(message)
+    if config.posterior:
+        from bridge.process_pool import default_size
+        from twin.replay.posterior import calibrate_posterior, describe_posterior
+
+        workers = config.workers or default_size()
+        posterior, calibration_id = calibrate_posterior(
+            run_folder, num_draws=config.draws, workers=workers, output=output
+        )
+        output.result(
+            {**posterior, "calibration_id": calibration_id},
+            describe_posterior(posterior, calibration_id),
+        )
+        return 0
     if config.physics:
         from twin.calibrate.physics.run import calibrate_physics, describe_physics
 

@@ -22,6 +22,11 @@ class CalibrateConfig:
     physics: bool = False
     """Friction, masses, forces, delay and pose bias from executed probes and trials, written to
     RUN/scene/calibration.json where held-out episodes confirm them."""
+    posterior: bool = False
+    """Which friction, masses, force and common shift agree with the trials executed in this run,
+    written to RUN/scene/calibration.json; samples of replays and of the gate then draw from it."""
+    draws: int = 64
+    """With --posterior: draws from the priors, each replayed through every trial."""
     pairs: Path | None = None
     """JSON or CSV file of pose pairs (T_base_effector, T_camera_target), for --camera."""
     camera: str = ""
@@ -42,8 +47,8 @@ class CalibrateConfig:
     """With --physics: a last resort, named where it strikes: wall time after which the search ends
     before its last point: 1h, 10min or plain seconds."""
     workers: int | None = None
-    """With --physics: processes that simulate side by side: one for each core, at most 8, when no
-    number is given."""
+    """With --physics and --posterior: processes that simulate side by side; one for each core, at
+    most 8, when no number is given."""
     samples: int = 4
     """With --physics: noisy starts of each judged trial behind its chance of success; 0: what the
     operator said of trials is not used."""
@@ -59,5 +64,6 @@ class CalibrateConfig:
                 "budget_s": (0, float("inf")),
                 "workers": (1, 1024),
                 "samples": (0, 1000),
+                "draws": (2, 100_000),
             },
         )

@@ -115,6 +115,7 @@ def _sigmas(item: Any) -> tuple[float, float]:
 
 
 ENGINE_NONE = "none"
+ROUNDING = 1e-9
 POLL_S = 0.05
 ANSWER_S = 0.1
 """Kept back from the wall-clock limit for answering."""
@@ -487,7 +488,10 @@ class Gate:
             )
         if p["value"] >= wanted:
             return verdict
-        detail = f"{p['k']:g} of {p['n']:g} varied replays succeed, {wanted:.0%} are asked for"
+        told = f"{p['k']:g} of {p['n']:g} varied replays succeed"
+        if abs(p["value"] - p["k"] / p["n"]) > ROUNDING:
+            told += f", and with what this session's trials say of them {p['value']:.0%} would"
+        detail = f"{told}, {wanted:.0%} are asked for"
         unlikely = Factor(value=False, cause="probability", detail=detail)
         return replace(verdict, terminal=unlikely, reason=f"terminal: probability: {detail}")
 

@@ -1,8 +1,8 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -15,6 +15,33 @@ FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 GRIP_FORCE = "grip_force_N"
 RIGID_MASSES = "masses of rigid objects"
 """Beside fields of ``PhysicsConfig`` among what a calibration found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosteriorDraw:
+    """One draw of what nobody measured and all trials of a session have in common."""
+
+    finger_pair_friction: float
+    """Between the pads and objects, whatever share each has in it."""
+    surface_pair_friction: float
+    """Between objects and the table."""
+    mass_scale: float
+    """Times the masses of the task file."""
+    grip_scale: float
+    """Times the force that the gripper is said to have."""
+    bias_m: tuple[float, float]
+    """Added to every localised pose along x and y [m]."""
+    weight: float
+    """How much it counts; those of all draws together are 1."""
+    wrong_yes: float
+    """Chance that a plan fails in this session although the replay with this draw succeeds: from
+    something that the twin does not have."""
+    wrong_no: float
+    """Chance that one succeeds although this replay fails."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Return plain numbers."""
+        return {**asdict(self), "bias_m": list(self.bias_m)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +72,10 @@ class VariationConfig:
     """Fields of ``PhysicsConfig``, and the masses of rigid objects, with the spread of their
     logarithm that calibration found; they replace the priors above. No flag: read from the scene's
     calibration."""
+    posterior: Annotated[tuple[PosteriorDraw, ...], Parameter(parse=False)] = ()
+    """What the session's own trials left of wide priors; samples draw frictions, force, masses and
+    a common shift of all poses from it instead of from the spreads above. No flag: read from the
+    scene's calibration."""
 
     def __post_init__(self) -> None:
         """Refuse spreads that are none."""
@@ -62,6 +93,17 @@ class VariationConfig:
                 "grip_delay_s": (0, most),
             },
         )
+
+    def draw_at(self, share: float) -> PosteriorDraw | None:
+        """The draw at a share of the posterior's weight, 0 to 1; None: there is no posterior."""
+        if not self.posterior:
+            return None
+        below = 0.0
+        for draw in self.posterior:
+            below += draw.weight
+            if share < below:
+                return draw
+        return self.posterior[-1]
 
     def physics_spreads(self) -> dict[str, float]:
         """Spread of the logarithm per field of ``PhysicsConfig``, in a fixed order.

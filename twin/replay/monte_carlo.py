@@ -19,7 +19,7 @@ from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
 from bridge.task.verdict import Verdict
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import ReplayConfig, VariationConfig
+from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
@@ -80,8 +80,55 @@ def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
 
 
-def draw_variation(rng: np.random.Generator, scene: ReplayScene, config: ReplayConfig) -> Variation:
+def with_draw(
+    draw: PosteriorDraw, scene: ReplayScene, config: ReplayConfig
+) -> tuple[ReplayScene, ReplayConfig]:
+    """A start and settings as one draw of a posterior has them.
+
+    The objects' own friction stays: what a draw has is that of both surfaces together.
+
+    Args:
+        draw: What is not known.
+        scene: Its movable objects get other masses, all of its objects are shifted.
+        config: With the force that the gripper is said to have.
+    """
+    own = config.physics.object_friction
+    physics = replace(
+        config.physics,
+        finger_friction=draw.finger_pair_friction / own,
+        surface_friction=draw.surface_pair_friction / own,
+        grip_force_N=config.physics.grip_force_N * draw.grip_scale,
+    )
+    objects = {
+        name: model if model.fixed else replace(model, mass_kg=model.mass_kg * draw.mass_scale)
+        for name, model in scene.task.objects.items()
+    }
+    poses = {}
+    for name, T in scene.Ts_base_object.items():
+        poses[name] = T.copy()
+        poses[name][:2, 3] += draw.bias_m
+    moved = replace(scene, task=replace(scene.task, objects=objects), Ts_base_object=poses)
+    return moved, replace(config, physics=physics)
+
+
+def halving(index: int) -> float:
+    """Share of 0 to 1 that is each next index's: 1/2, 1/4, 3/4, 1/8 ... (van der Corput 1935).
+
+    The first so many are spread evenly, however many they are.
+    """
+    share, width, left = 0.0, 0.5, index + 1
+    while left:
+        share, left, width = share + width * (left % 2), left // 2, width / 2
+    return share
+
+
+def draw_variation(
+    rng: np.random.Generator, scene: ReplayScene, config: ReplayConfig, *, index: int = 0
+) -> Variation:
     """Draw poses from the localisation's covariance and physics from the priors.
+
+    Where there is a posterior, what it knows of comes from its draws: the samples take turns, so
+    that each has as many as its weight says.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -91,8 +138,13 @@ def draw_variation(rng: np.random.Generator, scene: ReplayScene, config: ReplayC
         rng: Of this sample; see ``sample_rng``.
         scene: Nominal poses, their covariances and the task's objects.
         config: Nominal physics, and how far to vary around it.
+        index: Number of the sample; says which draw of a posterior is its.
     """
     settings = config.variation
+    drawn = settings.draw_at(halving(index))
+    if drawn is not None:
+        scene, config = with_draw(drawn, scene, config)
+        settings = replace(settings, friction_log=0.0, grip_force_log=0.0, mass_log=0.0)
     factors = {
         name: float(np.exp(spread * rng.standard_normal()))
         for name, spread in settings.physics_spreads().items()
@@ -195,6 +247,8 @@ class Sample:
     accepted: bool | None
     first_failing: str | None
     reason: str | None
+    probability: float | None = None
+    """Of success in the real cell now that this replay has said so; None: taken at its word."""
 
     def to_record(self) -> dict[str, Any]:
         """Return the gst sample v1 record, checked against its schema."""
@@ -236,7 +290,8 @@ def replay_samples(
         raise UsageError(message)
     samples: list[Sample] = []
     for index in range(config.samples):
-        variation = draw_variation(sample_rng(config.seed, identity, index), scene, config)
+        rng = sample_rng(config.seed, identity, index)
+        variation = draw_variation(rng, scene, config, index=index)
         samples.append(_sample(replay, scene, config, variation, plan_id, index))
     return tuple(samples)
 
@@ -255,6 +310,9 @@ def _sample(
         accepted, failing, reason = verdict.accepted, verdict.first_failing, verdict.reason
     except GstError as error:  # this variation cannot be replayed; the others can
         reason = str(error)
+    drawn, probability = config.variation.draw_at(halving(index)), None
+    if drawn is not None:
+        probability = 1.0 - drawn.wrong_yes if accepted is True else drawn.wrong_no
     return Sample(
         plan_id=plan_id,
         index=index,
@@ -262,13 +320,15 @@ def _sample(
         accepted=accepted,
         first_failing=failing,
         reason=reason,
+        probability=probability,
     )
 
 
 def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     """Add the share of accepted samples with its Wilson interval; without samples nothing.
 
-    A sample that could not be decided counts among those that were not accepted.
+    A sample that could not be decided counts among those that were not accepted. Where there is a
+    posterior, each sample counts with the chance that its answer is right in this session.
 
     Args:
         verdict: Of the nominal replay.
@@ -276,9 +336,16 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
     """
     if not samples:
         return verdict
-    from scipy.stats import binomtest  # noqa: PLC0415  # half a second, and only with samples
+    from scipy.stats import norm  # noqa: PLC0415  # half a second, and only with samples
 
     k, n = sum(sample.accepted is True for sample in samples), len(samples)
-    interval = binomtest(k, n).proportion_ci(LEVEL, method="wilson")
-    low, high = float(interval.low), float(interval.high)
-    return replace(verdict, p_success={"value": k / n, "low": low, "high": high, "k": k, "n": n})
+    value = sum(_probability(sample) for sample in samples) / n
+    z = float(norm.ppf(0.5 + LEVEL / 2))
+    centre = (value + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * float(np.sqrt(value * (1 - value) / n + (z / (2 * n)) ** 2))
+    low, high = max(0.0, min(centre - half, value)), min(1.0, max(centre + half, value))
+    return replace(verdict, p_success={"value": value, "low": low, "high": high, "k": k, "n": n})
+
+
+def _probability(sample: Sample) -> float:
+    return float(sample.accepted is True) if sample.probability is None else sample.probability

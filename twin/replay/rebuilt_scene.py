@@ -20,14 +20,21 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, shifted
+from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import RIGID_MASSES, ReplayConfig
+from twin.replay.config import RIGID_MASSES, PosteriorDraw, ReplayConfig
 from twin.replay.scene import ReplayScene, StartState
+from twin.scene.shape.from_training import with_heights
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
 from twin.scene.store.npz import UnreadableArraysError
+
+
+class UnreadablePosteriorError(TwinError):
+    """The posterior of calibration.json is none; make it again: calibrate RUN --posterior."""
+
 
 INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval in standard deviations."""
@@ -150,7 +157,24 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     masses = _mass_spread(calibration)
     if masses is not None:
         spreads += ((RIGID_MASSES, masses),)
-    return replace(config, physics=physics, variation=replace(config.variation, calibrated=spreads))
+    variation = replace(config.variation, calibrated=spreads, posterior=posterior_of(calibration))
+    return replace(config, physics=physics, variation=variation)
+
+
+def posterior_of(calibration: Calibration) -> tuple[PosteriorDraw, ...]:
+    """The draws that a run's trials left some weight; empty where there is no posterior.
+
+    Raises:
+        UnreadablePosteriorError: When one lacks a number.
+    """
+    draws = _mapping(calibration.record, "posterior").get("draws", [])
+    try:
+        return tuple(
+            PosteriorDraw(**{**draw, "bias_m": tuple(float(value) for value in draw["bias_m"])})
+            for draw in draws
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UnreadablePosteriorError(f"the posterior of calibration.json: {error!r}") from error
 
 
 def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
@@ -236,6 +260,8 @@ class RebuiltScene:
     calibration_id: str | None = None
     correction: Correction = field(default_factory=Correction)
     """What a calibration says of localised poses and of masses; ``static_sdf`` is moved already."""
+    rim_heights_m: Mapping[str, float] = field(default_factory=dict)
+    """Of containers as the scan shows them; published sizes stand in for others."""
     notes: tuple[str, ...] = ()
     """What the scene does not have, or has in a state in which it is not used."""
 
@@ -258,7 +284,7 @@ class RebuiltScene:
             covariances: How sure the poses are.
         """
         return ReplayScene(
-            task=self.correction.task(task),
+            task=with_heights(self.correction.task(task), self.rim_heights_m),
             urdf=urdf,
             Ts_base_object=self.correction.poses(Ts_base_object),
             reasons=reasons or {},
@@ -308,6 +334,11 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
         scene_hash=str(record["scene_hash"]),
         static_sdf=static,
         lattices=lattices,
+        rim_heights_m={
+            key: float(height_m)
+            for key, height_m in _mapping(_mapping(record, "sdf"), "rim_height_m").items()
+            if key in task.objects
+        },
         notes=tuple(notes),
     )
 

@@ -173,6 +173,7 @@ DESIGNS: dict[str, Design] = {
 CORNER_M = 0.035
 """Outer radius of the vertical edges."""
 RIM_M = 0.0055
+RIM_OVERLAP_M, BLEND_M = 0.004, 0.001
 HANDLE_RADIUS_M = 0.030
 HANDLE_M = 0.0055
 CORNER_PARTS = 3
@@ -278,6 +279,24 @@ def basket_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[Box
             parts.append(BoxPart(centre_m=centre, size_m=size, q_wxyz=straight))
     parts += _corner_parts(x - bend, y - bend, bend + wall_m / 2, wall_m, top)
     return parts + _handle_parts(x + wall_m / 2, top)
+
+
+def basket_rim_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[BoxPart]:
+    """Boxes around the bead on the walls, which a basket has beyond what it collides with.
+
+    Args:
+        inner_m: Extents of the cavity [m].
+        wall_m: Thickness of walls and floor [m].
+    """
+    top = inner_m[2] + wall_m
+    walls = (part for part in basket_parts(inner_m, wall_m)[1:] if part.centre_m[2] == top / 2)
+    parts = []
+    for part in walls:
+        size = part.size_m + RIM_OVERLAP_M
+        size[[int(np.argmin(part.size_m[:2])), 2]] = 2 * RIM_M + BLEND_M
+        centre = np.array([*part.centre_m[:2], top])
+        parts.append(BoxPart(centre_m=centre, size_m=size, q_wxyz=part.q_wxyz))
+    return parts
 
 
 def _corner_parts(x: float, y: float, radius: float, wall_m: float, top: float) -> list[BoxPart]:

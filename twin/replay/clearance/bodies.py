@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.robots.robot import Gripper
-from bridge.task.task_file import ObjectModel
+from bridge.task.meshes.toys import basket_parts, basket_rim_parts
+from bridge.task.task_file import BASKET, ObjectModel
 from twin.replay._clearance import Bounds
 from twin.robot.collision import RobotHulls, convex_hull
 
@@ -22,6 +24,8 @@ SCENE = "scene"
 """What stands still and has no name of its own."""
 
 _FAR_M = 1e3
+_SKIN_M = 0.001
+"""A basket's surface is rounded where its boxes meet, and stands out of them by so much."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +91,19 @@ def placed_panels(
     """The boxes an object is made of: pose of each box's centre, and its extents [m].
 
     Args:
-        model: The object; a container has a panel for each wall.
+        model: The object; a container has a panel for each wall, a basket more: its round corners,
+            its rim and its handles stand out of straight walls.
         T_base_object: Where it is.
     """
+    if model.mesh == BASKET:
+        shape = model.inner_m, model.wall_m
+        return [
+            (
+                T_base_object @ se3.transform_from(part.q_wxyz, part.centre_m),
+                part.size_m + 2 * _SKIN_M,
+            )
+            for part in basket_parts(*shape) + basket_rim_parts(*shape)
+        ]
     placed = []
     for centre, extents in model.panels():
         T_object_panel = np.eye(4)

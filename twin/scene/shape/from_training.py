@@ -17,10 +17,11 @@ from bridge.episode import provenance
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.task_file import SCANNED, ObjectModel, Task
+from bridge.task.task_file import BASKET, SCANNED, ObjectModel, Task
 from bridge.terminal import Advance
 from twin.errors import TwinError
 from twin.scene.frames.rgbd import TrainingView
+from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView
 from twin.scene.shape.known import surface_distances
 from twin.scene.shape.reconstruct import (
@@ -30,7 +31,7 @@ from twin.scene.shape.reconstruct import (
     reconstruct,
     shape_of_mesh,
 )
-from twin.scene.shape.static import StaticConfig, static_sdf
+from twin.scene.shape.static import StaticConfig, everything_in, static_sdf
 
 STATIC_FILE = "sdf.npz"
 MASK_MARGIN_M = 0.008
@@ -190,6 +191,75 @@ def _away(
     return np.asarray(np.abs(distance) if is_known else np.maximum(distance, 0.0))
 
 
+WALL_BAND_M = (0.006, 0.008)
+"""Points this far inside of a container's inner face, and outside of its outer one, are of its
+walls."""
+HEIGHTS = (0.3, 2.0)
+"""Of the published height: below, a wall may be hidden; above, nothing is the container's."""
+TOP_PERCENTILE = 98.0
+FEWEST_POINTS = 300
+MOST_VIEWS = 40
+
+
+def rim_height_m(
+    views: Sequence[TrainingView], model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
+) -> float | None:
+    """Height of a container's rim over its origin as the views show it [m].
+
+    What is published of a container may be wrong, and a plan that passes low over the rim hangs on
+    it. None where the views show too little of the walls.
+
+    Args:
+        views: What the scene was fitted to.
+        model: A container; where its walls stand is taken from it.
+        T_base_object: Where it is.
+    """
+    half, wall = np.array(model.size_m[:2]) / 2, model.wall_m
+    low_m, high_m = (share * model.size_m[2] for share in HEIGHTS)
+    T_object_base = se3.invert(T_base_object)
+    heights = []
+    for index in spread(np.arange(len(views)), MOST_VIEWS):
+        p = se3.apply(T_object_base, everything_in(views[index]).points_m())
+        beyond = np.abs(p[:, :2]) - half
+        outside = beyond.max(axis=1)
+        chosen = (outside > -wall - WALL_BAND_M[0]) & (outside < WALL_BAND_M[1])
+        chosen &= (p[:, 2] > low_m) & (p[:, 2] < high_m)
+        if model.mesh == BASKET:  # handles stand on the walls across x
+            chosen &= beyond[:, 1] > beyond[:, 0]
+        heights.append(p[chosen, 2])
+    seen = np.concatenate(heights) if heights else np.zeros(0)
+    return float(np.percentile(seen, TOP_PERCENTILE)) if len(seen) >= FEWEST_POINTS else None
+
+
+def _rim_heights_m(
+    views: Sequence[TrainingView], task: Task, Ts_base_object: Poses
+) -> dict[str, float]:
+    """Of the containers whose walls the views show."""
+    found = {}
+    for key, T in Ts_base_object.items():
+        if task.objects[key].wall_m > 0:
+            height_m = rim_height_m(views, task.objects[key], T)
+            if height_m is not None:
+                found[key] = height_m
+    return found
+
+
+def with_heights(task: Task, heights_m: Mapping[str, float]) -> Task:
+    """A task whose containers are as high as they were seen to be.
+
+    Args:
+        task: With the published sizes.
+        heights_m: Of rims over the origin, by container; what is missing stays.
+    """
+    objects = {
+        key: replace(model, size_m=(*model.size_m[:2], heights_m[key]))
+        if key in heights_m
+        else model
+        for key, model in task.objects.items()
+    }
+    return replace(task, objects=objects)
+
+
 def write_static(
     folder: Path,
     views: Sequence[TrainingView],
@@ -210,17 +280,20 @@ def write_static(
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
+    heights_m = {} if task is None else _rim_heights_m(views, task, Ts_base_object)
+    seen = None if task is None else with_heights(task, heights_m)
     objects = [
-        partial(from_outside_m, model=task.objects[key], T_base_object=T)
+        partial(from_outside_m, model=seen.objects[key], T_base_object=T)
         for key, T in Ts_base_object.items()
-        if task is not None
+        if seen is not None
     ]
     try:
         static = static_sdf(views, None if task is None else 0.0, objects, config)
     except TwinError as error:
-        return {"file": None, "remark": str(error)}
+        return {"file": None, "remark": str(error), "rim_height_m": heights_m}
     static.save(path)
-    return {"file": STATIC_FILE, "sha256": provenance.hash_file(path), **static.to_record()}
+    about = {"file": STATIC_FILE, "sha256": provenance.hash_file(path), **static.to_record()}
+    return {**about, "rim_height_m": heights_m}
 
 
 def from_outside_m(
@@ -228,7 +301,10 @@ def from_outside_m(
     model: ObjectModel,
     T_base_object: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, " num_points"]:
-    """Signed distance of points to what an object takes up, handles and rim included [m].
+    """Signed distance of points to what an object takes up: handles, rim and cavity included [m].
+
+    What cameras that are a little off see of a container's far wall lies in its cavity. Were it
+    left in the scene, nothing could be put there once the container stands elsewhere.
 
     Args:
         points: In the base frame [m].
@@ -236,6 +312,21 @@ def from_outside_m(
         T_base_object: Where it is.
     """
     if model.mesh is not None and model.soft is None:
-        return np.asarray(object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points)))
-    distance, _ = surface_distances(points, model, T_base_object)
+        distance = object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))
+    else:
+        distance, _ = surface_distances(points, model, T_base_object)
+    if model.wall_m > 0:
+        distance = np.minimum(distance, _from_cavity_m(points, model, T_base_object))
     return np.asarray(distance)
+
+
+def _from_cavity_m(
+    points: Float[np.ndarray, "num_points 3"],
+    model: ObjectModel,
+    T_base_object: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, " num_points"]:
+    """Distance to a container's cavity, 0 in it."""
+    half = np.array(model.inner_m) / 2
+    centre = np.array([0.0, 0.0, model.wall_m + half[2]])
+    p = se3.apply(se3.invert(T_base_object), points) - centre
+    return np.asarray(np.linalg.norm(np.maximum(np.abs(p) - half, 0.0), axis=1))

@@ -160,7 +160,7 @@ def static_sdf(
         ShapeError: When the views measured next to nothing.
     """
     config = StaticConfig() if config is None else config
-    masked = [_everything(views[k]) for k in spread(np.arange(len(views)), config.max_views)]
+    masked = [everything_in(views[k]) for k in spread(np.arange(len(views)), config.max_views)]
     box = _box(masked, table_z_m, config)
     truncation = config.truncation_voxels * box.voxel_m
     evidence = gather(box, masked, truncation, min_free_views=2)
@@ -185,7 +185,8 @@ def static_sdf(
     )
 
 
-def _everything(view: TrainingView) -> MaskedView:
+def everything_in(view: TrainingView) -> MaskedView:
+    """All of a view that shows nothing moving."""
     target = view.full
     depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
     return MaskedView(

@@ -152,6 +152,16 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
     return _store(run, {**kept, "physics": current, "physics_history": history})
 
 
+def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, Any]:
+    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced.
+
+    Args:
+        run: Run folder; ``scene/`` is made where needed.
+        posterior: The record, with ``draws`` and the trials they were weighed by.
+    """
+    return _store(run, {**_kept(run), "posterior": posterior})
+
+
 def _kept(run: RunFolder) -> dict[str, Any]:
     before = read_calibration(run)
     return {"cameras": {}, "not_identified": {}, **({} if before is None else before.record)}

@@ -7,7 +7,9 @@ import pytest
 from scripted_plans import joints_over
 
 from bridge.geometry import se3
-from twin.replay.clearance.bodies import TABLE, own_links, placement_of
+from bridge.task.meshes.catalogue import object_mesh
+from bridge.task.task_file import load_task
+from twin.replay.clearance.bodies import TABLE, own_links, placed_panels, placement_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
@@ -85,3 +87,16 @@ def test_near_pairs_are_those_of_measuring_every_pair(
         counted = [d for (_, other), d in measured.items() if other != "cube"]
         assert cut_m == max(near_m, min(counted))
     assert num_near > 60
+
+
+def test_the_boxes_of_a_basket_hold_its_rim_its_corners_and_its_handles() -> None:
+    """Otherwise the audit, which has the mesh, finds less distance than the clearance said."""
+    basket = load_task("sloth_over_rim").objects["basket"]
+    vertices = object_mesh(basket).vertices_m
+    away = np.full(len(vertices), np.inf)
+    for T, extents in placed_panels(basket, np.eye(4)):
+        q = np.abs(se3.apply(se3.invert(T), vertices)) - extents / 2
+        outside = np.linalg.norm(np.maximum(q, 0.0), axis=1)
+        away = np.minimum(away, outside + np.minimum(q.max(axis=1), 0.0))
+    assert away.max() < 5e-4
+    assert away.min() > -0.01

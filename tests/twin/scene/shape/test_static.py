@@ -13,6 +13,8 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.from_training import (
     from_outside_m,
+    rim_height_m,
+    with_heights,
     write_static,
 )
 from twin.scene.shape.known import pose_of, surface_distances
@@ -112,7 +114,7 @@ def test_the_scene_folder_gets_the_static_scene(views: list[TrainingView], tmp_p
     assert nameless["table_z_m"] is None
 
 
-def test_a_basket_takes_its_handles_and_its_rim_out_of_the_scene() -> None:
+def test_a_basket_takes_its_handles_its_rim_and_its_cavity_out_of_the_scene() -> None:
     """What stays in the grid is an obstacle that nobody may touch: a toy goes over the handles."""
     basket = load_task("sloth_into_basket").objects["basket"]
     T = pose_of(np.array([0.48, 0.2, 0.0, 0.3]))
@@ -121,6 +123,19 @@ def test_a_basket_takes_its_handles_and_its_rim_out_of_the_scene() -> None:
     arch = np.stack([np.full(9, x), 0.03 * np.cos(angle), top + 0.03 * np.sin(angle)], axis=1)
     rim = np.array([[0.0, basket.inner_m[1] / 2 + basket.wall_m / 2, top + 0.003]])
     inside = np.array([[0.0, 0.0, 0.05]])
-    for points, is_taken in ((arch, True), (rim, True), (inside, False)):
+    beside = np.array([[basket.inner_m[0] / 2 + 0.06, 0.0, 0.05]])
+    for points, is_taken in ((arch, True), (rim, True), (inside, True), (beside, False)):
         away = from_outside_m(se3.apply(T, points), basket, T)
         assert np.all(away < 0.001) if is_taken else np.all(away > 0.03)
+
+
+def test_a_rim_is_as_high_as_it_is_seen_whatever_is_published(views: list[TrainingView]) -> None:
+    box = TASK.objects["box"]
+    for share in (0.8, 1.0, 1.25):
+        published = replace(box, size_m=(*box.size_m[:2], share * box.size_m[2]))
+        height_m = rim_height_m(views, published, POSES["box"])
+        assert height_m == pytest.approx(box.size_m[2], abs=0.003)
+    assert rim_height_m(views[:0], box, POSES["box"]) is None
+    seen = with_heights(TASK, {"box": 0.07})
+    assert seen.objects["box"].inner_m[2] == pytest.approx(0.07 - box.wall_m)
+    assert seen.objects["cube"] == TASK.objects["cube"]

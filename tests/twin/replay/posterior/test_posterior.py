@@ -1,0 +1,266 @@
+"""A session's own trials as evidence: what draws are kept, how much a yes is trusted afterwards."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+import robot_gst
+from bridge.episode.run_folder import RunFolder
+from bridge.task.plan import Plan, Waypoint
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
+from bridge.terminal import Output
+from twin.replay import posterior
+from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
+from twin.replay.monte_carlo import (
+    Sample,
+    draw_variation,
+    halving,
+    replay_samples,
+    sample_rng,
+    with_draw,
+    with_probability,
+)
+from twin.replay.posterior import (
+    BIAS_M,
+    FRICTION,
+    WRONG,
+    Ended,
+    NoTrialsError,
+    Record,
+    Trial,
+    calibrate_posterior,
+    describe_posterior,
+    draw_beforehand,
+    effective,
+    log_nearness,
+    weighed,
+)
+from twin.replay.rebuilt_scene import UnreadablePosteriorError, calibrated, posterior_of
+from twin.replay.scene import ReplayScene
+from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
+
+QUIET = Output(quiet=True)
+TASK = load_task("slippery_block_into_box")
+PLAN = Plan(
+    id="p",
+    planner="",
+    policy="",
+    condition="",
+    robot="",
+    frame="",
+    instruction="",
+    stages=(),
+    tau=(Waypoint(t_ns=0, p_m=(0.0, 0.0, 0.0), q_wxyz=(1.0, 0.0, 0.0, 0.0), g=0),),
+)
+YES = Factor(value=True)
+VERDICT = Verdict(
+    plan_id="p",
+    trajectory="planned",
+    mode="dynamic",
+    ik=YES,
+    clearance=YES,
+    terminal=YES,
+    engine="fake",
+    seed=0,
+)
+
+
+def scene() -> ReplayScene:
+    poses = TASK.draw_start(np.random.default_rng(3))
+    return ReplayScene(task=TASK, urdf="", Ts_base_object=poses)
+
+
+def trial(*, success: bool, end_m: tuple[float, float] = (0.5, 0.2)) -> Trial:
+    return Trial(
+        episode=f"trial_{success}",
+        sha256="0",
+        plan=PLAN,
+        scene=scene(),
+        config=ReplayConfig(),
+        success=success,
+        ends_m={"block": np.array(end_m)},
+    )
+
+
+def holds_from(limit: float) -> object:
+    """A world in which a block is held from a friction on."""
+
+    def end_of(tried: Trial, draw: PosteriorDraw) -> Ended:
+        held = draw.finger_pair_friction * draw.grip_scale / draw.mass_scale > limit
+        end_m = np.array([0.5, 0.2]) if held else tried.scene.Ts_base_object["block"][:2, 3]
+        return Ended(success=held, ends_m={"block": end_m})
+
+    return end_of
+
+
+def test_draws_fill_the_priors_evenly_and_are_the_same_every_time() -> None:
+    draws = draw_beforehand(256)
+    assert draws == draw_beforehand(256)
+    assert sum(draw.weight for draw in draws) == pytest.approx(1.0)
+    friction = np.array([draw.finger_pair_friction for draw in draws])
+    middle = np.sqrt(FRICTION[0] * FRICTION[1])
+    assert np.mean(friction < middle) == pytest.approx(0.5, abs=0.01)
+    assert friction.min() >= FRICTION[0]
+    assert friction.max() <= FRICTION[1]
+    bias = np.array([draw.bias_m for draw in draws])
+    np.testing.assert_allclose(bias.std(axis=0), BIAS_M, rtol=0.05)
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(0, 0), (4, 0), (2, 2), (0, 4)])
+def test_how_far_an_answer_is_trusted_is_the_integral_over_all_rates(
+    right: int, wrong: int
+) -> None:
+    """Independent reference: Bayes' rule by quadrature over how often it is wrong."""
+    rate = stats.beta(*WRONG)
+
+    def weigh(extra: int) -> float:
+        return float(
+            integrate.quad(
+                lambda q: rate.pdf(q) * q ** (wrong + extra) * (1 - q) ** right, 0, 1, limit=200
+            )[0]
+        )
+
+    record = Record(right=right, wrong=wrong)
+    assert np.exp(record.log_likelihood) == pytest.approx(weigh(0), rel=1e-4)
+    assert record.probability_wrong == pytest.approx(weigh(1) / weigh(0), rel=1e-4)
+
+
+def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posterior, "end_of", holds_from(0.3))
+    draws = draw_beforehand(64)
+    start = scene().Ts_base_object["block"][:2, 3]
+    fell = [trial(success=False, end_m=tuple(start)) for _ in range(3)]
+    kept = weighed(draws, fell, workers=1, output=QUIET)
+    assert sum(draw.weight for draw in kept) == pytest.approx(1.0)
+    loses = [d.finger_pair_friction * d.grip_scale / d.mass_scale <= 0.3 for d in kept]
+    weights = np.array([draw.weight for draw in kept])
+    assert weights[loses].sum() > 0.95
+    assert effective(kept) <= sum(loses) + 1
+
+
+def test_what_no_draw_explains_makes_every_yes_doubtful(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posterior, "end_of", holds_from(-1.0))  # the twin always says yes
+    draws = draw_beforehand(8)
+    doubtful = weighed(draws, [trial(success=False)] * 4, workers=1, output=QUIET)
+    sure = weighed(draws, [trial(success=True)] * 4, workers=1, output=QUIET)
+    assert all(draw.wrong_yes > 0.7 for draw in doubtful)
+    assert all(draw.wrong_yes < 0.1 for draw in sure)
+    assert {draw.wrong_no for draw in doubtful} == {WRONG[0] / sum(WRONG)}
+
+
+def test_an_end_elsewhere_counts_against_a_draw_but_not_without_bound() -> None:
+    seen = trial(success=True)
+    logs = [
+        log_nearness(seen, Ended(success=True, ends_m={"block": np.array([0.5 + off_m, 0.2])}))
+        for off_m in (0.0, 0.005, 0.02, 1.0)
+    ]
+    assert logs == sorted(logs, reverse=True)
+    assert logs[0] == pytest.approx(0.0)
+    assert log_nearness(seen, Ended(success=False, ends_m={})) == pytest.approx(logs[-1])
+
+
+def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None:
+    draw = replace(draw_beforehand(2)[1], bias_m=(0.004, -0.002), mass_scale=1.5)
+    before, config = scene(), ReplayConfig()
+    after, settings = with_draw(draw, before, config)
+    for name, T in before.Ts_base_object.items():
+        np.testing.assert_allclose(after.Ts_base_object[name][:2, 3] - T[:2, 3], draw.bias_m)
+    own = settings.physics.object_friction
+    assert own == config.physics.object_friction
+    assert settings.physics.finger_friction * own == pytest.approx(draw.finger_pair_friction)
+    heavier = after.task.objects["block"].mass_kg / before.task.objects["block"].mass_kg
+    assert heavier == pytest.approx(1.5)
+    assert after.task.objects["box"] == before.task.objects["box"]
+
+
+def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
+    shares = [halving(index) for index in range(16)]
+    np.testing.assert_allclose(np.diff(sorted(shares)), 1 / 17, atol=0.04)
+    few = [
+        replace(draw, weight=w) for draw, w in zip(draw_beforehand(2), (0.75, 0.25), strict=True)
+    ]
+    config = ReplayConfig(variation=VariationConfig(posterior=tuple(few)))
+    frictions = [
+        draw_variation(sample_rng(0, "s", k), scene(), config, index=k).physics.finger_friction
+        for k in range(16)
+    ]
+    first = few[0].finger_pair_friction / config.physics.object_friction
+    assert sum(value == first for value in frictions) == 12
+
+
+def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() -> None:
+    draw = replace(draw_beforehand(2)[0], weight=1.0, wrong_yes=0.4, wrong_no=0.1)
+    config = ReplayConfig(samples=4, variation=VariationConfig(posterior=(draw,)))
+    answers = iter([True, True, False, None])
+
+    def replay(there: ReplayScene, settings: ReplayConfig) -> Verdict:
+        return replace(VERDICT, terminal=Factor(value=next(answers)))
+
+    samples = replay_samples(replay, scene(), config, plan_id="p", identity="s")
+    p = with_probability(VERDICT, samples).p_success
+    assert p is not None
+    assert p["value"] == pytest.approx((0.6 + 0.6 + 0.1 + 0.1) / 4)
+    assert (p["k"], p["n"]) == (2, 4)
+    assert p["low"] < p["value"] < p["high"]
+
+
+def test_without_a_posterior_the_interval_is_wilsons() -> None:
+    samples = [
+        Sample(
+            plan_id="p",
+            index=index,
+            variation={},
+            accepted=index < 5,
+            first_failing=None,
+            reason=None,
+        )
+        for index in range(16)
+    ]
+    p = with_probability(VERDICT, samples).p_success
+    wilson = stats.binomtest(5, 16).proportion_ci(0.95, method="wilson")
+    assert p is not None
+    assert (p["low"], p["high"]) == pytest.approx((wilson.low, wilson.high))
+
+
+def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
+    record = {
+        "draws": [draw.to_record() for draw in draws],
+        "effective_draws": 4.0,
+        "sources": {"trial_0001": {"sha256": "0", "success": True}},
+        "skipped": {"trial_0002": "nobody said how it ended"},
+    }
+    before = write_posterior(run, record)["calibration_id"]
+    known = read_calibration(run)
+    assert known is not None
+    assert calibrated(ReplayConfig(), known).variation.posterior == tuple(draws)
+    told = describe_posterior(record, str(before))
+    assert "4 draws weighed by 1 trials, 1 of which succeeded" in told
+    assert "trial_0002 not used" in told
+    write_posterior(run, {**record, "draws": record["draws"][:2]})
+    again = read_calibration(run)
+    assert again is not None
+    assert again.calibration_id != before
+    damaged: Mapping[str, object] = {**known.record, "posterior": {"draws": [{"weight": 1.0}]}}
+    with pytest.raises(UnreadablePosteriorError, match="bias_m"):
+        posterior_of(Calibration(record=damaged, cameras={}))
+
+
+def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with pytest.raises(NoTrialsError, match="no executed trial"):
+        calibrate_posterior(run, num_draws=2, workers=1, output=QUIET)
+    assert not (run.scene_dir / "calibration.json").exists()
+
+
+def test_only_one_thing_is_calibrated_at_a_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    assert robot_gst.run(["calibrate", str(run.path), "--posterior", "--physics"]) == 2
+    assert "--posterior" in capsys.readouterr().err

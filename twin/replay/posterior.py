@@ -1,0 +1,362 @@
+"""What a session's own trials say of what nobody measured: draws from wide priors, weighed by them.
+
+Friction, masses, the force of the fingers and what localisation is off as a whole are the same in
+all trials of a session. Draws from priors as wide as what is not known are replayed through every
+trial that was executed; a draw that ends as the trial did counts for more (importance sampling,
+Gordon, Salmond and Smith 1993, without their motion). Most draws differ in numbers that no trial
+shows one by one, such as force and friction of the fingers: only together they matter, and the
+draws that are left keep them together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import betaln, ndtri
+from scipy.stats import qmc
+
+from bridge.episode import provenance, streams
+from bridge.episode.catalogue import outcome_of
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
+from bridge.process_pool import Failed, ProcessPool
+from bridge.task.plan import Plan
+from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from bridge.terminal import Output
+from twin.replay.config import PosteriorDraw, ReplayConfig
+from twin.replay.dynamics import free_start, simulate, soft_models
+from twin.replay.monte_carlo import with_draw
+from twin.replay.path import path_of_plan
+from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene
+from twin.replay.scene import ReplayScene, localised_starts
+from twin.robot.collision import hulls_of
+from twin.robot.model import load_robot
+from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
+from twin.scene.store.folder import scene_hash_of
+
+FRICTION = (0.05, 1.2)
+"""Of a pair of surfaces: from steel on PTFE to rubber on what is dry (handbooks' tables of sliding
+friction). A coefficient that is published has not been measured here; every one is as likely as
+its double."""
+FACTOR_LOG = 0.4
+"""Spread of the logarithm of masses and forces, as ``calibrate --physics`` has it beforehand."""
+BIAS_M = 0.005
+"""Standard deviation, along x and y each, of what localisation is off as a whole; the same."""
+WRONG = (0.4, 1.6)
+"""What is known beforehand of how often the twin is wrong about a session's trials at the right
+draw: a beta distribution, one in five on average, and most sessions either never or often."""
+NEAR_M = 0.01
+"""Standard deviation of where an object ends about where the twin has it end, at the right draw."""
+ASTRAY = 0.1
+"""Weight that a draw keeps however far from there: what falls ends anywhere."""
+
+
+class NoTrialsError(UsageError):
+    """Nothing was executed that could be weighed by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One executed plan, what it began from and how it ended."""
+
+    episode: str
+    sha256: str
+    plan: Plan
+    scene: ReplayScene
+    config: ReplayConfig
+    success: bool
+    ends_m: Mapping[str, Float[np.ndarray, "2"]]
+    """Where objects that move were localised afterwards, x and y; without those not found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ended:
+    """How a trial ends with one draw."""
+
+    success: bool
+    ends_m: Mapping[str, Float[np.ndarray, "2"]]
+
+
+def draw_beforehand(count: int) -> list[PosteriorDraw]:
+    """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
+
+    Args:
+        count: A power of two covers best.
+    """
+    unit = qmc.Sobol(d=6, scramble=True, seed=0).random(count)
+    z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
+    frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
+    factors = np.exp(FACTOR_LOG * z[:, 2:4])
+    return [
+        PosteriorDraw(
+            finger_pair_friction=float(finger),
+            surface_pair_friction=float(surface),
+            mass_scale=float(mass),
+            grip_scale=float(grip),
+            bias_m=(float(bias[0]), float(bias[1])),
+            weight=1.0 / count,
+            wrong_yes=Record(right=0, wrong=0).probability_wrong,
+            wrong_no=Record(right=0, wrong=0).probability_wrong,
+        )
+        for (finger, surface), (mass, grip), bias in zip(
+            frictions, factors, BIAS_M * z[:, 4:], strict=True
+        )
+    ]
+
+
+def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, str]]:
+    """Read every trial of a run that was executed and judged; missing localisations are made.
+
+    Args:
+        run: Its episodes, and its scene and calibration.
+        output: Shows progress.
+
+    Returns:
+        The trials, and per episode why it is none.
+
+    Raises:
+        NoTrialsError: When there is none.
+    """
+    trials, reasons = [], {}
+    paths = run.episodes()
+    with output.progress("localise", len(paths)) as advance:
+        for index, path in enumerate(paths):
+            try:
+                episode = Episode.open(path)
+                if episode.info.kind == "trial":
+                    trials.append(_trial(run, episode))
+            except GstError as error:
+                reasons[path.stem] = str(error)
+            advance(index + 1, path.stem)
+    if not trials:
+        why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        message = f"{run.path} has no executed trial with an outcome. {why}".rstrip()
+        raise NoTrialsError(message)
+    return trials, reasons
+
+
+def _trial(run: RunFolder, episode: Episode) -> Trial:
+    outcome = outcome_of(run, episode)
+    if outcome is None or outcome.result == "unknown":
+        raise UsageError("nobody said how it ended")
+    executed = [
+        (stamp_ns, plan)
+        for stamp_ns, plan in streams.plans(episode)
+        if streams.executed_interval_ns(episode, plan.id) is not None
+    ]
+    if not executed:
+        raise UsageError("no plan was executed from beginning to end")
+    stamp_ns, plan = executed[-1]
+    urdf = streams.robot_description(episode)
+    if urdf is None:
+        raise UsageError("no robot description was recorded")
+    task = streams.task_file(episode, plan.task).task()
+    states = localised_starts(run, episode, task, scene_hash=scene_hash_of(run), force=False)
+    start, after = states.at(stamp_ns), states.after(plan.id)
+    scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
+    if scene.missing():
+        raise UsageError(f"at its start {scene.describe_missing()}")
+    config = for_task(calibrated(ReplayConfig(), _without_posterior(run)), task)
+    return Trial(
+        episode=episode.info.id,
+        sha256=episode.sha256(),
+        plan=plan,
+        scene=scene,
+        config=config,
+        success=outcome.result == "success",
+        ends_m={
+            name: T[:2, 3] for name, T in after.Ts_base_object.items() if name in scene.movable()
+        },
+    )
+
+
+def _without_posterior(run: RunFolder) -> Calibration | None:
+    """Of the run's calibration, all but what is made anew."""
+    known = read_calibration(run)
+    if known is None:
+        return None
+    return replace(
+        known, record={key: known.record[key] for key in known.record if key != "posterior"}
+    )
+
+
+def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
+    """Replay a trial's plan as a draw would have it.
+
+    Args:
+        trial: Begins where its objects were localised, moved by the draw's bias.
+        draw: What is not known.
+    """
+    scene, config = with_draw(draw, trial.scene, trial.config)
+    robot = load_robot(scene.urdf)
+    scene = free_start(scene, soft_models(scene), config.start_overlap_m)
+    path, _, _ = path_of_plan(trial.plan, robot, config)
+    states = simulate(path, scene, hulls_of(robot), config)
+    rollout = Rollout(
+        stamps_ns=states.stamps_ns,
+        Ts_base_object=states.Ts_base_object,
+        finger_contact=states.finger_contact,
+        extents_m=states.extents_m,
+        broken=states.broken,
+    )
+    back = np.array(draw.bias_m)
+    return Ended(
+        success=not states.broken and all_hold(evaluate_success(scene.task, rollout)) is True,
+        ends_m={name: states.Ts_base_object[name][-1][:2, 3] - back for name in trial.ends_m},
+    )
+
+
+def log_nearness(trial: Trial, ended: Ended) -> float:
+    """How well the places agree in which objects end.
+
+    Args:
+        trial: What happened.
+        ended: What a draw says.
+    """
+    total = 0.0
+    for name, seen_m in trial.ends_m.items():
+        off_m = float(np.linalg.norm(ended.ends_m.get(name, np.full(2, np.inf)) - seen_m))
+        near = np.exp(-0.5 * (off_m / NEAR_M) ** 2)
+        total += float(np.log(ASTRAY + (1 - ASTRAY) * near))
+    return total
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """How often a draw's answer was right in trials in which it was the same."""
+
+    right: int
+    wrong: int
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of exactly these, however often it is wrong in this session."""
+        a, b = WRONG
+        return float(betaln(a + self.wrong, b + self.right) - betaln(a, b))
+
+    @property
+    def probability_wrong(self) -> float:
+        """That the next such answer is wrong."""
+        a, b = WRONG
+        return (a + self.wrong) / (a + b + self.wrong + self.right)
+
+
+Piece = tuple[int, Trial, PosteriorDraw]
+
+
+def _ended(piece: Piece) -> Ended:
+    _, trial, draw = piece
+    try:
+        return end_of(trial, draw)
+    except GstError:  # as the gate counts a sample that cannot be replayed
+        return Ended(success=False, ends_m={})
+
+
+def weighed(
+    draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int, output: Output
+) -> list[PosteriorDraw]:
+    """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
+
+    Args:
+        draws: From ``draw_beforehand``.
+        trials: Executed ones.
+        workers: Processes that replay side by side; 1: this one alone.
+        output: Shows progress.
+    """
+    pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
+    logs = np.log([draw.weight for draw in draws])
+    counts = np.zeros((len(draws), 2, 2), dtype=int)
+    with output.progress("replays", len(pieces)) as advance:
+        for done, ((number, trial, _), ended) in enumerate(_answers(pieces, workers), start=1):
+            logs[number] += log_nearness(trial, ended)
+            counts[number, int(ended.success), int(ended.success == trial.success)] += 1
+            advance(done, trial.episode)
+    answers = [
+        [Record(right=int(right), wrong=int(wrong)) for wrong, right in rows] for rows in counts
+    ]
+    logs += [no.log_likelihood + yes.log_likelihood for no, yes in answers]
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    return [
+        replace(
+            draw, weight=float(w), wrong_yes=yes.probability_wrong, wrong_no=no.probability_wrong
+        )
+        for draw, w, (no, yes) in zip(draws, weights, answers, strict=True)
+    ]
+
+
+def _answers(pieces: Sequence[Piece], workers: int) -> Any:
+    if workers == 1:
+        yield from ((piece, _ended(piece)) for piece in pieces)
+        return
+    with ProcessPool(workers) as pool:
+        for piece, answer in pool.run(_ended, pieces, lambda piece: piece[1].plan.tau[-1].t_ns):
+            if isinstance(answer, Failed):
+                raise RuntimeError(answer.trace or answer.message)
+            yield piece, answer
+
+
+def effective(draws: Sequence[PosteriorDraw]) -> float:
+    """How many equal draws would know as much: 1 / sum of squared weights (Kong 1992)."""
+    return 1.0 / float(np.sum(np.square([draw.weight for draw in draws])))
+
+
+def calibrate_posterior(
+    run: RunFolder, *, num_draws: int, workers: int, output: Output
+) -> tuple[dict[str, Any], str]:
+    """Weigh draws by a run's trials and write them to ``calibration.json``.
+
+    Args:
+        run: Whose trials are read, and in whose scene folder the posterior goes.
+        num_draws: From the priors.
+        workers: Processes.
+        output: Shows progress.
+
+    Returns:
+        The record, and the id of the calibration that holds now.
+
+    Raises:
+        NoTrialsError: When no trial can be used.
+    """
+    trials, skipped = read_trials(run, output)
+    draws = weighed(draw_beforehand(num_draws), trials, workers=workers, output=output)
+    record: dict[str, Any] = {
+        "draws": [draw.to_record() for draw in draws],
+        "effective_draws": effective(draws),
+        "sources": {
+            trial.episode: {"sha256": trial.sha256, "success": trial.success} for trial in trials
+        },
+        "skipped": skipped,
+    }
+    record["id"] = provenance.hash_settings(record)
+    return record, str(write_posterior(run, record)["calibration_id"])
+
+
+def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
+    """Say what the trials left of the priors.
+
+    Args:
+        record: As ``calibrate_posterior`` makes it.
+        calibration_id: Of the calibration that holds now.
+    """
+    draws, trials = record["draws"], record["sources"]
+    good = sum(item["success"] for item in trials.values())
+    lines = [
+        f"posterior: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
+        f"succeeded; as much as {record['effective_draws']:.1f} equal ones; "
+        f"calibration {calibration_id}"
+    ]
+    weights = np.array([draw["weight"] for draw in draws])
+    for name in (key for key in draws[0] if key != "weight"):
+        values = np.array([np.atleast_1d(draw[name]) for draw in draws])
+        for axis, column in enumerate(values.T):
+            order = np.argsort(column)
+            share = np.cumsum(weights[order])
+            low, middle, high = (column[order][np.searchsorted(share, q)] for q in (0.1, 0.5, 0.9))
+            label = name if values.shape[1] == 1 else f"{name} {'xy'[axis]}"
+            lines.append(f"  {label:<22} {middle:8.3g}, eight of ten in [{low:.3g}, {high:.3g}]")
+    lines += [f"  {name} not used: {why}" for name, why in record["skipped"].items()]
+    return "\n".join(lines)
