@@ -198,7 +198,8 @@ def with_intervals(rows: Rows) -> dict[str, dict[str, float | None]]:
     ]
     rng = np.random.default_rng(0)
     values: dict[str, list[float]] = {name: [] for name in STATISTICS}
-    for _ in range(RESAMPLES if len(clusters) > len(strata) else 0):
+    enough = all(len(stratum) > 1 for stratum in strata)  # one alone would not vary
+    for _ in range(RESAMPLES if enough else 0):
         drawn = [rng.choice(stratum, len(stratum)) for stratum in strata]
         pick = np.concatenate([members[key] for key in np.concatenate(drawn)])
         part = {name: column[pick] for name, column in columns.items()}
