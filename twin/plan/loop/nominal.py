@@ -37,12 +37,15 @@ CLOSED_M = 0.0
 """Commanded width of the closed hand: its force, not its place, is what holds."""
 GRASPS = 6
 """Grasps of one object that are looked at, the surest first."""
-MOST_TRIED = 24
+NOT_KEPT = "not kept on the way"
+MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
 _PLACED = ("inside", "on")
 """Relations that final states are found for without a place to begin at."""
 _HOPELESS = ("nowhere_said", "not_localised", "container_too_small")
 """Causes that no other grasp changes."""
+_OF_GRASP = ("approach", "around", "lift")
+"""Movements that do not depend on the final state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +232,8 @@ class _Search:
                     transfer = self._moved(problem, grasp, release, start_rad, options)
                 except NoPathError as error:
                     self.why = f"{key}: {error}"
+                    if error.leg in _OF_GRASP:
+                        options.give_up(grasp)
                     continue
                 found = True
                 yield transfer
@@ -269,6 +274,8 @@ class _Search:
                 kept(legs)
             except NoPathError as error:
                 failure = failure or error
+                if error.reason != NOT_KEPT and not way.straight:
+                    break  # where nothing is free, another height is not either
                 continue
             return Transfer(
                 key=grasp.object_id,
@@ -323,6 +330,11 @@ class _Options:
             or record.get("support") == TABLE
         ]
         self.why = ""
+        self._given_up: list[Grasp] = []
+
+    def give_up(self, grasp: Grasp) -> None:
+        """No final state helps this grasp: the arm does not get there."""
+        self._given_up.append(grasp)
 
     def _ordered(self, grasps: list[Grasp]) -> list[Grasp]:
         """Leave out what was refused, or begin with what is to be kept."""
@@ -363,6 +375,8 @@ class _Options:
         states: dict[int, tuple[Release, ...]] = {}
         for rank in range(self._policy.release.max_releases):
             for number, grasp in enumerate(self._grasps):
+                if any(grasp is each for each in self._given_up):
+                    continue
                 if number not in states:
                     states[number] = self._releases(grasp)
                 if rank < len(states[number]):
@@ -435,7 +449,7 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
                 f = float(worst_along(constraint, states, times_s=leg.movement.path.times_s)[0])
                 if f > 0:
                     detail = f"{constraint.kind} is violated by {f:.3g} {constraint.unit}"
-                    error = NoPathError(reason="not kept on the way", detail=detail)
+                    error = NoPathError(reason=NOT_KEPT, detail=detail)
                     error.leg = leg.name
                     raise error
 
