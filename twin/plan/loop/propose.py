@@ -151,6 +151,7 @@ def plan_and_verify(
     plan_id: str,
     seed: int,
     rounds: int,
+    task_sha256: str = "",
 ) -> list[Attempt]:
     """Propose and have judged until one is accepted; the last attempt is the one that counts.
 
@@ -164,6 +165,7 @@ def plan_and_verify(
         plan_id: Plans are called this, a dot and their round.
         seed: Of everything that is drawn.
         rounds: Candidates that may be judged.
+        task_sha256: Of the task file; empty: not known.
 
     Raises:
         NoPlanError: When there is not even a first candidate.
@@ -186,7 +188,13 @@ def plan_and_verify(
                 raise
             break
         parent = attempts[-1].candidate.plan.id if attempts else None
-        plan = replace(candidate.plan, id=f"{plan_id}.{round_}", parent_id=parent, round=round_)
+        plan = replace(
+            candidate.plan,
+            id=f"{plan_id}.{round_}",
+            parent_id=parent,
+            round=round_,
+            task_sha256=task_sha256,
+        )
         candidate = replace(candidate, plan=plan)
         verdict = judge(plan)
         attempts.append(Attempt(candidate=candidate, verdict=verdict))
