@@ -34,6 +34,8 @@ LIFT_M = 0.06
 """How far an object is lifted, and let down, straight [m]."""
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001
+_LEAVE_MORE_M = (0.1, 0.05, 0.0)
+"""Beyond the length of the approach, how far the hand goes straight back."""
 _TURN = 2 * np.pi
 
 
@@ -130,8 +132,7 @@ def plan_transfer(
                     )
                 )  # fmt: skip
             with _named("leave"):
-                away = release.T_base_tcp @ _along_z(-grasp.pregrasp_m)
-                leave = plan_straight(placed, joints, away, config, width_m=open_m, allowed=leaving)
+                leave = _leave(placed, release, joints, config, open_m, leaving, grasp.pregrasp_m)
         except NoPathError as error:
             failure = error
             continue
@@ -168,6 +169,26 @@ def _backwards(movement: Movement) -> Movement:
         path=reversed_path(movement.path),
         decision=replace(movement.decision, clearance_m=movement.decision.clearance_m[::-1]),
     )
+
+
+def _leave(
+    placed: Problem,
+    release: Release,
+    joints_rad: Float[np.ndarray, " num_joints"],
+    config: PathConfig,
+    width_m: float,
+    allowed: Allowed,
+    least_m: float,
+) -> Movement:
+    """Straight back; the farther the better, for next to a rim nothing else may be planned."""
+    for more_m in _LEAVE_MORE_M:
+        away = release.T_base_tcp @ _along_z(-least_m - more_m)
+        try:
+            return plan_straight(placed, joints_rad, away, config, width_m=width_m, allowed=allowed)
+        except NoPathError:
+            if more_m == _LEAVE_MORE_M[-1]:
+                raise
+    raise NoPathError(reason="unreachable", detail="no way to leave is tried")
 
 
 def _carried_straight(
