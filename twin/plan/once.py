@@ -1,4 +1,4 @@
-"""One plan from words to a verdict: the start as recorded, candidates, what the twin says of each."""
+"""One plan from words to a verdict: the recorded start, candidates, what the twin says of each."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence

@@ -1,13 +1,14 @@
 """The planner: grasps by margin, final states of each, collision-free timed ways between them.
 
 Objects are moved in the task's order, each from where those before it have left the arm, with what
-was placed before lying where it is predicted to. Candidates come in an order that does not depend on
-how many are asked for: the surest grasps with their cheapest final state first, then the next final
+was placed before lying where it is predicted to. The order of candidates does not depend on how
+many are asked for: the surest grasps with their cheapest final state first, then the next final
 states. What a refusal asks to change is left out, or tried first.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ CLOSED_M = 0.0
 """Commanded width of the closed hand: its force, not its place, is what holds."""
 GRASPS = 6
 """Grasps of one object that are looked at, the surest first."""
+WIDER_M = 0.003
+"""Kept beyond what was asked for where a path was refused."""
 NOT_KEPT = "not kept on the way"
 MOST_TRIED = 16
 """Pairs of grasp and final state of one object that a way is sought for."""
@@ -161,9 +164,7 @@ class PlanProposer:
         named = {"planner": PLANNER, "policy": self._policy.name}
         kept = found[:1] if self._policy.grasps == 1 else found
         remark = "pushed straight, tool down; no distance was looked at"
-        return [
-            replace(each, plan=replace(each.plan, **named), remarks=(remark,)) for each in kept
-        ]
+        return [replace(each, plan=replace(each.plan, **named), remarks=(remark,)) for each in kept]
 
 
 class _Lazy:
@@ -185,9 +186,7 @@ class _Lazy:
 class _Search:
     """Ways to move all objects, the best first."""
 
-    def __init__(
-        self, problem: Problem, policy: Policy, seed: int, steer: Steer | None
-    ) -> None:
+    def __init__(self, problem: Problem, policy: Policy, seed: int, steer: Steer | None) -> None:
         self._problem, self._policy, self._seed, self._steer = problem, policy, seed, steer
         self._known: dict[tuple[int, ...], _Lazy] = {}
         self.why = "no candidate is left that was not refused"
@@ -261,7 +260,8 @@ class _Search:
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
             ways = ways[2:] or ways
-            base = replace(base, replay=replace(base.replay, eps_col_m=base.replay.eps_col_m + 0.003))
+            eps_m = base.replay.eps_col_m + WIDER_M
+            base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
             base = replace(base, seed=len(steer.refused))
         failure: NoPathError | None = None
         for way in ways:
@@ -293,8 +293,6 @@ class _Search:
 
 def _chance_to_miss(margin: float) -> float:
     """Of a normal variable, beyond so many standard deviations."""
-    from math import erfc, sqrt  # noqa: PLC0415
-
     return erfc(margin / sqrt(2.0)) / 2
 
 
@@ -326,8 +324,7 @@ class _Options:
         self._goals = [
             compile_constraint(record, problem)
             for record in records
-            if record["kind"] not in _PLACED
-            or record.get("support") == TABLE
+            if record["kind"] not in _PLACED or record.get("support") == TABLE
         ]
         self.why = ""
         self._given_up: list[Grasp] = []
@@ -395,9 +392,7 @@ class _Options:
         steer, releases = self._steer, found.releases
         if steer is not None and steer.change == "release":
             releases = tuple(
-                each
-                for each in releases
-                if not steer.has_release_like(self._key, each.T_base_tcp)
+                each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
             )
         return releases
 
@@ -412,9 +407,7 @@ class _Options:
             problem, grasp, constraints=self._goals, near=near, config=config, seed=self._seed
         )
 
-    def remarks_of(
-        self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]
-    ) -> tuple[str, ...]:
+    def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
         postures = sum(leg.movement.path.work.get("postures", 0.0) for leg in legs)
         clear = release.clearance_m
@@ -467,9 +460,7 @@ def _stage_of_leg(name: str, ids: Mapping[str, str]) -> str | None:
 def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
     """Poses along a leg that carries, as ``worst_along`` takes them."""
     T_tcp = problem.robot.Ts_base_tcp(leg.movement.path.joints_rad)
-    Ts: dict[str, Any] = {
-        name: T[None, None] for name, T in problem.scene.Ts_base_object.items()
-    }
+    Ts: dict[str, Any] = {name: T[None, None] for name, T in problem.scene.Ts_base_object.items()}
     Ts[grasp.object_id] = (T_tcp @ se3.invert(grasp.T_object_tcp))[None]
     widths = np.full((1, len(T_tcp)), leg.movement.width_m)
     return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
@@ -514,5 +505,3 @@ def _plan_of(
         tau=tuple(trajectory.tau),
     )
     return plan, remarks
-
-

@@ -96,8 +96,8 @@ def _grid(
 ) -> Float[np.ndarray, "num 4 4"]:
     """Places all over the table: turned as now, and along the sides of the other objects."""
     shift = np.random.default_rng(seed).uniform(0.0, _STEP_M, 2)
-    x, y = (np.arange(low, high, _STEP_M) + d for (low, high), d in zip(_AREA_M, shift, strict=True))
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    axes = [np.arange(low, high, _STEP_M) for low, high in _AREA_M]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2) + shift
     now = float(np.arctan2(T_now[1, 0], T_now[0, 0]))
     yaws = [0.0]
     for T in problem.scene.Ts_base_object.values():

@@ -75,9 +75,7 @@ def choose(
         NoPlanError: When there is none left.
     """
     if not refused:
-        ranked = proposer.propose(
-            problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None
-        )
+        ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
         if round_ >= len(ranked):
             raise NoPlanError(f"there are {len(ranked)} candidates, and {round_} were tried.")
         return named(ranked[round_], problem, seed=seed)

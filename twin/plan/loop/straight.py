@@ -265,9 +265,7 @@ def _push_legs(
     way = to - T[:2, 3]
     far_m = float(np.linalg.norm(way))
     if far_m < PUSH_GAP_M:
-        raise NoPlanError(
-            f"{key} lies {far_m * 1e3:.0f} mm from its mark: too near to be pushed."
-        )
+        raise NoPlanError(f"{key} lies {far_m * 1e3:.0f} mm from its mark: too near to be pushed.")
     along = way / far_m
     half = np.array(task.objects[key].size_m[:2]) / 2
     local = np.abs(T[:2, :2].T @ along)
