@@ -2,8 +2,8 @@
 
 Forty pairs of postures among a box, a post and a wall, and where the arm is in its own way; none
 can be joined straight. OMPL (its Python package) asks the project's exact clearance at every
-0.05 rad of an edge. Both find, then shorten. TOPP-RA gets the very curve that is timed here, and the
-cubic spline through the knots.
+0.05 rad of an edge. Both find, then shorten. TOPP-RA gets the very curve that is timed here, and
+the cubic spline through the knots.
 
 CPU time of this process, one thread. References: pip install ompl toppra (or their folder on
 PYTHONPATH); what is not there is left out.
