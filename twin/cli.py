@@ -5,7 +5,7 @@ from pathlib import Path
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.gate.config import GateConfig
-from twin.plan.config import LivePlanConfig
+from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
 
@@ -14,6 +14,7 @@ REPLAY = ReplayRunConfig()
 REBUILD = RebuildConfig()
 RENDER = RenderConfig()
 LIVE_PLAN = LivePlanConfig()
+PLAN = PlanConfig()
 CALIBRATE = CalibrateConfig()
 
 
@@ -71,29 +72,34 @@ def plan(
     task: str = "",
     dry: bool = False,
     live: bool = False,
+    words: PlanConfig = PLAN,
     config: LivePlanConfig = LIVE_PLAN,
     output: Output = OUTPUT,
 ) -> int:
-    """Say what an instruction asks for: objects, goals, stages; keep it as a task of the run.
+    """Plan a task from words, have the twin judge the plan, and write it into the run's plans/.
 
     With --live, plan for a cell that asks over zenoh; stop with Ctrl-C.
-    Exit code 2, with what could be meant, where the instruction is not understood whole.
-    Example: robot-gst plan runs/today --task "put the cube into the box" --dry
+    Exit code 2, with what could be meant, where the instruction is not understood whole; 3 where
+    the twin accepted no candidate. Nothing is sent to a cell.
+    Example: robot-gst plan runs/today --task "put the cube into the box"
 
     Args:
-        run: Run folder; its episodes and its scene say which objects there are.
+        run: Run folder; its episodes and its scene say which objects there are, and where.
         task: The instruction in English, or the name or file of a task.
-        dry: Write nothing; otherwise the task goes into the run's tasks/.
+        dry: Say what was understood and write nothing; without it the task goes into the run's
+            tasks/ and the plan into its plans/.
         live: Answer a cell's requests.
-        config: Settings of --live.
+        words: How an instruction is planned.
+        config: Settings of --live; its robot counts without it too.
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
     from twin.plan.ground.run_tasks import keep, understand
-    from twin.plan.live import run_planner
 
     if live:
+        from twin.plan.live import run_planner
+
         return run_planner(run, config, output)
     if not task:
         message = (
@@ -103,11 +109,21 @@ def plan(
         raise UsageError(message)
     folder = RunFolder.open(run)
     understood = understand(folder, task)
-    path = None if dry else keep(folder, understood)
-    data = {**understood.to_json(), "file": None if path is None else str(path)}
-    wrote = [] if path is None else ["", f"wrote {path}"]
-    output.result(data, "\n".join([*understood.lines(), *wrote]))
-    return 0
+    if dry:
+        output.result({**understood.to_json(), "file": None}, "\n".join(understood.lines()))
+        return 0
+    from twin.gate.twin_process import judge_of
+    from twin.plan.once import plan_once, proposer_of, start_of
+
+    proposer_of(words.policy)
+    path = keep(folder, understood)
+    start = start_of(folder, understood.file.task(), words, config.robot)
+    judge = judge_of(folder.path, start.problem.scene)
+    planned = plan_once(folder, understood, start, judge, words)
+    data = {**planned.to_json(), "file": None if path is None else str(path)}
+    wrote = [] if path is None else [f"wrote {path}"]
+    output.result(data, "\n".join([*planned.lines(), *wrote]))
+    return 0 if planned.path is not None else 3
 
 
 def rebuild(

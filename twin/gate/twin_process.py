@@ -3,7 +3,7 @@
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ from bridge.terminal import Output
 from twin.gate.config import GateConfig
 from twin.gate.gate import UndecidedError
 from twin.replay.config import ReplayConfig
+from twin.replay.scene import ReplayScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +94,6 @@ def answer(question: Question) -> Verdict:
         read_rebuilt_scene,
     )
     from twin.replay.result import ReplayResult  # noqa: PLC0415
-    from twin.replay.scene import ReplayScene  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
@@ -147,6 +147,39 @@ def answer(question: Question) -> Verdict:
         identity=plan.start_id or plan.id,
     )
     return _with_notes(with_probability(verdict, samples), rebuilt.notes)
+
+
+def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
+    """Ask the twin in this process as a gate asks it in its own.
+
+    Args:
+        run_path: Run folder with the rebuilt scene, or without one.
+        scene: Task, poses and robot; where the arm stands.
+
+    Returns:
+        What judges one plan; it raises ``UndecidedError`` where a replay takes too many steps.
+    """
+    config = GateConfig()
+
+    def judge(plan: Plan) -> Verdict:
+        replay = replace(config.replay, mode="dynamic", samples=config.samples)
+        replay.refuse_soft(scene.task.soft_objects)
+        return answer(
+            Question(
+                run_path=run_path,
+                plan=plan,
+                task=scene.task,
+                Ts_base_object=scene.Ts_base_object,
+                covariances=dict(scene.covariances),
+                urdf=scene.urdf,
+                config=replay,
+                max_steps=config.max_steps,
+                start_rad=scene.start_rad,
+                max_audit_distances=config.max_audit_distances,
+            )
+        )
+
+    return judge
 
 
 def _with_notes(verdict: Verdict, notes: tuple[str, ...]) -> Verdict:

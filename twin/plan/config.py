@@ -30,3 +30,23 @@ class LivePlanConfig:
     def __post_init__(self) -> None:
         """Refuse numbers with which no planner can work."""
         refuse_outside(self, {"candidates": (1, 1000)})
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PlanConfig:
+    """How an instruction is planned."""
+
+    policy: str = "nominal"
+    """nominal, single (the first candidate alone), loose (no distances), geometric (nothing is
+    optimised)."""
+    rounds: int = 5
+    """Candidates that the twin may judge; each is steered by what it said of the one before."""
+    seed: int = 0
+    """Of everything that is drawn."""
+    episode: str = ""
+    """Whose start is planned from; none: the newest that shows all objects."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that plan nothing."""
+        refuse_outside(self, {"rounds": (1, 1000), "seed": (0, 2**63 - 1)})

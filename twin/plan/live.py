@@ -7,6 +7,7 @@ and publishes nothing; the cell that asks publishes the plan, asks the gate, and
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,17 @@ from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.plan.config import LivePlanConfig
 from twin.plan.loop import straight
+from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import NoPlanError, Proposer, choose
 from twin.plan.problem import Problem
+from twin.plan.shapes import shapes_of
 from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
 
-PROPOSERS: Mapping[str, Callable[[], Proposer]] = {straight.POLICY: straight.GeometricProposer}
+PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
+    straight.POLICY: straight.GeometricProposer,
+    **{name: partial(PlanProposer, policy) for name, policy in POLICIES.items()},
+}
 """How a plan is made, by the policy it is called."""
 ALIVE = "/alive"
 """Behind the service's key: the liveliness token of the planner that answers there."""
@@ -130,7 +136,11 @@ class LivePlanner:
             task, urdf, poses, covariances=covariances
         )
         start_rad = np.array(request.joints_rad, dtype=np.float64)
-        return Problem(scene=replace(scene, start_rad=start_rad), robot=robot, shapes={})
+        return Problem(
+            scene=replace(scene, start_rad=start_rad),
+            robot=robot,
+            shapes=shapes_of(self._run.scene_dir, task),
+        )
 
 
 def claim_planner(session: Any, cell: str) -> None:

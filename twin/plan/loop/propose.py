@@ -36,6 +36,8 @@ class Proposer(Protocol):
     ) -> list[Candidate]:
         """Offer plans, the best first; the same arguments give the same plans.
 
+        Asked for fewer, it offers the first of them.
+
         Args:
             problem: What is to be done, and where.
             plan_id: Name of the plans; whoever publishes one gives it its own.
@@ -67,30 +69,35 @@ def choose(
         seed: Of the start; rounds that are steered draw from their own.
         round_: How many candidates were not executed.
         refused: Those of them that were judged, with their verdicts; none: candidates go by rank.
-        most: Candidates that are asked for at once.
+        most: Candidates that are asked for at once where the first was refused before.
 
     Raises:
         NoPlanError: When there is none left.
     """
     if not refused:
-        ranked = proposer.propose(
-            problem, plan_id=plan_id, seed=seed, count=max(most, round_ + 1), steer=None
-        )
+        ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
         if round_ >= len(ranked):
             raise NoPlanError(f"there are {len(ranked)} candidates, and {round_} were tried.")
         return named(ranked[round_], problem, seed=seed)
     steer = steer_by(refused, problem.scene.task, fingers_of(problem))
     known = [refusal.plan.tau for refusal in refused]
-    try:
-        steered = proposer.propose(problem, plan_id=plan_id, seed=seed, count=most, steer=steer)
-    except NoPlanError:
-        steered = []
-    if fresh := _fresh(steered, known):
+
+    def fresh_of(steer: Steer | None, counts: Sequence[int]) -> Candidate | None:
+        """The first that was not refused; plans take time, so few are asked for at first."""
+        for count in counts:
+            try:
+                found = proposer.propose(
+                    problem, plan_id=plan_id, seed=seed, count=count, steer=steer
+                )
+            except NoPlanError:
+                return None
+            if fresh := _fresh(found, known):
+                return fresh
+        return None
+
+    if fresh := fresh_of(steer, (1, most)):
         return named(fresh, problem, seed=seed, steer=steer)
-    ranked = proposer.propose(
-        problem, plan_id=plan_id, seed=seed, count=most + len(refused), steer=None
-    )
-    if fresh := _fresh(ranked, known):
+    if fresh := fresh_of(None, (len(refused) + 1, most + len(refused))):
         remark = f"nothing else answers {steer.clause}: the next by rank"
         return named(replace(fresh, remarks=(*fresh.remarks, remark)), problem, seed=seed)
     raise NoPlanError(f"every candidate was refused, the last by {steer.clause}.")
@@ -142,6 +149,7 @@ def plan_and_verify(
     plan_id: str,
     seed: int,
     rounds: int,
+    task_sha256: str = "",
 ) -> list[Attempt]:
     """Propose and have judged until one is accepted; the last attempt is the one that counts.
 
@@ -155,6 +163,7 @@ def plan_and_verify(
         plan_id: Plans are called this, a dot and their round.
         seed: Of everything that is drawn.
         rounds: Candidates that may be judged.
+        task_sha256: Of the task file; empty: not known.
 
     Raises:
         NoPlanError: When there is not even a first candidate.
@@ -177,7 +186,13 @@ def plan_and_verify(
                 raise
             break
         parent = attempts[-1].candidate.plan.id if attempts else None
-        plan = replace(candidate.plan, id=f"{plan_id}.{round_}", parent_id=parent, round=round_)
+        plan = replace(
+            candidate.plan,
+            id=f"{plan_id}.{round_}",
+            parent_id=parent,
+            round=round_,
+            task_sha256=task_sha256,
+        )
         candidate = replace(candidate, plan=plan)
         verdict = judge(plan)
         attempts.append(Attempt(candidate=candidate, verdict=verdict))

@@ -13,10 +13,11 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.task.plan import Plan, Stage, Waypoint
+from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import ObjectModel, Task
 from twin.plan.loop.propose import Candidate, NoPlanError
 from twin.plan.loop.steer import Steer
+from twin.plan.loop.tau import plan_stage, stages_of
 from twin.plan.problem import Problem
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -35,6 +36,10 @@ OVER_TOP_M = 0.003
 """Between the underside of the object and what it is put into, or onto, when it is let go."""
 SPEED_M_S, TURN_RAD_S = 0.25, 1.0
 SHORTEST_S = 0.5
+PUSH_GAP_M, PUSH_OVER_M, FINGERS_HALF_M = 0.03, 0.004, 0.011
+"""Before the fingers meet what they push; of the tool over its lowest place; of the closed pads."""
+PUSH_SPEED_M_S, RAMP_S, PUSH_STEP_S = 0.1, 0.12, 0.02
+"""Of a push whose task says no speed; time to reach it and to stop; between its waypoints."""
 ASIDE_M = (0.0, 0.012, -0.012)
 """Along the pads, where a grasp may be elsewhere than the task says."""
 RELEASES_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
@@ -64,6 +69,8 @@ class _Leg:
     g: int
     pause_s: float = 0.0
     """Stands here this long instead of moving."""
+    even_m_s: float | None = None
+    """Goes at this speed but for short ramps; None: slowly, at rest at both ends."""
 
 
 class GeometricProposer:
@@ -115,6 +122,8 @@ def _was_refused(problem: Problem, choice: _Choice, steer: Steer) -> bool:
     scene = problem.scene
     mine = scene.task.manipulated if steer.object_id is None else (steer.object_id,)
     for key in mine:
+        if "push" in stages_of(scene.task, key):
+            continue
         T = scene.Ts_base_object[key]
         tool = _grasp(scene.task.objects[key], T, choice)
         again = steer.has_grasp_like(key, se3.invert(T) @ tool)
@@ -137,7 +146,8 @@ def _plan(problem: Problem, choice: _Choice, plan_id: str) -> Plan:
     there = dict(scene.Ts_base_object)
     legs: list[_Leg] = []
     for key in task.manipulated:
-        legs += _legs(problem, key, choice, there)
+        pushed = "push" in stages_of(task, key)
+        legs += (_push_legs if pushed else _legs)(problem, key, choice, there)
     legs.append(_Leg(stage=legs[-1].stage, T_base_tcp=T_home, g=0))
     tau, bounds = _followed(problem, legs, start_rad)
     return Plan(
@@ -151,34 +161,8 @@ def _plan(problem: Problem, choice: _Choice, plan_id: str) -> Plan:
         instruction=task.instruction,
         entities={key: se3.pose_record(T) for key, T in scene.Ts_base_object.items()},
         joint_names=record.joints,
-        stages=tuple(_stage(table, task, bounds, there) for table in task.stages),
+        stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
         tau=tau,
-    )
-
-
-def _stage(
-    table: dict[str, object],
-    task: Task,
-    bounds: dict[str, tuple[int, int]],
-    there: dict[str, Float[np.ndarray, "4 4"]],
-) -> Stage:
-    stage_id = str(table["id"])
-    start_ns, end_ns = bounds.get(stage_id, (0, 0))
-    last = table is task.stages[-1]
-    grasp, release = table.get("grasp"), table.get("release")
-    pairs: Sequence[Sequence[str]] = table.get("allowed_contacts", [])  # type: ignore[assignment]
-    return Stage(
-        id=stage_id,
-        text=str(table.get("text", "")),
-        grasp=None if grasp is None else str(grasp),
-        release=None if release is None else str(release),
-        allowed_contacts=tuple((one, other) for one, other in pairs),
-        terminal=tuple(dict(item) for item in task.success) if last else (),
-        predicted_objects={}
-        if release is None
-        else {str(release): se3.pose_record(there[str(release)])},
-        t_start_ns=start_ns,
-        t_end_ns=end_ns,
     )
 
 
@@ -245,12 +229,7 @@ def _legs(
 ) -> list[_Leg]:
     """The movements for one object; ``there`` then has it where it comes to lie."""
     task = problem.scene.task
-    ids = {
-        verb: str(table["id"])
-        for table in task.stages
-        for verb in ("grasp", "carry", "release")
-        if table.get(verb) == key
-    }
+    ids = stages_of(task, key)
     if not {"grasp", "release"} <= ids.keys():
         raise NoPlanError(f"no stage of task {task.name} grasps {key}, or none releases it.")
     grasp = _grasp(task.objects[key], there[key], choice)
@@ -272,6 +251,50 @@ def _legs(
     ]
 
 
+def _push_legs(
+    problem: Problem, key: str, choice: _Choice, there: dict[str, Float[np.ndarray, "4 4"]]
+) -> list[_Leg]:
+    """Down behind the object with closed fingers, straight on to its mark, back and up."""
+    task, T = problem.scene.task, there[key]
+    mark = task.mark_of(key)
+    if mark is None:
+        raise NoPlanError(f"nothing in task {task.name} says where {key} is to be pushed.")
+    stage = stages_of(task, key)["push"]
+    table = next(each for each in task.stages if each["id"] == stage)
+    to = np.array(mark) + np.array(choice.release_m)
+    way = to - T[:2, 3]
+    far_m = float(np.linalg.norm(way))
+    if far_m < PUSH_GAP_M:
+        raise NoPlanError(f"{key} lies {far_m * 1e3:.0f} mm from its mark: too near to be pushed.")
+    along = way / far_m
+    half = np.array(task.objects[key].size_m[:2]) / 2
+    local = np.abs(T[:2, :2].T @ along)
+    reach_m = float(np.min(half / np.maximum(local, 1e-9))) + FINGERS_HALF_M
+    aside = np.array([-along[1], along[0]]) * choice.aside_m
+    tool = _tool_down(float(np.arctan2(along[1], along[0])) + np.pi * (choice.turns % 2))
+    height_m = problem.scene.table_height_m + LOWEST_TOOL_M + PUSH_OVER_M
+
+    def at(p: Float[np.ndarray, "2"], up_m: float = 0.0) -> Float[np.ndarray, "4 4"]:
+        T_tool = tool.copy()
+        T_tool[:3, 3] = [*p, height_m + up_m]
+        return T_tool
+
+    behind = T[:2, 3] - (reach_m + PUSH_GAP_M) * along + aside
+    ahead = to - reach_m * along + aside
+    back = ahead - PUSH_GAP_M * along
+    there[key] = T.copy()
+    there[key][:2, 3] = to
+    speed = float(table.get("speed_m_s", PUSH_SPEED_M_S))
+    return [
+        _Leg(stage=stage, T_base_tcp=at(behind, HOVER_M), g=1),
+        _Leg(stage=stage, T_base_tcp=at(behind), g=1),
+        _Leg(stage=stage, T_base_tcp=at(ahead), g=1, even_m_s=speed),
+        _Leg(stage=stage, T_base_tcp=at(ahead), g=1, pause_s=0.3),
+        _Leg(stage=stage, T_base_tcp=at(back), g=1),
+        _Leg(stage=stage, T_base_tcp=at(back, HOVER_M), g=1),
+    ]
+
+
 def _at_height(T: Float[np.ndarray, "4 4"], height_m: float) -> Float[np.ndarray, "4 4"]:
     raised = T.copy()
     raised[2, 3] = height_m
@@ -287,10 +310,9 @@ def _followed(
     tau = [_waypoint(0.0, T, legs[0].g, joints)]
     bounds: dict[str, tuple[int, int]] = {}
     for leg in legs:
-        seconds = leg.pause_s or _duration_s(T, leg.T_base_tcp)
-        steps = max(1, round(seconds / STEP_S))
+        seconds, law = _law(T, leg)
+        steps = len(law)
         u = np.arange(1, steps + 1) / steps
-        law = u**3 * (10 - 15 * u + 6 * u**2)  # at rest at both ends, with little jerk
         ends = np.array([T, leg.T_base_tcp])
         line = PoseTrajectory(
             np.array([0, 10**9], dtype=np.int64),
@@ -306,11 +328,27 @@ def _followed(
                     f"the arm cannot follow to ({x:.3f}, {y:.3f}, {z:.3f}) m in stage {leg.stage}."
                 )
             joints = solution.joints_rad
-            tau.append(_waypoint(t_s + float(share) * steps * STEP_S, pose, leg.g, joints))
-        t_s += steps * STEP_S
+            tau.append(_waypoint(t_s + float(share) * seconds, pose, leg.g, joints))
+        t_s += seconds
         T = leg.T_base_tcp
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], round(t_s * 1e9))
     return tuple(tau), bounds
+
+
+def _law(T: Float[np.ndarray, "4 4"], leg: _Leg) -> tuple[float, Float[np.ndarray, " num_steps"]]:
+    """How long a leg takes, and which share of its way is done after each step."""
+    if leg.even_m_s is None:
+        steps = max(1, round((leg.pause_s or _duration_s(T, leg.T_base_tcp)) / STEP_S))
+        u = np.arange(1, steps + 1) / steps
+        return steps * STEP_S, u**3 * (10 - 15 * u + 6 * u**2)  # with little jerk
+    far_m = float(np.linalg.norm(leg.T_base_tcp[:3, 3] - T[:3, 3]))
+    seconds = far_m / leg.even_m_s + RAMP_S
+    ramp = RAMP_S / seconds
+    u = np.arange(1, max(1, round(seconds / PUSH_STEP_S)) + 1)
+    u = u / len(u)
+    begins, ends = np.minimum(u, ramp), np.maximum(u - 1 + ramp, 0.0)
+    done = u - begins + begins**2 / (2 * ramp) - ends**2 / (2 * ramp)
+    return seconds, done / (1 - ramp)
 
 
 def _duration_s(T: Float[np.ndarray, "4 4"], T_next: Float[np.ndarray, "4 4"]) -> float:

@@ -33,6 +33,9 @@ from twin.robot.model import RobotModel
 LIFT_M = 0.06
 """How far an object is lifted, and let down, straight [m]."""
 _LEAST_LIFT_M = 0.02
+_SAME_RAD = 0.001
+_LEAVE_MORE_M = (0.1, 0.05, 0.0)
+"""Beyond the length of the approach, how far the hand goes straight back."""
 _TURN = 2 * np.pi
 
 
@@ -70,6 +73,9 @@ def plan_transfer(
     release: Release,
     start_rad: Float[np.ndarray, " num_joints"],
     config: PathConfig,
+    *,
+    lift_m: float = LIFT_M,
+    straight: bool = False,
 ) -> tuple[Leg, ...]:
     """Plan all movements from where the arm stands to where it has let go and left.
 
@@ -79,6 +85,8 @@ def plan_transfer(
         release: Where it is let go.
         start_rad: Where the arm stands.
         config: Of every movement.
+        lift_m: How far the object is lifted, and let down, straight; less where that is not free.
+        straight: Carry it along a straight line of the tool, turned evenly; else around.
 
     Raises:
         NoPathError: One of the movements does not exist; its name comes first.
@@ -98,7 +106,7 @@ def plan_transfer(
         ends = out.path.joints_rad[-1:]
         around = plan_move(problem, start_rad, ends, config, width_m=open_m)
     with _named("lift"):
-        lift = _straight_up(problem, grasp.joints_rad, config, closed_m, held, taking)
+        lift = _straight_up(problem, grasp.joints_rad, config, closed_m, held, taking, lift_m)
     lifted = lift.path.joints_rad[-1]
     placed = replace(
         problem,
@@ -112,15 +120,19 @@ def plan_transfer(
     for joints in nearest_solutions(robot, release.T_base_tcp, lifted, config.replay.ik):
         try:
             with _named("lower"):
-                rise = _straight_up(problem, joints, config, closed_m, held, leaving)
+                rise = _straight_up(problem, joints, config, closed_m, held, leaving, lift_m)
             with _named("carry"):
-                carry = plan_move(
-                    problem, lifted, rise.path.joints_rad[-1:], config, width_m=closed_m,
-                    carried=held, allowed=grip,
+                over = rise.path.joints_rad[-1]
+                carry = (
+                    _carried_straight(problem, lifted, over, config, closed_m, held, grip)
+                    if straight
+                    else plan_move(
+                        problem, lifted, over[None], config, width_m=closed_m,
+                        carried=held, allowed=grip,
+                    )
                 )  # fmt: skip
             with _named("leave"):
-                away = release.T_base_tcp @ _along_z(-grasp.pregrasp_m)
-                leave = plan_straight(placed, joints, away, config, width_m=open_m, allowed=leaving)
+                leave = _leave(placed, release, joints, config, open_m, leaving, grasp.pregrasp_m)
         except NoPathError as error:
             failure = error
             continue
@@ -159,6 +171,47 @@ def _backwards(movement: Movement) -> Movement:
     )
 
 
+def _leave(
+    placed: Problem,
+    release: Release,
+    joints_rad: Float[np.ndarray, " num_joints"],
+    config: PathConfig,
+    width_m: float,
+    allowed: Allowed,
+    least_m: float,
+) -> Movement:
+    """Straight back; the farther the better, for next to a rim nothing else may be planned."""
+    for more_m in _LEAVE_MORE_M:
+        away = release.T_base_tcp @ _along_z(-least_m - more_m)
+        try:
+            return plan_straight(placed, joints_rad, away, config, width_m=width_m, allowed=allowed)
+        except NoPathError:
+            if more_m == _LEAVE_MORE_M[-1]:
+                raise
+    raise NoPathError(reason="unreachable", detail="no way to leave is tried")
+
+
+def _carried_straight(
+    problem: Problem,
+    start_rad: Float[np.ndarray, " num_joints"],
+    goal_rad: Float[np.ndarray, " num_joints"],
+    config: PathConfig,
+    width_m: float,
+    held: Carried,
+    allowed: Allowed,
+) -> Movement:
+    """Carry along a straight line that ends on the branch on which the object is let down."""
+    goal = problem.robot.T_base_tcp(goal_rad)
+    movement = plan_straight(
+        problem, start_rad, goal, config, width_m=width_m, carried=held, allowed=allowed
+    )
+    off_rad = float(np.abs(movement.path.joints_rad[-1] - goal_rad).max())
+    if off_rad > _SAME_RAD:
+        detail = f"the straight line ends {off_rad:.2f} rad from how the arm lets down"
+        raise NoPathError(reason="branch", detail=detail)
+    return movement
+
+
 def _straight_up(
     problem: Problem,
     joints_rad: Float[np.ndarray, " num_joints"],
@@ -166,9 +219,10 @@ def _straight_up(
     width_m: float,
     held: Carried,
     allowed: Allowed,
+    lift_m: float,
 ) -> Movement:
     """Lift as far as is free and within reach, at least two centimetres."""
-    rise_m = LIFT_M
+    rise_m = lift_m
     while True:
         T = problem.robot.T_base_tcp(joints_rad)
         T[2, 3] += rise_m

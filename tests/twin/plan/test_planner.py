@@ -1,0 +1,157 @@
+"""The planner itself: policies, the order of candidates, steering, and from words to a verdict."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scripted_plans import scene_of_test
+
+from bridge.geometry import se3
+from bridge.robots.default import ROBOT
+from bridge.task.plan import Plan
+from bridge.task.plan_request import Refusal
+from bridge.task.task_file import load_task
+from bridge.task.verdict import Factor, Verdict
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.loop.nominal import LOOSE, NOMINAL, SINGLE, PlanProposer, Policy
+from twin.plan.loop.places import places_on_table
+from twin.plan.loop.propose import NoPlanError, choose
+from twin.plan.loop.steer import tried_in
+from twin.plan.problem import Problem, State
+from twin.plan.shapes import shapes_of
+from twin.replay.config import ReplayConfig
+from twin.replay.scene import ReplayScene
+from twin.replay.verdict import replay_plan
+from twin.robot.model import load_robot
+
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+QUICK = replace(NOMINAL, path=replace(NOMINAL.path, audited=False))
+"""The gate audits again."""
+
+
+def problem_in(scene: ReplayScene) -> Problem:
+    return Problem(
+        scene=replace(scene, start_rad=HOME),
+        robot=load_robot(scene.urdf),
+        shapes=shapes_of(None, scene.task),
+    )
+
+
+def drawn(task_name: str, seed: int) -> Problem:
+    task = load_task(task_name)
+    Ts = task.draw_start(np.random.default_rng(seed))
+    return problem_in(ReplayScene(task=task, Ts_base_object=Ts, urdf=ROBOT.urdf_text()))
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return problem_in(scene_of_test())
+
+
+def chosen(problem: Problem, round_: int, refused: tuple[Refusal, ...] = ()) -> Plan:
+    return choose(
+        PlanProposer(QUICK), problem, plan_id="p", seed=3, round_=round_, refused=refused, most=5
+    ).plan
+
+
+def refusal(plan: Plan, **factors: Factor) -> Refusal:
+    said = {"ik": Factor(value=True), "clearance": Factor(value=True)} | factors
+    verdict = Verdict(
+        plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
+        **{"terminal": Factor(value=True), **said},
+    )  # fmt: skip
+    return Refusal(plan=plan, verdict=verdict)
+
+
+def test_the_twin_accepts_the_first_plan(problem: Problem) -> None:
+    plan = chosen(problem, 0)
+    verdict = replay_plan(plan, problem.scene, ReplayConfig(mode="dynamic")).verdict
+    assert verdict.accepted, verdict.reason
+    assert Plan.from_json(plan.to_json()) == plan
+    assert all(w.joints_rad is not None and w.width_m is not None for w in plan.tau)
+    assert all(a.t_ns < b.t_ns for a, b in zip(plan.tau, plan.tau[1:], strict=False))
+    assert plan.tau[-1].joints_rad == pytest.approx(HOME, abs=1e-6)
+
+
+def test_the_order_of_candidates_is_that_of_a_longer_list(problem: Problem) -> None:
+    """Asked for two or for one, the first is the same to the byte; no two are alike."""
+    proposer = PlanProposer(QUICK)
+    two = proposer.propose(problem, plan_id="p", seed=3, count=2, steer=None)
+    one = proposer.propose(problem, plan_id="p", seed=3, count=1, steer=None)
+    assert one[0].plan.to_json() == two[0].plan.to_json()
+    assert [each.rank for each in two] == [0, 1]
+    assert two[0].plan.tau != two[1].plan.tau
+
+
+def test_a_refused_grasp_gives_another_grasp(problem: Problem) -> None:
+    first = chosen(problem, 0)
+    no = refusal(first, terminal=Factor(value=False, cause="slipped", bodies=("cube",)))
+    second = chosen(problem, 1, (no,))
+    assert second.steered_by is not None
+    assert second.steered_by.clause == "terminal.slipped"
+    (one,), (other,) = tried_in(first), tried_in(second)
+    away_m = np.linalg.norm(one.T_object_tcp[:3, 3] - other.T_object_tcp[:3, 3])
+    turned = se3.rotation_angle_rad(one.T_object_tcp[:3, :3].T @ other.T_object_tcp[:3, :3])
+    assert away_m > 0.01 or turned > np.radians(10)
+
+
+def test_a_refused_release_keeps_the_grasp(problem: Problem) -> None:
+    first = chosen(problem, 0)
+    touches = Factor(value=False, cause="contact", bodies=("cube", "box"))
+    second = chosen(problem, 1, (refusal(first, clearance=touches),))
+    (one,), (other,) = tried_in(first), tried_in(second)
+    assert other.T_object_tcp == pytest.approx(one.T_object_tcp, abs=1e-6)
+    assert one.T_base_release is not None
+    assert other.T_base_release is not None
+    away_m = np.linalg.norm(one.T_base_release[:3, 3] - other.T_base_release[:3, 3])
+    turned = se3.rotation_angle_rad(one.T_base_release[:3, :3].T @ other.T_base_release[:3, :3])
+    assert away_m > 0.01 or turned > np.radians(10)
+
+
+def test_single_has_one_candidate(problem: Problem) -> None:
+    found = PlanProposer(SINGLE).propose(problem, plan_id="p", seed=3, count=3, steer=None)
+    assert len(found) == 1
+    assert found[0].plan.policy == "single"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "policy"),
+    [
+        ("cube_into_box", LOOSE),
+        ("stack_two_cubes", NOMINAL),
+        ("push_cube_to_mark", NOMINAL),
+        ("sloth_into_basket", NOMINAL),
+        ("slippery_block_into_box", NOMINAL),
+    ],
+)
+def test_every_kind_of_task_has_a_plan(task: str, policy: Policy) -> None:
+    problem = drawn(task, 5)
+    (found,) = PlanProposer(policy).propose(problem, plan_id="p", seed=5, count=1, steer=None)
+    assert found.plan.policy == policy.name
+    assert [stage.id for stage in found.plan.stages] == [
+        stage["id"] for stage in problem.scene.task.stages
+    ]
+
+
+def test_what_was_not_localised_is_not_planned(problem: Problem) -> None:
+    Ts = {"box": problem.scene.Ts_base_object["box"]}
+    lost = replace(problem, scene=replace(problem.scene, Ts_base_object=Ts))
+    with pytest.raises(NoPlanError, match="cube of task cube_into_box was not localised"):
+        PlanProposer().propose(lost, plan_id="p", seed=0, count=1, steer=None)
+
+
+def test_places_on_the_table_satisfy_what_is_asked(problem: Problem) -> None:
+    record = {"kind": "beside", "obj": "cube", "reference": "box", "direction": "right",
+              "min_gap": 0.02, "max_gap": 0.05}  # fmt: skip
+    goal = compile_constraint(record, problem)
+    places = places_on_table(problem, "cube", [goal], seed=1)
+    assert places
+    for T in places:
+        Ts = {**problem.scene.Ts_base_object, "cube": T}
+        state = State(
+            Ts_base_object={name: T[None] for name, T in Ts.items()},
+            T_base_tcp=np.eye(4)[None],
+            width_m=np.zeros(1),
+        )
+        assert goal.violation(state)[0] <= 0, goal.explain(state)

@@ -1,0 +1,507 @@
+"""The planner: grasps by margin, final states of each, collision-free timed ways between them.
+
+Objects are moved in the task's order, each from where those before it have left the arm, with what
+was placed before lying where it is predicted to. The order of candidates does not depend on how
+many are asked for: the surest grasps with their cheapest final state first, then the next final
+states. What a refusal asks to change is left out, or tried first.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from math import erfc, sqrt
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.check import TABLE
+from bridge.task.plan import Plan
+from twin.plan.constrain.constraint import Constraint, worst_along
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError, turned
+from twin.plan.loop.places import lying_there, places_on_table
+from twin.plan.loop.propose import Candidate, NoPlanError
+from twin.plan.loop.steer import Steer
+from twin.plan.loop.straight import GeometricProposer
+from twin.plan.loop.tau import Trajectory, goals_of, plan_stage, stages_of
+from twin.plan.path.planner import NoPathError, PathConfig, plan_move
+from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
+from twin.plan.problem import Grasp, Problem, Release, State
+from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
+from twin.plan.release.resting import NoFinalStateError
+from twin.replay.config import ReplayConfig
+from twin.robot.config import IkConfig
+
+PLANNER = "gst_planner"
+CLOSED_M = 0.0
+"""Commanded width of the closed hand: its force, not its place, is what holds."""
+GRASPS = 6
+"""Grasps of one object that are looked at, the surest first."""
+WIDER_M = 0.003
+"""Kept beyond what was asked for where a path was refused."""
+NOT_KEPT = "not kept on the way"
+MOST_TRIED = 16
+"""Pairs of grasp and final state of one object that a way is sought for."""
+_PLACED = ("inside", "on")
+"""Relations that final states are found for without a place to begin at."""
+_HOPELESS = ("nowhere_said", "not_localised", "container_too_small")
+"""Causes that no other grasp changes."""
+_OF_GRASP = ("approach", "around", "lift")
+"""Movements that do not depend on the final state."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """How an object is carried."""
+
+    lift_m: float = LIFT_M
+    straight: bool = False
+    more_seed: int = 0
+
+
+_WAYS = (
+    Way(),
+    Way(straight=True),
+    Way(lift_m=0.10, more_seed=1),
+    Way(lift_m=0.10, straight=True),
+    Way(lift_m=0.14, more_seed=2),
+)
+"""In which order ways are tried where the first does not keep what holds on the way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """What is optimised, under the name that plans carry."""
+
+    name: str
+    grasp: GraspConfig = field(default_factory=GraspConfig)
+    release: ReleaseConfig = field(default_factory=ReleaseConfig)
+    path: PathConfig = field(default_factory=PathConfig)
+    grasps: int = GRASPS
+    """Grasps of one object that are looked at."""
+    ways: tuple[Way, ...] = _WAYS
+
+
+NOMINAL = Policy(name="nominal")
+SINGLE = Policy(
+    name="single",
+    release=ReleaseConfig(num_samples=0, num_nominal=1, max_releases=1),
+    grasps=1,
+)
+"""The first grasp and its cheapest solved final state; nothing is drawn, nothing comes after it."""
+LOOSE = Policy(
+    name="loose",
+    grasp=GraspConfig(clearance_m=0.0, least_margin=-5.0),
+    release=ReleaseConfig(eps_col_m=0.0, sigmas=0.0),
+    path=PathConfig(audited=False, replay=ReplayConfig(eps_col_m=0.0)),
+    ways=(Way(straight=True), Way()),
+)
+"""Nothing has to keep a distance, and objects are carried along straight lines."""
+POLICIES = {policy.name: policy for policy in (NOMINAL, SINGLE, LOOSE)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transfer:
+    """One object moved."""
+
+    key: str
+    grasp: Grasp
+    release: Release
+    legs: tuple[Leg, ...]
+    T_base_lies: Float[np.ndarray, "4 4"]
+    """Where the object is predicted to come to lie."""
+    cost: float
+    """J of the final state, plus the chance that the grasp misses."""
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def end_rad(self) -> Float[np.ndarray, " num_joints"]:
+        """Arm when it has let go and left."""
+        return self.legs[-1].movement.path.joints_rad[-1]
+
+
+class PlanProposer:
+    """Offers plans of one policy; see ``Proposer``."""
+
+    def __init__(self, policy: Policy = NOMINAL) -> None:
+        """Remember what is optimised."""
+        self._policy = policy
+
+    def propose(
+        self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
+    ) -> list[Candidate]:
+        """Offer plans, the surest grasps first; see ``Proposer``.
+
+        Raises:
+            NoPlanError: There is none; the message says what is in the way.
+        """
+        task = problem.scene.task
+        if lost := problem.scene.missing():
+            message = f"{', '.join(lost)} of task {task.name} was not localised."
+            raise NoPlanError(f"{message} {problem.scene.describe_missing()}")
+        if any(table.get("push") for table in task.stages):
+            return self._pushed(problem, plan_id=plan_id, seed=seed, count=count, steer=steer)
+        search = _Search(problem, self._policy, seed, steer)
+        found: list[Candidate] = []
+        for transfers in search.sequences():
+            try:
+                plan, remarks = _plan_of(problem, transfers, self._policy, plan_id, seed)
+            except NoPathError as error:
+                search.why = str(error)
+                continue
+            cost = sum(each.cost for each in transfers)
+            found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=remarks))
+            if len(found) == count:
+                break
+        if not found:
+            raise NoPlanError(search.why)
+        return found
+
+    def _pushed(self, problem: Problem, **asked: Any) -> list[Candidate]:
+        """Tasks that push go the straight geometric way."""
+        found = GeometricProposer().propose(problem, **asked)
+        named = {"planner": PLANNER, "policy": self._policy.name}
+        kept = found[:1] if self._policy.grasps == 1 else found
+        remark = "pushed straight, tool down; no distance was looked at"
+        return [replace(each, plan=replace(each.plan, **named), remarks=(remark,)) for each in kept]
+
+
+class _Lazy:
+    """A list that is made as it is asked for."""
+
+    def __init__(self, make: Iterator[Transfer]) -> None:
+        self._make, self._made = make, list[Transfer]()
+
+    def nearest(self, index: int) -> Transfer | None:
+        """The one at an index; the last where there are fewer, None where there are none."""
+        while len(self._made) <= index:
+            try:
+                self._made.append(next(self._make))
+            except StopIteration:
+                break
+        return self._made[min(index, len(self._made) - 1)] if self._made else None
+
+
+class _Search:
+    """Ways to move all objects, the best first."""
+
+    def __init__(self, problem: Problem, policy: Policy, seed: int, steer: Steer | None) -> None:
+        self._problem, self._policy, self._seed, self._steer = problem, policy, seed, steer
+        self._known: dict[tuple[int, ...], _Lazy] = {}
+        self.why = "no candidate is left that was not refused"
+
+    def sequences(self) -> Iterator[list[Transfer]]:
+        """Each candidate takes of every object the next transfer; the last ones are kept."""
+        before: list[Any] = []
+        for number in range(MOST_TRIED):
+            transfers = self._sequence(number)
+            if transfers is None or any(_same(transfers, other) for other in before):
+                return
+            before.append(transfers)
+            yield transfers
+
+    def _sequence(self, number: int) -> list[Transfer] | None:
+        transfers: list[Transfer] = []
+        problem = self._problem
+        for key in self._problem.scene.task.manipulated:
+            prefix = tuple(id(each) for each in transfers)
+            if prefix not in self._known:
+                self._known[prefix] = _Lazy(self._transfers(problem, key))
+            found = self._known[prefix].nearest(number)
+            if found is None:
+                return None
+            transfers.append(found)
+            problem = _after(problem, found)
+        return transfers
+
+    def _transfers(self, problem: Problem, key: str) -> Iterator[Transfer]:
+        """One object's: grasp by grasp with the cheapest final state, then with the next one."""
+        start = problem.scene.start_rad
+        start_rad = problem.robot.home_rad if start is None else start
+        try:
+            options = _Options(problem, key, self._policy, self._seed, self._mine(key))
+            pairs = options.pairs()
+            found = False
+            for tried, (grasp, release) in enumerate(pairs):
+                if tried == MOST_TRIED:
+                    self.why = f"of {MOST_TRIED} ways to move {key} none is free: {self.why}"
+                    return
+                try:
+                    transfer = self._moved(problem, grasp, release, start_rad, options)
+                except NoPathError as error:
+                    self.why = f"{key}: {error}"
+                    if error.leg in _OF_GRASP:
+                        options.give_up(grasp)
+                    continue
+                found = True
+                yield transfer
+            if not found and options.why:
+                self.why = options.why
+        except (NoGraspError, NoFinalStateError) as error:
+            self.why = str(error)
+
+    def _mine(self, key: str) -> Steer | None:
+        steer = self._steer
+        return steer if steer is not None and steer.object_id in (None, key) else None
+
+    def _moved(
+        self,
+        problem: Problem,
+        grasp: Grasp,
+        release: Release,
+        start_rad: Float[np.ndarray, " num_joints"],
+        options: "_Options",
+    ) -> Transfer:
+        """The first way that keeps what holds on the way."""
+        kept = _kept_on_the_way(problem, grasp)
+        ways = self._policy.ways
+        base = self._policy.path
+        steer = self._mine(grasp.object_id)
+        if steer is not None and steer.change == "path":
+            ways = ways[2:] or ways
+            eps_m = base.replay.eps_col_m + WIDER_M
+            base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
+            base = replace(base, seed=len(steer.refused))
+        failure: NoPathError | None = None
+        for way in ways:
+            config = replace(base, seed=base.seed + self._seed % 2**31 + way.more_seed)
+            try:
+                legs = plan_transfer(
+                    problem, grasp, release, start_rad, config,
+                    lift_m=way.lift_m, straight=way.straight,
+                )  # fmt: skip
+                kept(legs)
+            except NoPathError as error:
+                failure = failure or error
+                if error.reason != NOT_KEPT and not way.straight:
+                    break  # where nothing is free, another height is not either
+                continue
+            return Transfer(
+                key=grasp.object_id,
+                grasp=grasp,
+                release=release,
+                legs=legs,
+                T_base_lies=lying_there(problem, release),
+                cost=release.cost + _chance_to_miss(grasp.margin),
+                remarks=options.remarks_of(grasp, release, legs),
+            )
+        if failure is None:
+            raise NoPathError(reason="unreachable", detail="no way is tried")
+        raise failure
+
+
+def _chance_to_miss(margin: float) -> float:
+    """Of a normal variable, beyond so many standard deviations."""
+    return erfc(margin / sqrt(2.0)) / 2
+
+
+def _same(one: list[Transfer], other: list[Transfer]) -> bool:
+    return all(a is b for a, b in zip(one, other, strict=True))
+
+
+def _after(problem: Problem, moved: Transfer) -> Problem:
+    """The problem when an object was moved: it lies there, the arm stands where it left."""
+    Ts = {**problem.scene.Ts_base_object, moved.key: moved.T_base_lies}
+    scene = replace(problem.scene, Ts_base_object=Ts, start_rad=moved.end_rad)
+    return replace(problem, scene=scene)
+
+
+class _Options:
+    """Grasps of one object with their final states, as the policy and a refusal want them."""
+
+    def __init__(
+        self, problem: Problem, key: str, policy: Policy, seed: int, steer: Steer | None
+    ) -> None:
+        self._problem, self._key, self._policy = problem, key, policy
+        self._seed, self._steer = seed, steer
+        found = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed)).search(key)
+        self._remarks = found.remarks
+        self._grasps = self._ordered(list(found.grasps))[: policy.grasps]
+        self.num_grasps = len(found.grasps)
+        records = goals_of(problem.scene.task, key)
+        self._relation = problem.scene.task.goal_of(key)
+        self._goals = [
+            compile_constraint(record, problem)
+            for record in records
+            if record["kind"] not in _PLACED or record.get("support") == TABLE
+        ]
+        self.why = ""
+        self._given_up: list[Grasp] = []
+
+    def give_up(self, grasp: Grasp) -> None:
+        """No final state helps this grasp: the arm does not get there."""
+        self._given_up.append(grasp)
+
+    def _ordered(self, grasps: list[Grasp]) -> list[Grasp]:
+        """Leave out what was refused, or begin with what is to be kept."""
+        steer, key = self._steer, self._key
+        if steer is None:
+            return grasps
+
+        def refused(grasp: Grasp) -> bool:
+            T = grasp.T_object_tcp
+            return steer.has_grasp_like(key, T) or steer.has_grasp_like(key, turned(T[None])[0])
+
+        if steer.change in ("grasp", "branch"):
+            return [grasp for grasp in grasps if not refused(grasp)]
+        if steer.change == "grasp_shift" and steer.toward_m is not None:
+            toward = np.array(steer.toward_m)
+            near = sorted(
+                grasps,
+                key=lambda each: float(np.linalg.norm(each.T_object_tcp[:3, 3] - toward)),
+            )
+            fresh = [grasp for grasp in near if not refused(grasp)]
+            shifted = self._shifted(next((g for g in grasps if refused(g)), grasps[0]), toward)
+            return [*shifted, *fresh]
+        return sorted(grasps, key=lambda each: not refused(each))
+
+    def _shifted(self, grasp: Grasp, toward_m: Float[np.ndarray, "3"]) -> list[Grasp]:
+        """The refused grasp moved along its pads to where a finger met the object."""
+        T = grasp.T_object_tcp.copy()
+        way = toward_m - T[:3, 3]
+        T[:3, 3] += way - T[:3, 1] * (way @ T[:3, 1])  # between the pads it stays in the middle
+        if self._steer is not None and self._steer.has_grasp_like(self._key, T):
+            return []
+        goal = self._problem.scene.Ts_base_object[self._key] @ T
+        joints = nearest_solutions(self._problem.robot, goal, grasp.joints_rad, IkConfig())
+        return [replace(grasp, T_object_tcp=T, joints_rad=joints[0])] if joints else []
+
+    def pairs(self) -> Iterator[tuple[Grasp, Release]]:
+        """Every grasp with its cheapest final state, then every grasp with the next, and so on."""
+        states: dict[int, tuple[Release, ...]] = {}
+        for rank in range(self._policy.release.max_releases):
+            for number, grasp in enumerate(self._grasps):
+                if any(grasp is each for each in self._given_up):
+                    continue
+                if number not in states:
+                    states[number] = self._releases(grasp)
+                if rank < len(states[number]):
+                    yield grasp, states[number][rank]
+        if not self._grasps:
+            self.why = f"no grasp of {self._key} is left that was not refused"
+
+    def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
+        try:
+            found = self._final_states(grasp)
+        except NoFinalStateError as error:
+            self.why = str(error)
+            if error.cause in _HOPELESS:
+                raise
+            return ()
+        steer, releases = self._steer, found.releases
+        if steer is not None and steer.change == "release":
+            releases = tuple(
+                each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
+            )
+        return releases
+
+    def _final_states(self, grasp: Grasp) -> FinalStates:
+        problem, config = self._problem, self._policy.release
+        relation = self._relation
+        placed = relation is None or (relation[0] in _PLACED and relation[1] != TABLE)
+        near = None
+        if not placed or (relation is None and problem.scene.task.mark_of(self._key) is None):
+            near = places_on_table(problem, self._key, self._goals, seed=self._seed)
+        return final_states(
+            problem, grasp, constraints=self._goals, near=near, config=config, seed=self._seed
+        )
+
+    def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
+        """Where the numbers of a transfer come from, in words."""
+        postures = sum(leg.movement.path.work.get("postures", 0.0) for leg in legs)
+        clear = release.clearance_m
+        nearest = f", {clear * 1e3:.0f} mm clear" if np.isfinite(clear) else ""
+        return (
+            f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
+            f"{grasp.margin:.1f} standard deviations",
+            *(f"{self._key}: {text}" for text in (*self._remarks, *grasp.remarks)),
+            f"{self._key}: final state of J {release.cost:.4f}{nearest}; asked were "
+            + "; ".join(release.checked_against),
+            f"{self._key}: {postures:.0f} postures looked at on the way",
+        )
+
+
+def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...]], None]:
+    """Ask the constraints of the object's stages of each leg that belongs to them."""
+    task, key = problem.scene.task, grasp.object_id
+    ids = stages_of(task, key)
+    tables = {str(table["id"]): table for table in task.stages}
+    of_stage: dict[str, list[Constraint]] = {
+        stage: [compile_constraint(way, problem) for way in tables[stage].get("path", ())]
+        for stage in ids.values()
+    }
+
+    def check(legs: tuple[Leg, ...]) -> None:
+        for leg in legs:
+            stage = _stage_of_leg(leg.name, ids)
+            if stage is None or not of_stage[stage]:
+                continue
+            states = _states_along(problem, grasp, leg)
+            for constraint in of_stage[stage]:
+                f = float(worst_along(constraint, states, times_s=leg.movement.path.times_s)[0])
+                if f > 0:
+                    detail = f"{constraint.kind} is violated by {f:.3g} {constraint.unit}"
+                    error = NoPathError(reason=NOT_KEPT, detail=detail)
+                    error.leg = leg.name
+                    raise error
+
+    return check
+
+
+def _stage_of_leg(name: str, ids: Mapping[str, str]) -> str | None:
+    if name == "lift":
+        return ids.get("grasp")
+    if name == "carry":
+        return ids.get("carry", ids.get("release"))
+    return ids.get("release") if name == "lower" else None
+
+
+def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
+    """Poses along a leg that carries, as ``worst_along`` takes them."""
+    T_tcp = problem.robot.Ts_base_tcp(leg.movement.path.joints_rad)
+    Ts: dict[str, Any] = {name: T[None, None] for name, T in problem.scene.Ts_base_object.items()}
+    Ts[grasp.object_id] = (T_tcp @ se3.invert(grasp.T_object_tcp))[None]
+    widths = np.full((1, len(T_tcp)), leg.movement.width_m)
+    return State(Ts_base_object=Ts, T_base_tcp=T_tcp[None], width_m=widths)
+
+
+def _plan_of(
+    problem: Problem, transfers: list[Transfer], policy: Policy, plan_id: str, seed: int
+) -> tuple[Plan, tuple[str, ...]]:
+    """Write transfers as a plan; at the end the arm goes back to where it stood."""
+    task, record = problem.scene.task, problem.robot.record
+    trajectory = Trajectory(robot=problem.robot)
+    there = dict(problem.scene.Ts_base_object)
+    last = problem
+    for each in transfers:
+        trajectory.add_transfer(each.legs, each.grasp, stages_of(task, each.key), CLOSED_M)
+        there[each.key] = each.T_base_lies
+        last = _after(last, each)
+    remarks = tuple(text for each in transfers for text in each.remarks)
+    start = problem.scene.start_rad
+    home_rad = problem.robot.home_rad if start is None else start
+    open_m = transfers[-1].grasp.open_m
+    config = replace(policy.path, seed=seed % 2**31)
+    try:
+        home = plan_move(last, transfers[-1].end_rad, home_rad[None], config, width_m=open_m)
+    except NoPathError as error:
+        remarks += (f"the arm stays where it let go: {error}",)
+    else:
+        leg = Leg(name="home", movement=home, g=0)
+        trajectory.add(leg, str(task.stages[-1]["id"]), open_m)
+    plan = Plan(
+        id=plan_id,
+        planner=PLANNER,
+        policy=policy.name,
+        condition="without_replanning",
+        robot=record.name,
+        frame=record.base_frame,
+        task=task.name,
+        instruction=task.instruction,
+        entities={key: se3.pose_record(T) for key, T in problem.scene.Ts_base_object.items()},
+        joint_names=record.joints,
+        stages=tuple(plan_stage(task, table, trajectory.bounds, there) for table in task.stages),
+        tau=tuple(trajectory.tau),
+    )
+    return plan, remarks

@@ -1,0 +1,124 @@
+"""Where objects come to lie: predicted after a release, and places on the table that fit a goal."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.check import TABLE
+from twin.plan.constrain.bodies import surface_points
+from twin.plan.constrain.constraint import Constraint
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.problem import Problem, Release, State
+from twin.plan.release.resting import NoFinalStateError, target_of
+
+_AREA_M = ((0.28, 0.68), (-0.36, 0.36))
+"""Where an arm at the origin reaches with the tool down, in its base frame."""
+_STEP_M = 0.02
+_LEAST_GAP_M = 0.012
+_PLACES = 4
+_APART_M = 0.03
+
+
+def lying_there(problem: Problem, release: Release) -> Float[np.ndarray, "4 4"]:
+    """Where an object comes to lie that is let go a little above: straight below.
+
+    Args:
+        problem: With what it is put into or onto.
+        release: Where it is let go.
+    """
+    T = release.T_base_object.copy()
+    points = se3.apply(T, surface_points(problem, release.object_id))
+    T[2, 3] -= float(points[:, 2].min()) - _support_m(problem, release.object_id)
+    return T
+
+
+def _support_m(problem: Problem, key: str) -> float:
+    goal = problem.scene.task.goal_of(key)
+    if goal is None or goal[0] not in ("inside", "on") or goal[1] == TABLE:
+        return problem.scene.table_height_m
+    return float(target_of(problem, key).T_base[2, 3])
+
+
+def places_on_table(
+    problem: Problem, key: str, goals: Sequence[Constraint], *, seed: int
+) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses on the table, as the object lies now or turned by quarters, that satisfy goals.
+
+    Args:
+        problem: Everything else keeps its place.
+        key: Of the object.
+        goals: What is asked of where it lies.
+        seed: Of the grid's offset.
+
+    Raises:
+        NoFinalStateError: No free place satisfies all goals; says which one is farthest off.
+    """
+    T_now = problem.scene.Ts_base_object[key]
+    points = se3.apply(T_now, surface_points(problem, key))
+    Ts = _grid(problem, T_now, float(T_now[2, 3] - points[:, 2].min()), seed)
+    state = State(
+        Ts_base_object={
+            name: Ts if name == key else np.broadcast_to(T, Ts.shape)
+            for name, T in problem.scene.Ts_base_object.items()
+        },
+        T_base_tcp=Ts,
+        width_m=np.zeros(len(Ts)),
+    )
+    apart = [
+        compile_constraint(
+            {"kind": "clearance", "obj": key, "against": name, "min": _LEAST_GAP_M}, problem
+        )
+        for name in problem.scene.Ts_base_object
+        if name != key
+    ]
+    excess = np.array([c.violation(state) / c.scale for c in (*goals, *apart)])
+    total = np.maximum(excess, 0.0).sum(axis=0) if len(excess) else np.zeros(len(Ts))
+    if not (total <= 0).any():
+        best = int(total.argmin())
+        worst = (*goals, *apart)[int(excess[:, best].argmax())]
+        one = State(
+            Ts_base_object={name: T[best : best + 1] for name, T in state.Ts_base_object.items()},
+            T_base_tcp=Ts[best : best + 1],
+            width_m=np.zeros(1),
+        )
+        message = f"no free place on the table fits {key}. In the best one {worst.explain(one)}."
+        raise NoFinalStateError(cause="no_free_pose", message=message)
+    fits = np.flatnonzero(total <= 0)
+    slack = np.minimum(-excess[:, fits].max(axis=0), 1.0)
+    travel = np.linalg.norm(Ts[fits, :2, 3] - T_now[:2, 3], axis=1)
+    return _apart(Ts[fits[np.argsort(travel - 0.2 * slack, kind="stable")]])
+
+
+def _grid(
+    problem: Problem, T_now: Float[np.ndarray, "4 4"], rest_m: float, seed: int
+) -> Float[np.ndarray, "num 4 4"]:
+    """Places all over the table: turned as now, and along the sides of the other objects."""
+    shift = np.random.default_rng(seed).uniform(0.0, _STEP_M, 2)
+    axes = [np.arange(low, high, _STEP_M) for low, high in _AREA_M]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2) + shift
+    now = float(np.arctan2(T_now[1, 0], T_now[0, 0]))
+    yaws = [0.0]
+    for T in problem.scene.Ts_base_object.values():
+        turn = float(np.arctan2(T[1, 0], T[0, 0])) - now
+        yaws.append((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+    found = []
+    for yaw in dict.fromkeys(round(turn, 6) for turn in yaws):
+        Ts = np.tile(np.eye(4), (len(places), 1, 1))
+        Ts[:, :3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, yaw])) @ T_now[:3, :3]
+        Ts[:, :2, 3] = places
+        Ts[:, 2, 3] = problem.scene.table_height_m + rest_m + 0.003
+        found.append(Ts)
+    return np.concatenate(found)
+
+
+def _apart(Ts: Float[np.ndarray, "num 4 4"]) -> list[Float[np.ndarray, "4 4"]]:
+    """The first few that are not next to each other."""
+    kept: list[Float[np.ndarray, "4 4"]] = []
+    for T in Ts:
+        if all(np.linalg.norm(T[:2, 3] - other[:2, 3]) > _APART_M for other in kept):
+            kept.append(T)
+        if len(kept) == _PLACES:
+            break
+    return kept

@@ -1,0 +1,143 @@
+"""From movements to a gst plan: the trajectory tau, the stages it goes through, what they leave."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.geometry import se3
+from bridge.task.plan import Stage, Waypoint
+from bridge.task.task_file import Task
+from twin.plan.constrain.relations import constraint_of
+from twin.plan.path.planner import waypoints_of
+from twin.plan.path.transfer import Leg
+from twin.plan.problem import Grasp
+from twin.robot.model import RobotModel
+
+Bounds = Mapping[str, tuple[int, int]]
+"""When each stage begins and ends, from the start of the plan [ns]."""
+SETTLE_S, CLOSE_S, OPEN_S = 0.2, 0.7, 0.5
+"""Standing still before the hand moves, while it closes, and while it opens."""
+
+
+@dataclass
+class Trajectory:
+    """Movements one after the other, with the hand's closing and opening in between."""
+
+    robot: RobotModel
+    tau: list[Waypoint] = field(default_factory=list)
+    bounds: dict[str, tuple[int, int]] = field(default_factory=dict)
+    end_s: float = 0.0
+
+    def add_transfer(
+        self, legs: Sequence[Leg], grasp: Grasp, stages: Mapping[str, str], closed_m: float
+    ) -> None:
+        """Append a pick and place.
+
+        Args:
+            legs: From ``plan_transfer``.
+            grasp: Says how far the hand opens.
+            stages: Ids of the stages that grasp, carry and release; the last may cover the carry.
+            closed_m: Commanded width while it holds; the force of the gripper limits how hard.
+        """
+        pick, place = stages["grasp"], stages["release"]
+        of = {"around": pick, "approach": pick, "lift": pick, "carry": stages.get("carry", place)}
+        for leg in legs:
+            stage = of.get(leg.name, place)
+            width_m = closed_m if leg.g else grasp.open_m
+            self.add(leg, stage, width_m)
+            if leg.name == "approach":
+                self._pause(stage, SETTLE_S, g=0, width_m=grasp.open_m)
+                self._pause(stage, CLOSE_S, g=1, width_m=closed_m)
+            if leg.name == "lower":
+                self._pause(stage, SETTLE_S, g=1, width_m=closed_m)
+                self._pause(stage, OPEN_S, g=0, width_m=grasp.open_m)
+
+    def add(self, leg: Leg, stage: str, width_m: float) -> None:
+        """Append one movement.
+
+        Args:
+            leg: It begins where the last one ended.
+            stage: Which it belongs to.
+            width_m: Commanded all the way.
+        """
+        begin_s = self.end_s
+        points = waypoints_of(
+            self.robot, leg.movement.path, g=leg.g, width_m=width_m, begin_s=begin_s
+        )
+        self.tau += points[1:] if self.tau else points
+        self._ends(stage, begin_s, begin_s + float(leg.movement.path.times_s[-1]))
+
+    def _pause(self, stage: str, seconds: float, *, g: int, width_m: float) -> None:
+        """Stand still; the command is given as soon as that begins."""
+        here, begin_s = self.tau[-1], self.end_s
+        for t_s in (begin_s + 0.02, begin_s + seconds):
+            self.tau.append(
+                Waypoint(
+                    t_ns=round(t_s * 1e9),
+                    p_m=here.p_m,
+                    q_wxyz=here.q_wxyz,
+                    g=g,
+                    width_m=width_m,
+                    joints_rad=here.joints_rad,
+                )
+            )
+        self._ends(stage, begin_s, begin_s + seconds)
+
+    def _ends(self, stage: str, begin_s: float, end_s: float) -> None:
+        begin_ns = self.bounds.get(stage, (round(begin_s * 1e9), 0))[0]
+        self.bounds[stage] = (begin_ns, round(end_s * 1e9))
+        self.end_s = end_s
+
+
+def stages_of(task: Task, key: str) -> dict[str, str]:
+    """Ids of the stages that grasp, carry, release and push an object, by their verb."""
+    return {
+        verb: str(table["id"])
+        for table in task.stages
+        for verb in ("grasp", "carry", "release", "push")
+        if table.get(verb) == key
+    }
+
+
+def plan_stage(
+    task: Task,
+    table: Mapping[str, Any],
+    bounds: Bounds,
+    there: Mapping[str, Float[np.ndarray, "4 4"]],
+) -> Stage:
+    """What a plan says of one stage of its task: when it is, what may touch, where it leads.
+
+    Args:
+        task: What counts as success is its own.
+        table: The stage in its file.
+        bounds: When it is.
+        there: Where each object lies in the end.
+    """
+    stage_id = str(table["id"])
+    start_ns, end_ns = bounds.get(stage_id, (0, 0))
+    release = table.get("release", table.get("push"))
+    return Stage(
+        id=stage_id,
+        text=str(table.get("text", "")),
+        subgoal=tuple(goals_of(task, str(release))) if release is not None else (),
+        path=tuple(dict(way) for way in table.get("path", ())),
+        grasp=table.get("grasp"),
+        release=table.get("release"),
+        push=table.get("push"),
+        allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", ())),
+        terminal=tuple(dict(item) for item in task.success) if table is task.stages[-1] else (),
+        predicted_objects={}
+        if release is None
+        else {str(release): se3.pose_record(there[str(release)])},
+        t_start_ns=start_ns,
+        t_end_ns=end_ns,
+    )
+
+
+def goals_of(task: Task, key: str) -> list[dict[str, Any]]:
+    """The success predicates about where an object is, as constraints."""
+    mine = (spec for spec in task.success if spec.get("object") == key)
+    return [record for spec in mine if (record := constraint_of(spec, task)) is not None]

@@ -1,0 +1,302 @@
+"""One plan from words to a verdict: the recorded start, candidates, what the twin says of each."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import ROBOT_DESCRIPTION
+from bridge.errors import EpisodeError, UsageError
+from bridge.geometry import se3
+from bridge.robots.robot import read_robot, robot_of
+from bridge.task.check import nearest
+from bridge.task.plan import Plan, Stage
+from bridge.task.task_file import Task
+from bridge.task.verdict import Verdict
+from bridge.whole_file import write_whole
+from twin.errors import TwinError
+from twin.plan.config import PlanConfig
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.ground.run_tasks import UnderstoodTask
+from twin.plan.live import PROPOSERS
+from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
+from twin.plan.problem import Problem, State
+from twin.plan.shapes import problem_of
+from twin.replay.job import recorded_start
+from twin.scene.localise.episode import localise_episode
+from twin.scene.localise.mesh_fit import scanned_surfaces
+from twin.scene.localise.objects import LocaliseConfig
+from twin.scene.localise.result import LocalisedObject
+from twin.scene.localise.stationary_frames import calibrated_cameras
+from twin.scene.store.calibration import read_calibration
+
+PLANS = "plans"
+"""Folder of the run that plans go to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """What was recorded before anything moved."""
+
+    episode: str
+    localised: Mapping[str, LocalisedObject]
+    problem: Problem
+    urdf: str
+
+    def lines(self) -> list[str]:
+        """Where each object is, how sure, and by what."""
+        found = [f"start: as recorded at the beginning of {self.episode}"]
+        for key, item in self.localised.items():
+            if item.T_base_object is None:
+                continue
+            x, y, z = item.T_base_object[:3, 3] * 1e3
+            sure = "nobody says how sure"
+            if item.covariance is not None:
+                sigma = np.sqrt(np.linalg.eigvalsh(item.covariance[:3, :3]).max()) * 1e3
+                sure = f"to {sigma:.1f} mm"
+            shape = self.problem.shapes[key].source
+            found.append(
+                f"  {key}: ({x:.0f}, {y:.0f}, {z:.0f}) mm {sure}, by {item.method}; shape: {shape}"
+            )
+        scene = self.problem.scene.scene_hash
+        found.append(f"  scene: {'none was rebuilt' if scene is None else scene[:12]}")
+        return found
+
+
+def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") -> Start:
+    """Localise a task's objects at the start of the newest episode that shows them all.
+
+    Args:
+        run: With the episodes.
+        task: Whose objects are looked for.
+        config: May name the episode.
+        robot: Robot file that takes the place of the recorded description; none: that one.
+
+    Raises:
+        UsageError: No episode is called as asked, or there is none.
+        NoPlanError: No episode shows all of them; says what is missing in the newest.
+        EpisodeError: The robot was not described.
+    """
+    paths = run.episodes()
+    if config.episode:
+        names = {path.stem: path for path in paths}
+        if config.episode not in names:
+            message = (
+                f"{run.path} has no episode {config.episode!r}. There are: {', '.join(names)}."
+                f"{nearest(config.episode, names)}"
+            )
+            raise UsageError(message)
+        paths = [names[config.episode]]
+    run.refuse_empty()
+    lacking = ""
+    episodes = [Episode.open(path) for path in paths]
+    for episode in sorted(episodes, key=lambda each: streams.first_stamp_ns(each) or 0)[::-1]:
+        path = episode.path
+        found = _localised(run, episode, task)
+        missing = {
+            key: item.reason or "not found"
+            for key, item in found.items()
+            if item.T_base_object is None
+        }
+        if not missing:
+            return _start(run, episode, task, found, robot)
+        why = ", ".join(f"{key} ({reason})" for key, reason in missing.items())
+        lacking = lacking or f"{why} in {path.stem}"
+    message = (
+        f"not localised: {lacking}, and in no older episode all objects of task {task.name} are. "
+        f"Show them to the cameras and record again: robot-gst record {run.path}."
+    )
+    raise NoPlanError(message)
+
+
+def _localised(run: RunFolder, episode: Episode, task: Task) -> dict[str, LocalisedObject]:
+    config = LocaliseConfig()
+    surfaces = scanned_surfaces(run, task, config.mesh.num_samples).surfaces
+    poses = calibrated_cameras(episode, read_calibration(run))
+    return localise_episode(episode, task, config, surfaces=surfaces, poses=poses)
+
+
+def _start(
+    run: RunFolder,
+    episode: Episode,
+    task: Task,
+    found: Mapping[str, LocalisedObject],
+    robot: str,
+) -> Start:
+    urdf = streams.robot_description(episode)
+    if robot:
+        urdf = read_robot(robot).description()
+    if urdf is None:
+        raise EpisodeError(
+            path=episode.path,
+            found="no robot description",
+            hint=f"Record {ROBOT_DESCRIPTION}, or name the robot file: --robot.",
+        )
+    seen_ns = max(item.stamp_ns for item in found.values())
+    start_rad = recorded_start(episode, seen_ns, robot_of(urdf).joints)
+    problem = problem_of(run, task, found, urdf, start_rad)
+    return Start(episode=episode.path.stem, localised=found, problem=problem, urdf=urdf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """What came of an instruction."""
+
+    understood: UnderstoodTask
+    start: Start
+    attempts: Sequence[Attempt]
+    path: Path | None
+    """Where the accepted plan lies; None: none was accepted."""
+
+    @property
+    def last(self) -> Attempt:
+        """The attempt that counts."""
+        return self.attempts[-1]
+
+    def lines(self) -> list[str]:
+        """Everything for a person."""
+        told = [*self.understood.lines(), "", *self.start.lines(), "", "constraints:"]
+        plan = self.last.candidate.plan
+        for stage in plan.stages:
+            told += _explained(self.start.problem, plan, stage)
+        told += ["", "candidates:"]
+        told += [f"  {_attempt_line(each)}" for each in self.attempts]
+        told += ["", "where the numbers come from:"]
+        told += [f"  {remark}" for remark in self.last.candidate.remarks]
+        verdict = self.last.verdict
+        told += [f"  the twin: {text}" for text in verdict.warnings]
+        if self.path is not None:
+            told += ["", f"wrote {self.path}"]
+        else:
+            told += ["", "no candidate was accepted; nothing was written and nothing was sent"]
+        return told
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as data."""
+        return {
+            **self.understood.to_json(),
+            "start": {"episode": self.start.episode},
+            "plan": None if self.path is None else str(self.path),
+            "attempts": [
+                {
+                    "id": each.candidate.plan.id,
+                    "rank": each.candidate.rank,
+                    "cost": each.candidate.cost,
+                    "remarks": list(each.candidate.remarks),
+                    "steered_by": None
+                    if each.candidate.plan.steered_by is None
+                    else each.candidate.plan.steered_by.clause,
+                    "duration_s": each.candidate.plan.tau[-1].t_ns * 1e-9,
+                    "verdict": json.loads(each.verdict.to_json()),
+                }
+                for each in self.attempts
+            ],
+            "constraints": [
+                line
+                for stage in self.last.candidate.plan.stages
+                for line in _explained(self.start.problem, self.last.candidate.plan, stage)
+            ],
+        }
+
+
+def plan_once(
+    run: RunFolder,
+    understood: UnderstoodTask,
+    start: Start,
+    judge: Callable[[Plan], Verdict],
+    config: PlanConfig,
+) -> Planned:
+    """Propose, have the twin judge, steer, until a plan is accepted; write that one.
+
+    Args:
+        run: The plan goes into its ``plans/``.
+        understood: The task.
+        start: From where.
+        judge: The twin, as a gate asks it.
+        config: Policy, rounds and seed.
+
+    Raises:
+        NoPlanError: There is no candidate at all.
+    """
+    task = understood.file.task()
+    attempts = plan_and_verify(
+        proposer_of(config.policy),
+        start.problem,
+        judge,
+        plan_id=f"{task.name}.{config.policy}.{config.seed}",
+        seed=config.seed,
+        rounds=config.rounds,
+        task_sha256=understood.file.sha256,
+    )
+    path = None
+    if attempts[-1].verdict.accepted is True:
+        plan = attempts[-1].candidate.plan
+        path = run.path / PLANS / f"{plan.id}.json"
+        path.parent.mkdir(exist_ok=True)
+        write_whole(path, plan.to_json())
+    return Planned(understood=understood, start=start, attempts=attempts, path=path)
+
+
+def proposer_of(policy: str) -> Proposer:
+    """Who plans by a policy.
+
+    Raises:
+        UsageError: Nobody does.
+    """
+    if policy not in PROPOSERS:
+        known = ", ".join(sorted(PROPOSERS))
+        message = f"no policy {policy!r}. There are: {known}.{nearest(policy, PROPOSERS)}"
+        raise UsageError(message)
+    return PROPOSERS[policy]()
+
+
+def _attempt_line(attempt: Attempt) -> str:
+    plan, verdict = attempt.candidate.plan, attempt.verdict
+    answer = {True: "accepted", False: "refused", None: "undecided"}[verdict.accepted]
+    steered = "" if plan.steered_by is None else f", steered by {plan.steered_by.clause}"
+    failing = verdict.first_failing
+    factor = verdict.factors()[failing] if failing else None
+    cause = "" if factor is None else f" by {failing}.{factor.cause}: {factor.detail}"
+    if verdict.accepted is None and verdict.reason:
+        cause = f": {verdict.reason}"
+    return (
+        f"{plan.id}: rank {attempt.candidate.rank}, J {attempt.candidate.cost:.4f}, "
+        f"{plan.tau[-1].t_ns * 1e-9:.1f} s{steered}; {answer}{cause}"
+    )
+
+
+def _explained(problem: Problem, plan: Plan, stage: Stage) -> list[str]:
+    """A stage with its constraints, now and where the plan leaves it."""
+    told = [f"  {stage.id}: {stage.text}"]
+    for record in (*stage.subgoal, *stage.path):
+        try:
+            constraint = compile_constraint(record, problem)
+        except (UsageError, TwinError) as error:
+            told.append(f"    {record.get('kind')}: {error}")
+            continue
+        told.append(f"    now:  {constraint.explain(_state(problem, plan, None))}")
+        told.append(f"    then: {constraint.explain(_state(problem, plan, stage))}")
+    return told
+
+
+def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
+    """The start, or what a plan predicts of the end of a stage."""
+    Ts: dict[str, Float[np.ndarray, "4 4"]] = dict(problem.scene.Ts_base_object)
+    at = plan.tau[0]
+    if stage is not None:
+        for each in plan.stages[: plan.stages.index(stage) + 1]:
+            Ts |= {key: se3.pose_from_record(T) for key, T in each.predicted_objects.items()}
+        at = [w for w in plan.tau if w.t_ns <= stage.t_end_ns][-1]
+    T_tcp = se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))
+    return State(
+        Ts_base_object={key: T[None] for key, T in Ts.items()},
+        T_base_tcp=T_tcp[None],
+        width_m=np.array([at.width_m or 0.0]),
+    )
