@@ -1,8 +1,8 @@
 """True success rates on which the model of agreement is judged, fixed before the first result.
 
-Every truth is a population of groups: a pair of normal numbers with correlation ``rho``, turned into
-a recorded rate and a rate of the twin. Judged is whether an interval holds the correlation and the
-mean difference of the rates of that population. Groups of a task share a part of their numbers.
+Every truth is a population of groups: a pair of normal numbers with correlation ``rho``, turned
+into a recorded rate and a rate of the twin. Judged is whether an interval holds the correlation and
+the mean difference of the rates of that population. Groups of a task share a part of their numbers.
 """
 
 from dataclasses import dataclass

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
-from evaluator.compare.agreement import agreement_intervals, group_agreement
+from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, vouched_rate
+from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, averages
@@ -53,6 +54,7 @@ def compare_records(
     word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
     gains = replanning_gains(groups, method=method)
     chosen, decision_tables = decisions(groups)
+    modelled, model_tables = model_results(usable_groups(groups))
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *averages(groups, method=method),
@@ -60,6 +62,7 @@ def compare_records(
         *gains,
         *gain_tests(groups),
         *chosen,
+        *modelled,
     )
     return Comparison(
         run=path.stem,
@@ -72,6 +75,7 @@ def compare_records(
             *layout_table(groups, measurements, word),
             *gains_table(gains, word),
             *agreement_intervals(groups),
+            *model_tables,
             *decision_tables,
             *notes_table(notes(groups, measurements)),
         ),
