@@ -19,8 +19,8 @@ from evaluator.statistics.hierarchical import AgreementModel, GroupCounts
 
 FULL_DRAWS = 2
 DRAWS = int(os.environ.get("MODEL_DRAWS", FULL_DRAWS))
-NODES, NODES_IN_TASKS = 512, 256
-"""Fewer than the evaluator uses (2048, 1024): the ends of intervals move by some hundredths."""
+NODES, NODES_IN_TASKS = 1024, 512
+"""Fewer than the evaluator uses (4096, 2048): the ends of intervals move by some hundredths."""
 WHOLE = 1.98
 """Width of r from which on an interval says nothing."""
 LOG = "MODEL_LOG" in os.environ

@@ -148,7 +148,7 @@ RATE_BY_UNIT = _new(
     "successes / {unit}s as labelled; {unit}s of one trial are not independent, so the interval is narrower than the trials justify",
 )
 RATE_AS_GIVEN = _new(
-    "rate.{side}.{task}.{condition}.-",
+    "rate.{side}.{task}.{condition}.{policy}",
     "1",
     "higher",
     intervals.wilson,

@@ -8,7 +8,7 @@ trials is taken out of correlations, and rates of small groups are drawn towards
 Everything is quadrature: over the log-odds of a group on a grid, over a task's mean by adaptive
 Gauss-Hermite nodes (Liu and Pierce 1994), over the parameters by importance weights on Sobol nodes.
 Equal counts give equal numbers. Parameters are the means mu (normal, sd 2.5), the spreads sigma
-(half-normal, 2.5) and correlations rho = tanh z with density 1 / cosh z (arcsine law).
+(half-normal, 2.5) and correlations rho, whose arcsine is uniform.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ TASK_NODES = 3
 ROUNDS = 4
 """Times that the nodes are moved to where the posterior lies."""
 FREEDOM = 5
-FEW = 30.0
+FEW = 80.0
 """Nodes that have to count while they are being moved."""
 BATCH = 12_000_000
 """Numbers on the grid that are held at once."""
@@ -133,12 +133,12 @@ class Nodes:
 
     @staticmethod
     def of(phi: Float64[np.ndarray, "nodes parameters"]) -> "Nodes":
-        """Read coordinates: both means, then log sigma twice and atanh rho of each spread."""
+        """Read coordinates: both means, then of each spread sigma twice and the arcsine of rho."""
         spreads = [
             Spread(
-                first=np.exp(phi[:, at]),
-                second=np.exp(phi[:, at + 1]),
-                rho=np.tanh(phi[:, at + 2]),
+                first=phi[:, at],
+                second=phi[:, at + 1],
+                rho=np.sin(phi[:, at + 2]),
             )
             for at in range(2, phi.shape[1], 3)
         ]
@@ -159,9 +159,9 @@ def log_prior(phi: Float64[np.ndarray, "nodes parameters"]) -> Float64[np.ndarra
     """Return the logarithm of the prior density of coordinates, up to a constant."""
     found = -0.5 * (phi[:, :2] ** 2).sum(axis=1) / PRIOR_MEAN_SD**2
     for at in range(2, phi.shape[1], 3):
-        logs = phi[:, at : at + 2]
-        found += (logs - 0.5 * np.exp(2 * np.minimum(logs, 20)) / PRIOR_SPREAD**2).sum(axis=1)
-        found -= np.logaddexp(phi[:, at + 2], -phi[:, at + 2])
+        sizes, angle = phi[:, at : at + 2], phi[:, at + 2]
+        found -= 0.5 * (sizes**2).sum(axis=1) / PRIOR_SPREAD**2
+        found[(sizes <= 0).any(axis=1) | (np.abs(angle) >= np.pi / 2)] = -np.inf
     return np.asarray(found)
 
 
@@ -397,15 +397,15 @@ class AgreementModel:
 
     def _enough(self) -> int:
         if not self.in_tasks:
-            return 2048
-        return 1024 if len(self.groups) <= 40 else 512
+            return 4096 if len(self.groups) <= 40 else 2048
+        return 2048 if len(self.groups) <= 40 else 1024
 
     def _integrate(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
         """Move nodes to the posterior in some rounds, then weigh as many as were asked for."""
         start, scale = self._start()
         centre, chol = np.array(start), np.diag(scale)
         for turn in range(ROUNDS):
-            phi, log_w = self._weigh(centre, chol, max(num_nodes // 4, 256), turn)
+            phi, log_w = self._weigh(centre, chol, max(num_nodes // 4, 512), turn)
             weights = _flattened(log_w)
             centre = weights @ phi
             off = phi - centre
@@ -424,17 +424,18 @@ class AgreementModel:
         left = max(len(inside) - len(shares), 1)
         within = np.clip((inside**2).sum(axis=0) / left - noise, 0.1, 9.0)
         few = 1 / np.sqrt(len(self.groups))
-        start = [*like.logits.mean(axis=0), *(0.5 * np.log(within)), 0.7]
-        scale = [2 * few, 2 * few, 0.2 + 1.5 * few, 0.2 + 1.5 * few, 0.5 + 2 * few]
+        size = np.sqrt(within)
+        start = [*like.logits.mean(axis=0), *size, 0.7]
+        spread = [*(0.1 + 2 * few * size), min(0.3 + 2 * few, 1.0)]
+        scale = [2 * few, 2 * few, *spread]
         if self.in_tasks:
             few = 1 / np.sqrt(len(shares))
             means = np.stack([share.mean(axis=0) for share in shares])
-            between = np.clip(
-                means.var(axis=0) - (noise + within) * len(shares) / len(inside), 0.1, 9
-            )
-            start += [*(0.5 * np.log(between)), 0.7]
+            rest = (noise + within) * len(shares) / len(inside)
+            size = np.sqrt(np.clip(means.var(axis=0) - rest, 0.1, 9.0))
+            start += [*size, 0.7]
             scale[:2] = [2 * few, 2 * few]
-            scale += [0.2 + 1.5 * few, 0.2 + 1.5 * few, 0.5 + 2 * few]
+            scale += [*(0.1 + 2 * few * size), min(0.3 + 2 * few, 1.0)]
         return start, scale
 
     def _weigh(
@@ -518,8 +519,10 @@ class AgreementModel:
                 prior = like.weights(at[part], some)
                 for group in members:
                     mass = prior * like.table[group]
-                    row, column = _draw_cells(mass.reshape(len(mass), *like.shape), rng)
-                    recorded[part, group], sim[part, group] = like.rate[row], like.rate[column]
+                    cells_drawn = _draw_cells(mass.reshape(len(mass), *like.shape), rng)
+                    for side, drawn in zip((recorded, sim), cells_drawn, strict=True):
+                        inside = like.step * (rng.random(len(mass)) - 0.5)
+                        side[part, group] = expit(like.grid[drawn] + inside)
         return Draws(recorded=recorded, sim=sim)
 
 
