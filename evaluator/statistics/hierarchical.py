@@ -102,7 +102,7 @@ def estimate(
     tail = (1 - LEVEL) / 2
     low, high = np.interp([tail, 1 - tail], middle, ordered)
     mean = float(weights @ values)
-    sd = float(np.sqrt(max(weights @ (values - mean) ** 2, 0.0)))
+    sd = float(np.sqrt(weights @ (values - mean) ** 2))
     return Estimate(mean=mean, sd=sd, low=float(low), high=float(high))
 
 
@@ -216,7 +216,7 @@ class Likelihood:
         recorded, sim = (_binomial(*side, self.grid) for side in (group.recorded, group.sim))
         found = recorded[:, None] + sim[None, :]
         if not sum(group.pairs):
-            return found
+            return np.asarray(found)
         both = _both(self.rate[:, None], self.rate[None, :], float(np.exp(odds)))
         cells = (
             both,
@@ -227,7 +227,7 @@ class Likelihood:
         scale = min(1.0, MOST / sum(group.pairs))
         for count, chance in zip(group.pairs, cells, strict=True):
             found = found + scale * count * np.log(np.maximum(chance, 1e-300))
-        return found
+        return np.asarray(found)
 
     def weights(
         self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread
@@ -244,7 +244,7 @@ class Likelihood:
         found += two[:, None, :]
         found = found.reshape(len(mean), -1)
         np.exp(found, out=found)
-        return found
+        return np.asarray(found)
 
     def log(self, phi: Float64[np.ndarray, "nodes parameters"]) -> Float64[np.ndarray, " nodes"]:
         """Return the logarithm of the probability of all counts, for each set of parameters."""
@@ -252,7 +252,7 @@ class Likelihood:
         found = np.zeros(len(phi))
         for members in self.members:
             found += _log_sum(self.of_task(nodes, members)[0])
-        return found
+        return np.asarray(found)
 
     def of_task(
         self, nodes: Nodes, members: Int64[np.ndarray, " groups"]
@@ -313,7 +313,7 @@ class Likelihood:
 
 def _binomial(k: int, n: int, grid: Float64[np.ndarray, " grid"]) -> Float64[np.ndarray, " grid"]:
     scale = min(1.0, MOST / n) if n else 0.0
-    return -scale * (k * np.logaddexp(0, -grid) + (n - k) * np.logaddexp(0, grid))
+    return np.asarray(-scale * (k * np.logaddexp(0, -grid) + (n - k) * np.logaddexp(0, grid)))
 
 
 def _both(
@@ -346,7 +346,7 @@ class Draws:
     @cached_property
     def gap(self) -> Float64[np.ndarray, "draws groups"]:
         """Rate of the twin minus the recorded one."""
-        return self.sim - self.recorded
+        return np.asarray(self.sim - self.recorded)
 
     @cached_property
     def pearson(self) -> Float64[np.ndarray, " draws"]:
@@ -529,6 +529,7 @@ class AgreementModel:
 def _flattened(log_w: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:
     """Return weights of sum 1, flattened by a power until enough nodes count."""
     power = 1.0
+    weights = np.zeros_like(log_w)
     for _ in range(40):
         weights = np.exp(power * (log_w - log_w.max()))
         weights /= weights.sum()

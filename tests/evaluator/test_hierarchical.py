@@ -51,7 +51,7 @@ def eight() -> AgreementModel:
 
 def test_a_group_has_the_probability_that_scipy_integrates() -> None:
     groups = groups_of([("a", 3, 10, 14, 20), ("b", 0, 5, 1, 7), ("c", 4, 5, 5, 5)])
-    phi = np.array([[-0.3, 0.4, np.log(1.1), np.log(0.8), np.arctanh(0.6)]])
+    phi = np.array([[-0.3, 0.4, 1.1, 0.8, np.arcsin(0.6)]])
     like = Likelihood(groups)
     more = (like.step / 2) ** 2
     cov = np.array([[1.21 + more, 0.6 * 0.88], [0.6 * 0.88, 0.64 + more]])
@@ -128,12 +128,11 @@ def test_pairs_that_agree_make_the_bias_sharper() -> None:
     assert sharp.mean == pytest.approx(rough.mean, abs=0.03)
 
 
-def test_the_prior_is_a_density() -> None:
-    z = np.linspace(-20, 20, 4001)
-    phi = np.zeros((len(z), 5))
-    phi[:, 4] = z
-    density = np.exp(log_prior(phi) - log_prior(np.zeros((1, 5))))
-    assert density == pytest.approx(1 / np.cosh(z), rel=1e-9)
+def test_the_prior_allows_spreads_above_zero_and_true_correlations() -> None:
+    phi = np.array([[0, 0, 1, 1, 0.5], [0, 0, 2, 1, 1.5], [0, 0, -0.1, 1, 0], [0, 0, 1, 1, 1.6]])
+    found = log_prior(phi)
+    assert found[0] - found[1] == pytest.approx((4 - 1) / (2 * 2.5**2))
+    assert np.isneginf(found[2:]).all()
 
 
 def test_the_population_has_the_correlation_that_draws_have() -> None:
