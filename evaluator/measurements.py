@@ -21,6 +21,7 @@ from evaluator.statistics import (
     differences,
     funnel,
     gate,
+    hierarchical,
     intervals,
     power,
     prediction_powered,
@@ -147,7 +148,7 @@ RATE_BY_UNIT = _new(
     "successes / {unit}s as labelled; {unit}s of one trial are not independent, so the interval is narrower than the trials justify",
 )
 RATE_AS_GIVEN = _new(
-    "rate.{side}.{task}.{condition}.-",
+    "rate.{side}.{task}.{condition}.{policy}",
     "1",
     "higher",
     intervals.wilson,
@@ -364,6 +365,76 @@ PEARSON_R_REMEASURED = _new(
     "higher",
     agreement.pearson,
     "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
+)
+MODEL_R = _new(
+    "agreement.model.r",
+    "1",
+    "higher",
+    hierarchical.estimate,
+    "correlation of the true rates of these groups: the noise of counting is taken out",
+)
+MODEL_R_OTHERS = _new(
+    "agreement.model.r_others",
+    "1",
+    "higher",
+    hierarchical.population,
+    "the same over all groups of this kind; its interval is that of Pearson r",
+)
+MODEL_WITHIN = _new(
+    "agreement.model.r_within",
+    "1",
+    "higher",
+    hierarchical.AgreementModel,
+    "correlation of log-odds between groups of one task, noise of counting taken out",
+)
+MODEL_BETWEEN = _new(
+    "agreement.model.r_between",
+    "1",
+    "higher",
+    hierarchical.AgreementModel,
+    "correlation of the mean log-odds of tasks, noise of counting taken out",
+)
+MODEL_OPPOSED = _new(
+    "agreement.model.opposed",
+    "1",
+    "none",
+    hierarchical.AgreementModel,
+    "probability that the correlations within and between tasks have different signs",
+)
+MODEL_BIAS = _new(
+    "agreement.model.bias_pp",
+    "pp",
+    "none",
+    hierarchical.estimate,
+    "mean true sim rate - true recorded rate of these groups",
+)
+MODEL_BIAS_OF_GROUP = _new(
+    "agreement.model.bias_pp.{task}.{condition}.{policy}",
+    "pp",
+    "none",
+    hierarchical.estimate,
+    "true sim rate - true recorded rate of one group, drawn towards the others where it is small",
+)
+MODEL_GAIN = _new(
+    "gain.model.pp.{side}.average",
+    "pp",
+    "higher",
+    hierarchical.estimate,
+    "gain with replanning ({side}), mean of tasks, in the model of all groups",
+)
+MODEL_GAIN_OF_TASK = _new(
+    "gain.model.pp.{side}.{task}.{policy}",
+    "pp",
+    "higher",
+    hierarchical.estimate,
+    "gain with replanning ({side}) of one task in the model of all groups: drawn towards the others",
+)
+MODEL_BEST = _new(
+    "decision.model.best",
+    "1",
+    "higher",
+    hierarchical.chosen_is_best,
+    "probability that what the twin calls best ({words}) has the highest recorded rate",
 )
 SPEARMAN = _agreement(
     "spearman_rho",

@@ -1,6 +1,6 @@
 """Rates CSV in: success rates as papers print them, with the counts they must come from.
 
-Columns: task, condition, side, unit, k, n, and rate (0..1) or rate_percent (0..100).
+Columns: task, condition, policy, side, unit, k, n, and rate (0..1) or rate_percent (0..100).
 """
 
 import math
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from bridge.exchange.trials_csv import UNITS, SourceRow, TableError, read_rows
 
-COLUMNS = ("task", "condition", "side", "unit", "k", "n", "rate", "rate_percent")
+COLUMNS = ("task", "condition", "policy", "side", "unit", "k", "n", "rate", "rate_percent")
 SIDES = ("sim", "real", "stand-in")
 MOST_DIGITS = 30
 """Before or behind the point of a printed figure; more would take forever to compare."""
@@ -41,6 +41,7 @@ class RateRecord:
     rate: Fraction
     """k/n where both are known, else as printed."""
     row: int
+    policy: str = ""
 
 
 def read_rates(path: Path) -> list[RateRecord]:
@@ -77,14 +78,20 @@ def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecor
             )
         if _key(other) == _key(record):
             raise row.refuse(
-                f"{record.side} of {record.task!r} {record.condition!r} stands in row "
+                f"{record.side} of {' '.join(repr(part) for part in _cell(record))} stands in row "
                 f"{other.row} already",
                 "Give each cell once",
             )
 
 
-def _key(record: RateRecord) -> tuple[str, str, str]:
-    return record.task, record.condition, "sim" if record.side == "sim" else "recorded"
+def _cell(record: RateRecord) -> tuple[str, ...]:
+    parts = (record.task, record.condition)
+    return (*parts, record.policy) if record.policy else parts
+
+
+def _key(record: RateRecord) -> tuple[str, str, str, str]:
+    side = "sim" if record.side == "sim" else "recorded"
+    return record.task, record.condition, record.policy, side
 
 
 def read_rate(row: SourceRow) -> RateRecord:
@@ -125,6 +132,7 @@ def read_rate(row: SourceRow) -> RateRecord:
         n=n,
         rate=rate,
         row=row.row,
+        policy=row.text("policy"),
     )
 
 

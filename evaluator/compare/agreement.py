@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from evaluator.compare.measure import measured
+from evaluator.compare.model import headline_interval
 from evaluator.compare.rows import RateGroup
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
@@ -86,6 +87,14 @@ class GroupIntervals:
     def kind(self) -> str:
         """Points where groups are independent, else clusters."""
         return "points" if self.unit == "groups" else "clusters"
+
+    def model(self, statistic: str) -> Interval | None:
+        """Return the interval of the model of all counts, which goes before all others.
+
+        Args:
+            statistic: r and bias have one, where trials are counted and groups are enough.
+        """
+        return headline_interval(statistic, self._groups)
 
     def of(self, statistic: str) -> Found:
         """Return the interval by the method whose stored coverage is best.
@@ -198,6 +207,9 @@ def interval_table(
         found = intervals.of(statistic)
         kept, refusal = _vouched(found)
         others = OTHERS.format(intervals.unit)
+        model = intervals.model(statistic)
+        if model is not None:
+            rows.append((words, OTHERS.format("groups"), *_shown(model, "", factor)))
         rows.append((words, others, *_shown(kept, refusal or found.reason, factor)))
         rows.append((words, AGAIN, *_band(again, statistic, factor, unknown, intervals)))
     return (
@@ -208,8 +220,9 @@ def interval_table(
             rows=tuple(rows),
             note="95 %. Two questions: where the number would be for other groups of the same "
             "kind, and where it would fall if these were measured again with as many trials. "
-            "The method is the one with the best coverage in the stored map; least coverage is "
-            "the least in it.",
+            "Hierarchical: the model of all counts, which takes out the noise of counting; it is "
+            "the interval of the number itself. Beside it the classic method with the best "
+            "coverage in the stored map; least coverage is the least in it.",
         ),
     )
 
@@ -314,9 +327,10 @@ def _measure(
     """Measure one statistic with the interval that the coverage map chooses for it."""
     factor = 100.0 if quantity.unit == "pp" else 1.0
     found = intervals.of(statistic)
+    model = intervals.model(statistic)
 
     def compute() -> tuple[float, Interval | None]:
-        interval = found.interval
+        interval = model or found.interval
         if interval is not None and factor != 1:
             interval = Interval(
                 low=factor * interval.low,
@@ -327,6 +341,10 @@ def _measure(
         return factor * value(), interval
 
     resampled = f"; interval: {intervals.unit} resampled" if intervals.kind == "clusters" else ""
+    if model is not None:
+        resampled = (
+            "; interval: of true rates over other groups like these, all counts in one model"
+        )
     return measured(
         quantity.of(what=what, resampled=resampled, **parts),
         compute,
@@ -335,7 +353,7 @@ def _measure(
         reason_without_interval=found.reason,
         episodes=_episodes(groups),
         interval_n=found.num_units,
-        coverage_key=found.choice.key,
+        coverage_key=found.choice.key if model is None else "",
         instead=found.choice.instead,
     )
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from bridge.task.protocol import VOID_CAUSES
-from evaluator.compare.agreement import agreement_intervals, group_agreement
+from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
@@ -16,6 +16,7 @@ from evaluator.compare.gains import (
 )
 from evaluator.compare.gate import agreement, gate_scorecard, reliability
 from evaluator.compare.measure import refuse_alike
+from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
@@ -109,6 +110,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
     chosen, decision_tables = decisions(groups)
+    modelled, model_tables = model_results(usable_groups(groups))
     study, study_tables, void = study_results(rows, void_causes, method=method)
     measurements = (
         *rates,
@@ -128,6 +130,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *kept,
         *stages,
         *chosen,
+        *modelled,
         *assisted_rates(rows),
         *sequences(rows, pairs),
     )
@@ -140,7 +143,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         study_tables=study_tables,
         gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
-        decision_tables=decision_tables,
+        decision_tables=(*model_tables, *decision_tables),
     )
 
 

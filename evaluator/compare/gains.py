@@ -31,6 +31,7 @@ from evaluator.statistics.differences import (
     boschloo,
     guaranteed_difference,
     mcnemar,
+    mean_of_intervals,
     newcombe_difference,
     tango_points,
 )
@@ -267,7 +268,7 @@ def replanning_gains(groups: Sequence[RateGroup], *, method: str = "wilson") -> 
     """
     pairs = changes(groups)
     measurements = [m for change in pairs for m in _gain(change, method)]
-    measurements.extend(_average_gains(pairs))
+    measurements.extend(_average_gains(pairs, method))
     return measurements
 
 
@@ -288,18 +289,7 @@ def _gain(change: Change, method: str) -> list[Measurement]:
     before, after = change.before, change.after
 
     def points() -> tuple[float, Interval | None]:
-        gain = 100 * (_value(after) - _value(before))
-        if change.counts is None:
-            return gain, None
-        guaranteed = method == "clopper-pearson"
-        fraction = (guaranteed_difference if guaranteed else newcombe_difference)(*change.counts)
-        interval = Interval(
-            low=100 * fraction.low,
-            high=100 * fraction.high,
-            level=fraction.level,
-            method=f"{fraction.method}, unpaired",
-        )
-        return gain, interval
+        return 100 * (_value(after) - _value(before)), _points_interval(change, method)
 
     arms = None if change.counts is None else (change.counts[1], change.counts[3])
     make = partial(
@@ -323,7 +313,29 @@ def _gain(change: Change, method: str) -> list[Measurement]:
     ]
 
 
-def _average_gains(pairs: Sequence[Change]) -> list[Measurement]:
+def _points_interval(change: Change, method: str) -> Interval | None:
+    """Interval of one gain [pp] as if no start was shared; None where trials are not counted."""
+    if change.counts is None:
+        return None
+    guaranteed = method == "clopper-pearson"
+    fraction = (guaranteed_difference if guaranteed else newcombe_difference)(*change.counts)
+    return Interval(
+        low=100 * fraction.low,
+        high=100 * fraction.high,
+        level=fraction.level,
+        method=f"{fraction.method}, unpaired",
+    )
+
+
+def _average_points(mine: Sequence[Change], method: str) -> tuple[float, Interval | None]:
+    gains = [100 * (_value(change.after) - _value(change.before)) for change in mine]
+    each = [_points_interval(change, method) for change in mine]
+    known = [interval for interval in each if interval is not None]
+    mean = sum(gains) / len(gains)
+    return mean, mean_of_intervals(gains, known) if len(known) == len(gains) else None
+
+
+def _average_gains(pairs: Sequence[Change], method: str) -> list[Measurement]:
     measurements = []
     for side in SIDES:
         mine = [change for change in pairs if change.side == side]
@@ -334,10 +346,10 @@ def _average_gains(pairs: Sequence[Change]) -> list[Measurement]:
         measurements += [
             measured(
                 GAIN_POINTS_AVERAGE.of(side=side, count=len(mine)),
-                lambda first=first, second=second: 100 * (second() - first()),  # type: ignore[misc]
+                partial(_average_points, mine, method),
                 n=len(mine),
                 counted="task",
-                reason_without_interval="tasks may be counted in different units",
+                reason_without_interval="the number of trials of a task is not known",
             ),
             measured(
                 GAIN_RELATIVE_AVERAGE.of(side=side, count=len(mine)),

@@ -2,13 +2,16 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
 from itertools import chain, groupby
 from typing import Any
 
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
+from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
+from evaluator.statistics.agreement import within_and_between
 
 SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
@@ -28,6 +31,7 @@ def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> l
     """
     by_id = {measurement.id: measurement for measurement in measurements}
     return [
+        *_opposed(groups, by_id),
         *_units(groups),
         *_few_groups(by_id),
         *_hidden_bias(by_id),
@@ -99,6 +103,47 @@ def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
     direction = "optimistic" if bias.value > 0 else "pessimistic"
     text = f"r = {r.value:.3f} does not show that the twin is {direction} by {bias.value:+.1f} pp"
     return [("agreement.pearson_r", text)]
+
+
+def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
+    """Say that r within tasks tells another story than r over all groups (Simpson 1951)."""
+    usable = [g for g in groups if g.recorded_rate is not None and g.sim_rate is not None]
+    tasks: dict[str, list[tuple[Fraction, Fraction]]] = {}
+    for group in usable:
+        if group.recorded_rate is not None and group.sim_rate is not None:
+            tasks.setdefault(group.task, []).append((group.recorded_rate, group.sim_rate))
+    if not 1 < len(tasks) < len(usable):
+        return []
+    try:
+        within, between = within_and_between(list(tasks.values()))
+    except UndefinedStatisticError:
+        return []
+    inside, across = (by_id.get(f"agreement.model.r_{name}") for name in ("within", "between"))
+    apart = _apart(inside, across)
+    if within * between >= 0 and not apart:
+        return []
+    r = by_id.get("agreement.pearson_r")
+    whole = (
+        "" if r is None or r.value is None else f"r = {r.value:.2f} over all groups hides this: "
+    )
+    text = (
+        f"{whole}inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
+    )
+    opposed = by_id.get("agreement.model.opposed")
+    if apart:
+        text += "; without the noise of counting their intervals do not meet"
+    elif opposed is not None and opposed.value is not None:
+        text += f"; that the signs really differ has a probability of {opposed.value:.2f}"
+    if within < 0:
+        text += ". Inside a task, what the twin ranks higher did worse: do not choose by it"
+    return [("agreement.pearson_r", text)]
+
+
+def _apart(first: Measurement | None, second: Measurement | None) -> bool:
+    """Whether two numbers have intervals that do not meet."""
+    if first is None or second is None or first.interval is None or second.interval is None:
+        return False
+    return first.interval.high < second.interval.low or second.interval.high < first.interval.low
 
 
 def _two_gains(by_id: dict[str, Measurement]) -> list[Note]:

@@ -184,6 +184,7 @@ def _as_printed(row: SourceRow, rate: Fraction) -> RateRecord:
         n=None,
         rate=rate,
         row=row.row,
+        policy=row.text("policy"),
     )
 
 

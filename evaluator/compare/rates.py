@@ -6,10 +6,11 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
-from evaluator.compare.agreement import agreement_intervals, group_agreement
+from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, vouched_rate
+from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, averages
@@ -42,9 +43,9 @@ def compare_records(
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
 
     Raises:
-        AlikeNamesError: When ids cannot tell two tasks or conditions apart.
+        AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
     """
-    for kind in ("task", "condition"):
+    for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(r, kind), f"row {r.row}") for r in records))
     sides = {record.side for record in records}
     # Rates of the twin alone say nothing of where the others would come from.
@@ -53,6 +54,7 @@ def compare_records(
     word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
     gains = replanning_gains(groups, method=method)
     chosen, decision_tables = decisions(groups)
+    modelled, model_tables = model_results(usable_groups(groups))
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *averages(groups, method=method),
@@ -60,6 +62,7 @@ def compare_records(
         *gains,
         *gain_tests(groups),
         *chosen,
+        *modelled,
     )
     return Comparison(
         run=path.stem,
@@ -72,6 +75,7 @@ def compare_records(
             *layout_table(groups, measurements, word),
             *gains_table(gains, word),
             *agreement_intervals(groups),
+            *model_tables,
             *decision_tables,
             *notes_table(notes(groups, measurements)),
         ),
@@ -84,28 +88,31 @@ def compare_records(
 def _rate_groups(
     records: Sequence[RateRecord], method: str
 ) -> tuple[tuple[RateGroup, ...], list[Exclusion]]:
-    keys = list(dict.fromkeys((r.task, r.condition, r.unit) for r in records))
+    keys = list(dict.fromkeys((r.task, r.condition, r.policy, r.unit) for r in records))
+    policies = list(dict.fromkeys(record.policy for record in records))
     tasks = list(dict.fromkeys(record.task for record in records))
-    keys.sort(key=lambda key: (tasks.index(key[0]), key[1] == WITH))
+    keys.sort(key=lambda key: (tasks.index(key[0]), policies.index(key[2]), key[1] == WITH))
     groups, left_out = [], []
-    for task, condition, unit in keys:
+    for key in keys:
+        task, condition, policy, unit = key
         sides: dict[str, RateRecord] = {
             "sim" if r.side == "sim" else "recorded": r
             for r in records
-            if (r.task, r.condition) == (task, condition)
+            if (r.task, r.condition, r.policy) == (task, condition, policy)
         }
         for side in ("sim", "recorded"):
             if side not in sides:
-                reason = f"{task} {condition}: no {side} rate"
+                name = " ".join(part for part in (task, condition, policy) if part)
+                reason = f"{name}: no {side} rate"
                 left_out.append(Exclusion(episode=task, scope="agreement of groups", reason=reason))
         groups.append(
             RateGroup(
                 task=task,
                 condition=condition,
-                policy="",
+                policy=policy,
                 unit=unit,
-                recorded=_rate(sides.get("recorded"), "recorded", task, condition, unit, method),
-                sim=_rate(sides.get("sim"), "sim_planned", task, condition, unit, method),
+                recorded=_rate(sides.get("recorded"), "recorded", key, method),
+                sim=_rate(sides.get("sim"), "sim_planned", key, method),
                 recorded_rate=_fraction(sides.get("recorded")),
                 sim_rate=_fraction(sides.get("sim")),
             )
@@ -118,13 +125,15 @@ def _fraction(record: RateRecord | None) -> Fraction | None:
 
 
 def _rate(
-    record: RateRecord | None, side: str, task: str, condition: str, unit: str, method: str
+    record: RateRecord | None, side: str, key: tuple[str, str, str, str], method: str
 ) -> Measurement:
+    task, condition, policy, unit = key
     interval, why = None, "no n"
     if record is not None and record.k is not None and record.n is not None:
         interval, why = vouched_rate(record.k, record.n, method)
     where = "" if record is None else f" in row {record.row} ({record.side})"
-    defined = RATE_AS_GIVEN.of(side=side, task=task, condition=condition, unit=unit, where=where)
+    parts = {"task": task, "condition": condition, "policy": policy, "unit": unit}
+    defined = RATE_AS_GIVEN.of(side=side, where=where, **parts)
     return Measurement(
         **vars(defined),
         value=None if record is None else float(record.rate),

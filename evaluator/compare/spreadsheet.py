@@ -20,7 +20,7 @@ from evaluator.compare.notes import with_notes
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_rates
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
-from evaluator.compare.success import trials_in
+from evaluator.compare.success import trials_in, unpaired_keys
 from evaluator.result import Exclusion
 
 
@@ -182,6 +182,8 @@ def _from_benchmark(
 
 
 def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
+    """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
+    apart = unpaired_keys(rows)
     return [
         Exclusion(episode=row.episode, scope="agreement", reason=reason)
         for row in rows
@@ -190,6 +192,7 @@ def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
             ("sim_planned is unknown", row.sim_planned is None),
         )
         if lacks
+        and ((row.task, row.condition, row.policy) not in apart or row.recorded == row.sim_planned)
     ]
 
 

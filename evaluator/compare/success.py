@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
+from functools import partial
 
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
@@ -43,6 +44,16 @@ def group_rows(rows: Sequence[TrialRow]) -> dict[Key, list[TrialRow]]:
     return dict(
         sorted(groups.items(), key=lambda item: (item[0][0], item[0][2], item[0][1] == WITH))
     )
+
+
+def unpaired_keys(rows: Iterable[TrialRow]) -> set[Key]:
+    """Return the groups whose sides have trials of their own, none with both."""
+    seen: dict[Key, set[tuple[bool, bool]]] = {}
+    for row in rows:
+        known = (row.recorded is not None, row.sim_planned is not None)
+        seen.setdefault((row.task, row.condition, row.policy), set()).add(known)
+    apart = {(True, False), (False, True)}
+    return {key for key, known in seen.items() if apart <= known and (True, True) not in known}
 
 
 def trials_in(rows: Iterable[TrialRow]) -> int:
@@ -152,6 +163,8 @@ def rate_groups(
 ) -> tuple[RateGroup, ...]:
     """Lay the recorded and the headline sim rate of each group side by side.
 
+    Over the trials where both sides are known; where there is none, each side over its own trials.
+
     Args:
         rows: Trials of all groups.
         rates: What ``side_rates`` measured of the same trials.
@@ -161,6 +174,9 @@ def rate_groups(
     groups = []
     for key, members in group_rows(rows).items():
         both = [r for r in members if r.recorded is not None and r.sim_planned is not None]
+        recorded, sim = (
+            by_id[of_group(RATES[side], key).id] for side in ("recorded", "sim_planned")
+        )
         recorded_common, sim_common = (
             answered(
                 of_group(common, key),
@@ -171,14 +187,24 @@ def rate_groups(
             )
             for side, common in RATES_IN_COMMON.items()
         )
+        group = partial(
+            RateGroup,
+            task=key[0],
+            condition=key[1],
+            policy=key[2],
+            unit="trial",
+            recorded=recorded,
+            sim=sim,
+        )
+        if not both and recorded.n and sim.n:  # each side has trials of its own
+            rates_apart = fraction_of(recorded), fraction_of(sim)
+            names = (*recorded.episodes, *sim.episodes)
+            groups.append(
+                group(recorded_rate=rates_apart[0], sim_rate=rates_apart[1], episodes=names)
+            )
+            continue
         groups.append(
-            RateGroup(
-                task=key[0],
-                condition=key[1],
-                policy=key[2],
-                unit="trial",
-                recorded=by_id[of_group(RATES["recorded"], key).id],
-                sim=by_id[of_group(RATES["sim_planned"], key).id],
+            group(
                 recorded_rate=fraction_of(recorded_common),
                 sim_rate=fraction_of(sim_common),
                 episodes=tuple(names_of(both)),

@@ -309,6 +309,26 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     return -size if shared < 0 else size
 
 
+def within_and_between(tasks: Sequence[Sequence[tuple[Number, Number]]]) -> tuple[float, float]:
+    """Return r of the distances to the means of tasks, and r of those means.
+
+    Args:
+        tasks: For each task the recorded rate and the twin's of its groups.
+
+    Raises:
+        UndefinedStatisticError: When one of both is undefined.
+    """
+    inside: list[tuple[Fraction, Fraction]] = []
+    means: list[tuple[Fraction, Fraction]] = []
+    for groups in tasks:
+        x, y = ([Fraction(value) for value in side] for side in zip(*groups, strict=True))
+        mean_x, mean_y = sum(x, Fraction(0)) / len(x), sum(y, Fraction(0)) / len(y)
+        means.append((mean_x, mean_y))
+        inside += [(a - mean_x, b - mean_y) for a, b in zip(x, y, strict=True)]
+    within = pearson([a for a, _ in inside], [b for _, b in inside])
+    return within, pearson([a for a, _ in means], [b for _, b in means])
+
+
 def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return Spearman's rank correlation; ties share their average rank.
 

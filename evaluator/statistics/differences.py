@@ -1,7 +1,7 @@
 """Has a rate changed? Same starts: McNemar, sign test, Tango; other starts: Newcombe, Boschloo."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -334,3 +334,27 @@ def _largest(weights: Float[np.ndarray, " totals"]) -> float:
         low, high = (low, b) if left > right else (a, high)
     polished = float(_at(np.array([(low + high) / 2]), weights)[0])
     return min(1.0, max(ends, float(values[best]), polished))
+
+
+def mean_of_intervals(values: Sequence[float], intervals: Sequence[Interval]) -> Interval:
+    """Return the interval of a mean of independent estimates from the interval of each.
+
+    Distances to the ends are added as variances are: the mean of one is its own interval, of
+    differences with Wilson's ends Newcombe's method carried on (Zou and Donner 2008, equation 2).
+
+    Args:
+        values: The estimates.
+        intervals: Of each; together they give the method its name, which must be one.
+
+    Raises:
+        UndefinedStatisticError: Without estimates.
+    """
+    if not values:
+        raise UndefinedStatisticError(statistic="interval of a mean", reason="there are none")
+    mean = sum(values) / len(values)
+    pairs = list(zip(values, intervals, strict=True))
+    below = math.sqrt(sum((value - each.low) ** 2 for value, each in pairs)) / len(values)
+    above = math.sqrt(sum((each.high - value) ** 2 for value, each in pairs)) / len(values)
+    method = " and ".join(dict.fromkeys(each.method for each in intervals))
+    first = intervals[0]
+    return Interval(low=mean - below, high=mean + above, level=first.level, method=f"mean-{method}")

@@ -169,11 +169,19 @@ def test_the_paper_table_gives_its_known_numbers() -> None:
     r = results.get("agreement.pearson_r")
     # By hand from 80/80, 100/90, 60/40, 100/80, 60/46, 80/70.
     assert r.value == pytest.approx(0.92914, abs=1e-5)
-    assert r.interval is None
-    assert "share tasks" in str(r.reason_without_interval)
+    assert r.interval is not None
+    assert r.interval.method == "hierarchical"
+    assert r.interval.high - r.interval.low < 1.6  # three tasks say little, and not nothing
+    lines = [
+        row for table in results.tables if table.id == "agreement_intervals" for row in table.rows
+    ]
+    assert any("share tasks" in str(row[-1]) for row in lines), "the classic one stays beside it"
     assert results.get("agreement.bias_pp").value == pytest.approx(12.3333, abs=1e-4)
     points = results.get("gain.pp.recorded.average")
     assert points.value == pytest.approx(24.6667, abs=1e-4)
+    assert points.interval is not None
+    assert points.interval.low == pytest.approx(5.547, abs=1e-3)
+    assert points.interval.high == pytest.approx(39.791, abs=1e-3)
     relative = results.get("gain.relative.recorded.average")
     assert relative.value == pytest.approx(0.44578, abs=1e-5)
     ducks = results.get("rate.recorded.ducks_into_basket.without_replanning.-")
