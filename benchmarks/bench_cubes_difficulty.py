@@ -1,10 +1,10 @@
-"""How hard the tasks of the cell standin_cubes are for the scripted planner alone, on development seeds.
+"""How hard the tasks of the cell standin_cubes are for the scripted planner, on development seeds.
 
 The cell's own physics carries out one plan per start as the cell draws it, errors and all, without
 cameras, zenoh and twin. A control runs the same starts in a laboratory that is as published, with a
 planner that makes no error: what fails there is the plan's own fault.
 
-    python benchmarks/bench_cubes_difficulty.py --labs 20 --starts 2 --out benchmarks/results/cubes_difficulty.json
+    python benchmarks/bench_cubes_difficulty.py --labs 20 --starts 2 --out FILE
 """
 
 import argparse
