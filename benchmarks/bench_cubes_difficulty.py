@@ -27,7 +27,7 @@ from bridge.task.task_file import load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
 
 CELL = "standin_cubes"
-TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place")
+TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place", "cube_on_block")
 
 
 def trial(cell: StandinCell, start_seed: int, *, errs: bool) -> dict[str, Any]:

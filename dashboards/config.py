@@ -87,9 +87,9 @@ class DemoConfig:
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: tuple[str, ...] = ()
     """Tasks of the trials, names or files: without and with replanning by the cell's own planner.
-    The first one is scanned. Default: cube_into_box and cube_beside_cube; --quick: the first."""
+    The first one is scanned. Default: cube_into_box and cube_on_block; --quick: the first."""
     policies: tuple[str, ...] = ()
-    """Policies that try the first task too, without replanning, as in robot-gst plan --live.
+    """Policies that try every task too, without replanning, as in robot-gst plan --live.
     Default: geometric; --quick: none."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
@@ -103,7 +103,7 @@ class DemoConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """Tasks of the trials."""
-        both = ("cube_into_box", "cube_beside_cube")
+        both = ("cube_into_box", "cube_on_block")
         return self.task or (both[:1] if self.quick else both)
 
     @property

@@ -31,6 +31,8 @@ from bridge.terminal import Output, how_to_activate
 from dashboards.config import BUILT_IN_POLICY, DemoConfig
 from dashboards.errors import DashboardError
 
+ENOUGH_TRIALS = 20
+"""In a group, before the correlation over groups is believed; robot-gst trials makes so many."""
 START_TIMEOUT_S = 300.0
 STOP_TIMEOUT_S = 60.0
 
@@ -113,19 +115,17 @@ class Trial:
 
 
 def groups_of(config: DemoConfig) -> list[Group]:
-    """What a demo tries: every task by the cell's own planner, the first by others too.
+    """What a demo tries: every task by every policy, with replanning by the cell's own planner.
 
     Args:
         config: Its tasks and policies.
     """
-    built_in = [
-        Group(chosen=each, policy=BUILT_IN_POLICY, conditions=CONDITIONS) for each in config.tasks
+    policies = {BUILT_IN_POLICY: CONDITIONS} | dict.fromkeys(config.other_policies, (WITHOUT,))
+    return [
+        Group(chosen=task, policy=policy, conditions=conditions)
+        for policy, conditions in policies.items()
+        for task in config.tasks
     ]
-    others = [
-        Group(chosen=config.tasks[0], policy=each, conditions=(WITHOUT,))
-        for each in config.other_policies
-    ]
-    return built_in + others
 
 
 @dataclass
@@ -467,6 +467,11 @@ def _close(
             f"{config.iterations} images, so its renders are worse than they could be."
         )
     lines += [f"{episode.stem} has no outcome: {why}." for episode, why in void.items()]
+    if config.trials < ENOUGH_TRIALS:
+        lines += [
+            f"A group has {config.trials} trials, so the correlation says nothing yet:",
+            f"  {ENOUGH_TRIALS} in each are needed (robot-gst trials RUN).",
+        ]
     lines += [
         "Look at next:",
         f"  {summary['report']}",

@@ -37,7 +37,7 @@ FROZEN = {
     ("tasks", "sloth_over_rim"): "b74724cd53fce2c1",
     ("tasks", "stack_two_cubes"): "86f3f31876d484e5",
 }
-TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place")
+TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place", "cube_on_block")
 SEED = 9_000_000
 
 
