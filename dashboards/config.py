@@ -7,6 +7,8 @@ from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
 
+BUILT_IN_POLICY = "perturbed"
+"""Of the cell's own planner; the others are asked on the wire."""
 PORTS = {"port": (0, 65_535)}
 
 
@@ -83,8 +85,12 @@ class DemoConfig:
     """Ten trials per condition, the number the paper used, and a longer fit."""
     seed: int = 1
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
-    task: str = "cube_into_box"
-    """Task of the trials: cube_into_box, sloth_into_basket, five_ducks_into_basket or a file."""
+    task: tuple[str, ...] = ()
+    """Tasks of the trials, names or files: without and with replanning by the cell's own planner.
+    The first one is scanned. Default: cube_into_box and cube_on_block; --quick: the first."""
+    policies: tuple[str, ...] = ()
+    """Policies that try every task too, without replanning, as in robot-gst plan --live.
+    Default: geometric; --quick: none."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
@@ -93,6 +99,18 @@ class DemoConfig:
     def __post_init__(self) -> None:
         """Refuse now what would end the demo after minutes."""
         refuse_outside(self, PORTS)
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Tasks of the trials."""
+        both = ("cube_into_box", "cube_on_block")
+        return self.task or (both[:1] if self.quick else both)
+
+    @property
+    def other_policies(self) -> tuple[str, ...]:
+        """Policies that are not the cell's own planner's."""
+        asked = self.policies or (() if self.quick else ("geometric",))
+        return tuple(each for each in asked if each != BUILT_IN_POLICY)
 
     @property
     def trials(self) -> int:
@@ -114,4 +132,5 @@ class DemoConfig:
         """Varied replays behind each verdict; toys take seconds for each, and have none."""
         from bridge.task.find import chosen_task_file  # noqa: PLC0415  # not for --help
 
-        return 0 if self.quick or chosen_task_file(self.task).task().soft_objects else 8
+        soft = any(chosen_task_file(each).task().soft_objects for each in self.tasks)
+        return 0 if self.quick or soft else 8

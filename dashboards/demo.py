@@ -21,16 +21,18 @@ from typing import Any
 
 from bridge.episode.catalogue import outcome_of, sidecar_path
 from bridge.episode.mcap.part_file import lock_dead
-from bridge.episode.metadata import Outcome
+from bridge.episode.metadata import WITHOUT, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
 from bridge.task.find import chosen_task_file
 from bridge.terminal import Output, how_to_activate
-from dashboards.config import DemoConfig
+from dashboards.config import BUILT_IN_POLICY, DemoConfig
 from dashboards.errors import DashboardError
 
+ENOUGH_TRIALS = 20
+"""In a group, before the correlation over groups is believed; robot-gst trials makes so many."""
 START_TIMEOUT_S = 300.0
 STOP_TIMEOUT_S = 60.0
 
@@ -83,13 +85,56 @@ def stop_command(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
+@dataclass(frozen=True, kw_only=True, order=True)
+class Group:
+    """Trials of one task by one policy, under one or both conditions."""
+
+    chosen: str
+    """The task as it was asked for: its name or its file."""
+    policy: str
+    conditions: tuple[str, ...]
+
+    def trials(self, config: DemoConfig) -> list["Trial"]:
+        """Each start, once per condition."""
+        task, first = chosen_task_file(self.chosen).task().name, config.seed * SEEDS_PER_SESSION
+        return [
+            Trial(task=task, policy=self.policy, start_seed=first + k, condition=condition)
+            for k in range(config.trials)
+            for condition in self.conditions
+        ]
+
+
+@dataclass(frozen=True, kw_only=True, order=True)
+class Trial:
+    """What tells one trial of a demo from another."""
+
+    task: str
+    policy: str
+    start_seed: int
+    condition: str
+
+
+def groups_of(config: DemoConfig) -> list[Group]:
+    """What a demo tries: every task by every policy, with replanning by the cell's own planner.
+
+    Args:
+        config: Its tasks and policies.
+    """
+    policies = {BUILT_IN_POLICY: CONDITIONS} | dict.fromkeys(config.other_policies, (WITHOUT,))
+    return [
+        Group(chosen=task, policy=policy, conditions=conditions)
+        for policy, conditions in policies.items()
+        for task in config.tasks
+    ]
+
+
 @dataclass
 class Recorded:
     """What a run folder holds of a demo."""
 
     has_scan: bool = False
-    missing: list[tuple[int, str]] = field(default_factory=list)
-    """Start seed and condition of each trial that is not there."""
+    missing: list[Trial] = field(default_factory=list)
+    """Trials that are not there."""
     unusable: dict[Path, str] = field(default_factory=dict)
     """Files that were cut short, and why."""
     void: dict[Path, str] = field(default_factory=dict)
@@ -103,14 +148,13 @@ def look(run: RunFolder, config: DemoConfig) -> Recorded:
 
     Args:
         run: The run folder of the demo, perhaps filled in part by an earlier start.
-        config: Which task, seed and number of trials the demo is to have.
+        config: Which tasks, policies, seed and number of trials the demo is to have.
 
     Raises:
         UsageError: When the folder holds episodes of anything else, or is being recorded into.
     """
     found = Recorded()
-    first = config.seed * SEEDS_PER_SESSION
-    trials = {(first + k, each) for k in range(config.trials) for each in CONDITIONS}
+    trials = {trial for group in groups_of(config) for trial in group.trials(config)}
     for path in sorted(run.episodes_dir.glob("*.part")):
         descriptor = lock_dead(path)
         if descriptor is None:
@@ -133,7 +177,14 @@ def look(run: RunFolder, config: DemoConfig) -> Recorded:
         elif info.kind == "scan":
             found.has_scan = True
         elif info.kind == "trial" and info.start_seed is not None:
-            trials.discard((info.start_seed, info.condition))
+            trials.discard(
+                Trial(
+                    task=info.task,
+                    policy=info.policy,
+                    start_seed=info.start_seed,
+                    condition=info.condition,
+                )
+            )
             if outcome is None or outcome.result == "unknown":
                 found.void[path] = (outcome and outcome.detail) or "nobody labelled it"
             else:
@@ -146,7 +197,7 @@ def _refuse_other(run: RunFolder, config: DemoConfig, episode: Episode) -> None:
     info = episode.info
     if not info.stand_in:
         found = f"{episode.path.name}, which is not from the stand-in cell"
-    elif info.task != chosen_task_file(config.task).task().name:
+    elif info.task not in [chosen_task_file(each).task().name for each in config.tasks]:
         found = f"episodes of --task {info.task}"
     elif info.start_seed is not None and info.start_seed // SEEDS_PER_SESSION != config.seed:
         found = f"episodes of --seed {info.start_seed // SEEDS_PER_SESSION}"
@@ -191,7 +242,8 @@ def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
         DashboardError: When a step failed, or nothing could be measured.
     """
     started = time.monotonic()
-    chosen_task_file(config.task).task()  # refuse an unknown one before anything is made
+    for each in config.tasks:
+        chosen_task_file(each).task()  # refuse an unknown one before anything is made
     run = RunFolder.create(path)
     with ending_on_signals():
         void = _record(run, config, output).void
@@ -236,27 +288,28 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     logs = run.notes_dir / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     standin = ["publish", "standin", "--connect", endpoint, "--seed", str(config.seed)]
-    standin += ["--task", config.task, "--trials"]
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
     with running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
         if found.has_scan:
             output.say("2/6 the scan is recorded; it is kept and used")
         else:
-            step(output, "2/6 the stand-in cell scans its table", [*standin, "0"], recorder)
+            scan = [*standin, "--task", config.tasks[0], "--trials", "0"]
+            step(output, "2/6 the stand-in cell scans its table", scan, recorder)
         if found.has_scan and _scene(run):
             output.say("3/6 the scene is rebuilt; it is kept and used")
         else:
             step(output, label, rebuild, recorder)
         if found.missing:
-            _record_trials(run, config, endpoint, standin, len(found.missing), recorder, output)
+            _record_trials(run, config, endpoint, standin, found.missing, recorder, output)
     found = look(run, config)
     cause = next(iter((found.void | found.unusable).values()), "the session was stopped")
     if not found.has_scan:
         raise DashboardError(f"there is no scan: {cause}. Start the demo again.")
     if found.missing or not found.num_known:
         count = len(found.missing) + len(found.void)
-        message = f"{count} of {2 * config.trials} trials have no outcome: {cause}. "
+        asked = sum(len(group.trials(config)) for group in groups_of(config))
+        message = f"{count} of {asked} trials have no outcome: {cause}. "
         raise DashboardError(f"{message}Start the demo again; it adds what is missing.")
     return found
 
@@ -266,17 +319,36 @@ def _record_trials(
     config: DemoConfig,
     endpoint: str,
     standin: list[str],
-    count: int,
+    missing: list[Trial],
     recorder: Background,
     output: Output,
 ) -> None:
-    log = run.notes_dir / "logs" / "gate.log"
-    judge = ["gate", str(run.path), "--connect", endpoint, "--task", config.task]
-    label = f"4/6 {count} trials, {config.trials} starts without and with replanning"
-    with running(judge, log) as gate:
-        gate.wait_until(lambda: "ready" in log.read_text(errors="replace"))
-        trials = [*standin, str(config.trials), "--no-scan", "--ask-always", "--missing"]
-        step(output, label, trials, recorder, gate)
+    connect, logs = ["--connect", endpoint], run.notes_dir / "logs"
+    gate_log, planner_log = logs / "gate.log", logs / "plan.log"
+    left = [(each, len(set(missing) & set(each.trials(config)))) for each in groups_of(config)]
+    with ExitStack() as stack:
+        gate = stack.enter_context(running(["gate", str(run.path), *connect], gate_log))
+        gate.wait_until(lambda: "ready" in gate_log.read_text(errors="replace"))
+        there = [recorder, gate]
+        if any(count and group.policy != BUILT_IN_POLICY for group, count in left):
+            live = ["plan", str(run.path), "--live", *connect]
+            planner = stack.enter_context(running(live, planner_log))
+            planner.wait_until(lambda: "ready" in planner_log.read_text(errors="replace"))
+            there.append(planner)
+        for group, count in left:
+            if not count:
+                continue
+            words = [*standin, "--task", group.chosen, "--trials", str(config.trials)]
+            words += ["--no-scan", "--ask-always", "--missing", "--policy", group.policy]
+            words += [word for each in group.conditions for word in ("--conditions", each)]
+            if group.policy != BUILT_IN_POLICY:
+                words += ["--planner", "wire"]
+            how = "and with " if len(group.conditions) > 1 else ""
+            label = (
+                f"4/6 {count} trials of {Path(group.chosen).stem} by the policy {group.policy}, "
+                f"{config.trials} starts without {how}replanning"
+            )
+            step(output, label, words, *there)
 
 
 def _scene(run: RunFolder) -> Mapping[str, Any]:
@@ -395,6 +467,11 @@ def _close(
             f"{config.iterations} images, so its renders are worse than they could be."
         )
     lines += [f"{episode.stem} has no outcome: {why}." for episode, why in void.items()]
+    if config.trials < ENOUGH_TRIALS:
+        lines += [
+            f"A group has {config.trials} trials, so the correlation says nothing yet:",
+            f"  {ENOUGH_TRIALS} in each are needed (robot-gst trials RUN).",
+        ]
     lines += [
         "Look at next:",
         f"  {summary['report']}",

@@ -31,7 +31,7 @@ from bridge.task.find import chosen_task_file
 from bridge.task.plan import STUDY_ARMS
 from bridge.task.protocol import PolicyArms, Protocol, StudyTask, keep_protocol, with_coins
 from bridge.terminal import Output
-from dashboards.config import TrialsConfig
+from dashboards.config import BUILT_IN_POLICY, TrialsConfig
 from dashboards.demo import (
     Background,
     StepFailedError,
@@ -47,7 +47,6 @@ from dashboards.demo import (
 )
 
 EVERY_TASK = "all"
-BUILT_IN_POLICY = "perturbed"
 ORDER_STREAM = 808
 POLL_S = 0.2
 

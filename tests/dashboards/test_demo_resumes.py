@@ -14,7 +14,7 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from dashboards import demo
 from dashboards.config import DemoConfig
-from dashboards.demo import look
+from dashboards.demo import Trial, groups_of, look
 from dashboards.errors import DashboardError
 
 TASK = "cube_into_box"
@@ -26,6 +26,10 @@ STARTS = [
     (1001, "without_replanning"),
     (1001, "with_replanning"),
 ]
+
+
+def trial(seed: int, condition: str, task: str = TASK, policy: str = "perturbed") -> Trial:
+    return Trial(task=task, policy=policy, start_seed=seed, condition=condition)
 
 
 @pytest.fixture
@@ -41,6 +45,7 @@ def record(
     outcome: Outcome | None = None,
     stopped_by: str = "command",
     stand_in: bool = True,
+    policy: str = "perturbed",
 ) -> Path:
     """Leave an episode behind as the recorder does."""
     path = run.episodes_dir / f"{name}.mcap"
@@ -51,6 +56,7 @@ def record(
             task=TASK,
             start_seed=start[0],
             condition=start[1],
+            policy=policy,
             stand_in=stand_in,
         )
         writer.describe(info)
@@ -85,9 +91,41 @@ def test_a_whole_recording_is_kept_and_what_is_missing_is_named(run: RunFolder) 
     assert look(run, QUICK) == demo.Recorded(has_scan=True, num_known=4)
     (run.episodes_dir / "trial_0003.mcap").unlink()
     found = look(run, QUICK)
-    assert found.missing == [STARTS[2]]
-    more = look(run, DemoConfig())
-    assert more.missing == [STARTS[2], (1002, "with_replanning"), (1002, "without_replanning")]
+    assert found.missing == [trial(*STARTS[2])]
+    more = look(run, DemoConfig(task=(TASK,), policies=("perturbed",)))
+    third = [(1002, "with_replanning"), (1002, "without_replanning")]
+    assert more.missing == [trial(*each) for each in (STARTS[2], *third)]
+
+
+def test_another_policy_on_the_same_start_is_another_trial(run: RunFolder) -> None:
+    record_all(run)
+    wider = DemoConfig(quick=True, policies=("geometric",))
+    missing = look(run, wider).missing
+    assert missing == [
+        trial(seed, "without_replanning", policy="geometric") for seed in (1000, 1001)
+    ]
+    for number, each in enumerate(missing, start=5):
+        record(
+            run,
+            f"trial_{number:04d}",
+            start=(each.start_seed, each.condition),
+            outcome=Outcome(result="failure"),
+            policy="geometric",
+        )
+    assert look(run, wider) == demo.Recorded(has_scan=True, num_known=6)
+
+
+def test_the_demo_tries_two_tasks_and_two_policies_and_a_quick_one_of_each() -> None:
+    usual = [each for group in groups_of(DemoConfig()) for each in group.trials(DemoConfig())]
+    assert len({(each.task, each.policy, each.condition) for each in usual}) == 6
+    assert len({each.task for each in usual}) == len({each.policy for each in usual}) == 2
+    assert len(usual) == len(set(usual)) == 18
+    quick = [each for group in groups_of(QUICK) for each in group.trials(QUICK)]
+    assert {(each.task, each.policy) for each in quick} == {(TASK, "perturbed")}
+    own = DemoConfig(quick=True, task=("stack_two_cubes",), policies=("perturbed",))
+    assert [(each.chosen, each.policy) for each in groups_of(own)] == [
+        ("stack_two_cubes", "perturbed")
+    ]
 
 
 @pytest.mark.parametrize(
@@ -124,7 +162,7 @@ def test_a_folder_that_is_being_recorded_into_is_refused(run: RunFolder) -> None
     ("config", "named"),
     [
         (DemoConfig(seed=2), "--seed 1"),
-        (DemoConfig(task="sloth_into_basket"), f"--task {TASK}"),
+        (DemoConfig(task=("sloth_into_basket",)), f"--task {TASK}"),
     ],
 )
 def test_another_demo_does_not_record_into_the_same_folder(

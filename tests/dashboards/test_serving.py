@@ -50,7 +50,7 @@ def test_a_port_that_cannot_be_is_refused_before_anything_is_done(
 
 def test_a_demo_of_an_unknown_task_is_refused_before_anything_is_recorded(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no task named 'nonsense'"):
-        run_demo(tmp_path / "run", DemoConfig(quick=True, task="nonsense"), Output(quiet=True))
+        run_demo(tmp_path / "run", DemoConfig(quick=True, task=("nonsense",)), Output(quiet=True))
     assert not (tmp_path / "run").exists()
 
 

@@ -42,6 +42,7 @@ def test_all_means_every_task_that_ships() -> None:
     protocol, _ = protocol_of(replace(STUDY, task=("all",)))
     names = [each.task for each in protocol.tasks]
     assert {"cube_into_box", "stack_two_cubes", "sloth_into_basket"} <= set(names)
+    assert {"sort_by_colour", "cube_beside_cube", "clear_then_place"} <= set(names)
     assert all(each.coin == 0.4 for each in protocol.tasks)
 
 

@@ -300,8 +300,10 @@ class Operator:
         if not config.missing:
             return all_
         if not config.study_arms:
-            there = {(item["start_id"], item["condition"]) for item in self._recorded()}
-            return [(s, t) for s, t in all_ if (f"{task}/{s}", t.condition) not in there]
+            there = {
+                (item["start_id"], item["condition"], item["policy"]) for item in self._recorded()
+            }
+            return [(s, t) for s, t in all_ if (f"{task}/{s}", t.condition, policy) not in there]
         tried = {
             (item["start_id"], study_arm_of(item["tags"]), item["policy"])
             for item in self._recorded()

@@ -16,6 +16,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, BASE_FRAME, ROBOT_NAME
 from bridge.sources.standin.cell_file import PlannerNoise
+from bridge.sources.standin.destination import Destination, destination_of, slots_of
 from bridge.sources.standin.kinematics import (
     WAYPOINT_S,
     Kinematics,
@@ -29,7 +30,7 @@ from bridge.sources.standin.kinematics import (
     wrap_rad,
     yaw_of,
 )
-from bridge.task.check import VERBS
+from bridge.task.check import TABLE, VERBS
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import ObjectModel, Task
 
@@ -65,62 +66,6 @@ def stage_ids(task: Task, object_id: str) -> StageIds:
         )
         raise UsageError(message)
     return StageIds(pick=pick, carry=carry or place, place=place)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Destination:
-    """What an object is put into or onto, as the planner sees it."""
-
-    id: str
-    relation: str
-    """inside or on."""
-    model: ObjectModel
-    T_base: Float[np.ndarray, "4 4"]
-
-    def resting_m(self, model: ObjectModel) -> float:
-        """Height at which the middle of an object comes to lie there."""
-        if self.relation == "inside":
-            return float(self.T_base[2, 3]) + (self.model.wall_m + model.size_m[2] / 2)
-        return self.top_m + model.size_m[2] / 2
-
-    @property
-    def top_m(self) -> float:
-        """Height that the object has to pass: the rim of the walls, or what it is put on."""
-        above_origin = self.model.size_m[2] - self.model.rest_height_m
-        return float(self.T_base[2, 3]) + above_origin
-
-    @property
-    def clearance_m(self) -> float:
-        """Between the underside of the held object and that height when it is let go."""
-        return RELEASE_CLEARANCE_M if self.relation == "inside" else ON_CLEARANCE_M
-
-    @property
-    def area_m(self) -> tuple[float, float]:
-        """Extents of what objects may lie on, in its frame."""
-        x, y, _ = self.model.inner_m if self.relation == "inside" else self.model.size_m
-        return x, y
-
-
-def destination_of(
-    task: Task, object_id: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
-) -> Destination:
-    """Find where an object belongs by the success predicates, and where that is.
-
-    Raises:
-        UsageError: When no predicate says it, and there is no container.
-    """
-    goal = task.goal_of(object_id)
-    if goal is None and task.containers:
-        goal = ("inside", task.containers[0])
-    if goal is None or goal[0] not in ("inside", "on") or goal[1] not in task.objects:
-        message = (
-            f"nothing in the success predicates of task {task.name} says what {object_id} is to be "
-            "inside or on: the scripted planner cannot plan it. See docs/tasks.md."
-        )
-        raise UsageError(message)
-    relation, target = goal
-    model = task.objects[target]
-    return Destination(id=target, relation=relation, model=model, T_base=seen[target])
 
 
 def planned_stages(
@@ -186,7 +131,8 @@ def _predicted(
     table: Mapping[str, Any],
 ) -> Float[np.ndarray, "4 4"]:
     """Where a stage leaves its object: lifted, over where it belongs, lying there, or pushed."""
-    place = {leg.name: leg.T_base_tcp[:3, 3] for leg in legs}
+    tool = {leg.name: leg.T_base_tcp for leg in legs}
+    place = {name: T_base_tcp[:3, 3] for name, T_base_tcp in tool.items()}
     T = T_base_object.copy()
     if destination is None:
         along = place["push"] - place["down"]
@@ -195,6 +141,8 @@ def _predicted(
     elif table.get("release"):
         T[:2, 3] = place["open"][:2]
         T[2, 3] = destination.resting_m(model)
+        if destination.is_turned:
+            T[:3, :3] = tool["open"][:3, :3] @ tool["close"][:3, :3].T @ T[:3, :3]
     else:
         T[:3, 3] += place["carry" if table.get("carry") else "lift"] - place["close"]
     return T
@@ -209,10 +157,6 @@ HOVER_M = 0.13
 """Height of the tool above the object's centre before the descent."""
 CARRY_M = 0.24
 """Height of the tool while carrying."""
-RELEASE_CLEARANCE_M = 0.018
-"""Between the underside of the held object and the top of the container's walls."""
-ON_CLEARANCE_M = 0.003
-"""Between the underside of the held object and the top of what it is put on."""
 LOWEST_TOOL_M = 0.016
 """The tips reach 10 mm below the tool frame."""
 
@@ -336,7 +280,7 @@ def plan_pick_and_place(
         key: None if pushing_stage(task, key) else destination_of(task, key, seen)
         for key in task.manipulated
     }
-    slots = _slots({key: place for key, place in places.items() if place is not None})
+    slots = slots_of({key: place for key, place in places.items() if place is not None})
     track = Track.at_rest(T_home, joints_start_rad)
     legs_of: dict[str, list[Leg]] = {}
     then = dict(seen)
@@ -354,7 +298,7 @@ def plan_pick_and_place(
         )
         released = {"release": key}
         then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
-    targets = (place.id for place in places.values() if place is not None)
+    targets = (place.id for place in places.values() if place is not None and place.id != TABLE)
     keypoints = dict.fromkeys((*task.manipulated, *targets))
     last = legs_of[task.manipulated[-1]][-1].stage
     home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
@@ -378,35 +322,6 @@ def plan_pick_and_place(
         stages=planned_stages(task, legs_of, track.bounds, seen, places),
         tau=track.tau,
     )
-
-
-def _slots(places: Mapping[str, Destination]) -> dict[str, Float[np.ndarray, "2"]]:
-    """Share each destination among the objects that belong there."""
-    slots: dict[str, Any] = {}
-    for target in dict.fromkeys(place.id for place in places.values()):
-        keys = [key for key, place in places.items() if place.id == target]
-        area = places[keys[0]].area_m
-        slots |= dict(zip(keys, release_slots(len(keys), area), strict=True))
-    return slots
-
-
-def release_slots(count: int, area_m: tuple[float, float]) -> list[Float[np.ndarray, "2"]]:
-    """Where on an area several objects go: two rows along its x axis, from its middle [m].
-
-    An odd last one lies between the rows; a single one goes to the middle.
-
-    Args:
-        count: How many objects.
-        area_m: Extents of the area along its x and y axes; heights are not decided here.
-    """
-    x, y = area_m
-    columns = -(-count // 2)
-    slots = []
-    for index in range(count):
-        alone = index == count - 1 and count % 2 == 1
-        across = 0.0 if alone else (index % 2 - 0.5) * y / 2
-        slots.append(np.array([x * ((index // 2 + 0.5) / columns - 0.5), across]))
-    return slots
 
 
 def _first_reachable(
@@ -477,21 +392,22 @@ def _legs(
     low = over.copy()
     low[2] = release_m
     ids = stage_ids(task, object_id)
+    there = destination.turned_to(yaw)
     moves = (
-        ("pregrasp", ids.pick, above, 1.5, 0),
-        ("grasp", ids.pick, p, 0.9, 0),
-        ("settle", ids.pick, p, 0.2, 0),
-        ("close", ids.pick, p, 0.7, 1),
-        ("lift", ids.pick, carried, 0.9, 1),
-        ("carry", ids.carry, over, 1.6, 1),
-        ("lower", ids.place, low, 0.8, 1),
-        ("settle", ids.place, low, 0.2, 1),
-        ("open", ids.place, low, 0.5, 0),
-        ("retreat", ids.place, over, 0.7, 0),
+        ("pregrasp", ids.pick, above, yaw, 1.5, 0),
+        ("grasp", ids.pick, p, yaw, 0.9, 0),
+        ("settle", ids.pick, p, yaw, 0.2, 0),
+        ("close", ids.pick, p, yaw, 0.7, 1),
+        ("lift", ids.pick, carried, yaw, 0.9, 1),
+        ("carry", ids.carry, over, there, 1.6, 1),
+        ("lower", ids.place, low, there, 0.8, 1),
+        ("settle", ids.place, low, there, 0.2, 1),
+        ("open", ids.place, low, there, 0.5, 0),
+        ("retreat", ids.place, over, there, 0.7, 0),
     )
     return [
-        Leg(name=name, stage=stage, T_base_tcp=tool_down(to, yaw), duration_s=seconds, g=g)
-        for name, stage, to, seconds, g in moves
+        Leg(name=name, stage=stage, T_base_tcp=tool_down(to, turned), duration_s=seconds, g=g)
+        for name, stage, to, turned, seconds, g in moves
     ]
 
 

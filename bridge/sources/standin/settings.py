@@ -42,8 +42,8 @@ class SessionConfig:
     first_trial: int | None = None
     """Number of the first trial's episode; without it the run's numbering goes on."""
     missing: bool = False
-    """Record only the trials of which the recorder has none yet with the same task, start and
-    condition: completes a session that was interrupted."""
+    """Record only the trials of which the recorder has none yet with the same task, start,
+    condition and policy: completes a session that was interrupted."""
     probes: int = 0
     """Rounds of probe episodes after the trials, for calibrate RUN --physics: each round pushes,
     slides, squeezes and drops the first object."""

@@ -13,11 +13,11 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden
+from bridge.sources.standin.destination import ON_CLEARANCE_M
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
     NO_ERROR,
-    ON_CLEARANCE_M,
     GraspError,
     plan_pick_and_place,
 )

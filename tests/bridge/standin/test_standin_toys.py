@@ -15,6 +15,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, nominal_hidden
+from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down, yaw_of
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
@@ -22,7 +23,6 @@ from bridge.sources.standin.planner import (
     draw_error,
     draw_errors,
     plan_pick_and_place,
-    release_slots,
 )
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.soft import SoftBody

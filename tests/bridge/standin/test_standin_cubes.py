@@ -1,0 +1,189 @@
+"""Cubes in bins of their colours, beside one another, and past one that stands in the way."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.data_files import dataset_file
+from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
+from bridge.sources.standin.cell_file import draw_hidden, load_cell
+from bridge.sources.standin.destination import destination_of
+from bridge.sources.standin.kinematics import Kinematics, arm_kinematics, tool_down
+from bridge.sources.standin.operator import execute_plan, label_trial
+from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
+from bridge.sources.standin.streams import Streams
+from bridge.task.plan import Plan
+from bridge.task.predicate import Rollout, evaluate_success
+from bridge.task.task_file import Task, load_task
+
+FROZEN = {
+    # SHA-256 of the files that were there before: what was recorded with them names their hash.
+    ("cells", "lab"): "6d372fd7101387df",
+    ("cells", "standin"): "5ea62810956d071b",
+    ("cells", "standin_toys"): "86202f6783135dfa",
+    ("cells", "standin_toys_steady"): "0ef80d4f758d2c69",
+    ("tasks", "cube_into_box"): "ca150252dc659ee9",
+    ("tasks", "five_ducks_into_basket"): "07e88730503c952e",
+    ("tasks", "heavy_block_into_box"): "4b0c0d139a99f23e",
+    ("tasks", "push_cube_to_mark"): "a20309ef41406cda",
+    ("tasks", "slippery_block_into_box"): "771a828e739cafb6",
+    ("tasks", "sloth_into_basket"): "f65db801f314e38d",
+    ("tasks", "sloth_over_rim"): "b74724cd53fce2c1",
+    ("tasks", "stack_two_cubes"): "86f3f31876d484e5",
+}
+TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place", "cube_on_block")
+SEED = 9_000_000
+
+
+@pytest.mark.parametrize("folder", ["cells", "tasks"])
+def test_older_files_are_what_they_were(folder: str) -> None:
+    for kind, name in FROZEN:
+        if kind == folder:
+            data = dataset_file(kind, name).read_bytes()
+            assert hashlib.sha256(data).hexdigest()[:16] == FROZEN[kind, name], name
+
+
+@pytest.fixture(scope="module")
+def arm() -> Kinematics:
+    return arm_kinematics()
+
+
+def planned(arm: Kinematics, task: Task, starts: dict[str, np.ndarray]) -> Plan:
+    home = tool_down(np.array([0.42, 0.0, 0.42]), 0.0)
+    return plan_pick_and_place(
+        task,
+        starts,
+        NO_ERROR,
+        kinematics=arm,
+        joints_start_rad=arm.joints_for(home, np.array(HOME_SEED_RAD)),
+        max_joint_speed_rad_s=1.6,
+        plan_id="p",
+        condition="without_replanning",
+        start_id="s",
+    )
+
+
+def predicted(plan: Plan, starts: dict[str, np.ndarray]) -> Rollout:
+    """The start, then what the plan says where everything comes to lie."""
+    ends = dict(starts)
+    for stage in plan.stages:
+        for key, pose in stage.predicted_objects.items():
+            ends[key] = se3.pose_from_record(pose)
+    return Rollout(
+        stamps_ns=np.array([0, 10**9]),
+        Ts_base_object={key: np.array([T, ends[key]]) for key, T in starts.items()},
+        finger_contact={},
+    )
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_plan_predicts_what_its_task_asks_for(arm: Kinematics, name: str) -> None:
+    task = load_task(name)
+    assert load_cell(task.cell).name == "standin_cubes"
+    starts = task.draw_start(np.random.default_rng(SEED))
+    plan = planned(arm, task, starts)
+    assert [stage.id for stage in plan.stages] == [stage["id"] for stage in task.stages]
+    begins = [stage.t_start_ns for stage in plan.stages]
+    assert begins == sorted(begins)
+    found = evaluate_success(task, predicted(plan, starts))
+    about_poses = [each for each in found if each.kind not in ("settled", "no_finger_contact")]
+    assert about_poses
+    assert all(each.value is True for each in about_poses), [each.detail for each in about_poses]
+    before = {key: np.array([T, T]) for key, T in starts.items()}
+    still = replace(predicted(plan, starts), Ts_base_object=before)
+    assert any(each.value is False for each in evaluate_success(task, still))
+
+
+@pytest.mark.parametrize("yaw", [-0.6, 0.0, 0.6])
+@pytest.mark.parametrize("side", ["left", "right", "in_front", "behind", None])
+def test_beside_is_the_middle_of_the_gap_with_a_finger_on_either_side_of_it(
+    yaw: float, side: str | None
+) -> None:
+    task = load_task("cube_beside_cube")
+    success = list(task.success)
+    success[0] = {key: value for key, value in success[0].items() if key != "direction"}
+    if side:
+        success[0]["direction"] = side
+    task = replace(task, success=tuple(success))
+    q = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    seen = {
+        "cube": se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.5, -0.2, 0.02])),
+        "other": se3.transform_from(q, np.array([0.48, 0.1, 0.02])),
+    }
+    place = destination_of(task, "cube", seen)
+    T = place.T_base.copy()
+    T[2, 3] = place.resting_m(task.objects["cube"])
+    rows = {key: np.array([each, each]) for key, each in (seen | {"cube": T}).items()}
+    rollout = Rollout(stamps_ns=np.array([0, 1]), Ts_base_object=rows, finger_contact={})
+    found = evaluate_success(task, rollout)[0]
+    assert found.value is True, found.detail
+    assert "20 mm from other" in found.detail
+    for taken in (-1.0, 0.4, 2.5):
+        closing = tool_down(np.zeros(3), place.turned_to(taken))[:2, 1]
+        assert abs(float(closing @ (T - seen["other"])[:2, 3])) < 1e-9
+        assert abs(place.turned_to(taken) - taken) <= np.pi / 2 + 1e-9
+
+
+def test_what_stands_in_the_way_is_put_to_its_mark_before_the_cube_is_touched(
+    arm: Kinematics,
+) -> None:
+    task = load_task("clear_then_place")
+    starts = task.draw_start(np.random.default_rng(SEED))
+    plan = planned(arm, task, starts)
+    mark = task.mark_of("block")
+    assert mark is not None
+    stages = {stage.id: stage for stage in plan.stages}
+    put = se3.pose_from_record(stages["clear"].predicted_objects["block"])
+    assert put[:2, 3] == pytest.approx(mark, abs=1e-9)
+    assert stages["clear"].t_end_ns <= stages["grasp_cube"].t_start_ns
+    # The cube's underside passes lower than the block is high, and where that stood.
+    carry = stages["carry_cube"]
+    way = np.array([w.p_m for w in plan.tau if carry.t_start_ns <= w.t_ns <= carry.t_end_ns])
+    cube, block = task.objects["cube"], task.objects["block"]
+    underside = way[:, 2].max() - cube.grasp_m[2] - cube.size_m[2] / 2
+    assert underside < block.size_m[2] - 0.01
+    aside = np.linalg.norm(way[:, :2] - starts["block"][:2, 3], axis=1).min()
+    assert aside < (cube.size_m[0] + block.size_m[1]) / 2
+
+
+def test_an_object_that_belongs_between_two_is_not_planned(arm: Kinematics) -> None:
+    task = load_task("cube_beside_cube")
+    between = {"kind": "between", "object": "cube", "first": "other", "second": "cube"}
+    with pytest.raises(UsageError, match="beside what, or at which mark"):
+        planned(arm, replace(task, success=(between,)), task.draw_start(np.random.default_rng(1)))
+
+
+@pytest.mark.parametrize(("cleared", "result"), [(True, "success"), (False, "failure")])
+@pytest.mark.usefixtures("unchecked")
+def test_the_cube_gets_past_the_block_only_when_that_was_moved(
+    make_session: Callable[..., Any], cleared: bool, result: str
+) -> None:
+    task, file = load_task("clear_then_place"), load_cell("standin_cubes")
+    if not cleared:
+        only = [stage for stage in task.stages if "block" not in stage.values()]
+        mine = [spec for spec in task.success if spec["object"] == "cube"]
+        task = replace(task, manipulated=("cube",), stages=tuple(only), success=tuple(mine))
+    cell = StandinCell(
+        file,
+        task,
+        draw_hidden(file, SEED, task),
+        Streams(make_session(), "standin"),
+        config=CellConfig(rate_hz=0.0, scale=0.25),
+        seed=SEED,
+        start_ns=0,
+    )
+    cell.reset(task.draw_start(np.random.default_rng(SEED)))
+    cell.wait(0.2)
+    plan = planned(cell.kinematics, task, cell.world.Ts_base_object())
+    cell.truth.clear()
+    execute_plan(cell, plan)
+    moved_m = np.linalg.norm(np.ptp(np.array(cell.truth.poses["block"])[:, :2, 3], axis=0))
+    assert moved_m > 0.01
+    outcome = label_trial(task, cell.truth, executed=True)
+    assert outcome.result == result, outcome.detail
