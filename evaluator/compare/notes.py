@@ -12,11 +12,17 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.agreement import within_and_between
+from evaluator.statistics.hierarchical import METHOD
 
 SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
 HIGH_R = 0.8
 FEW_GROUPS = 4
+
+SHARED_TASKS = (
+    "groups share tasks: in simulated studies of that kind the interval of r held the truth in 64 "
+    "of 72, not in 95 %"
+)
 
 Note = tuple[str, str]
 """About what, and the sentence."""
@@ -34,6 +40,7 @@ def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> l
         *_opposed(groups, by_id),
         *_units(groups),
         *_few_groups(by_id),
+        *_shared_tasks(groups, by_id),
         *_hidden_bias(by_id),
         *_two_gains(by_id),
         *_power(by_id),
@@ -92,6 +99,16 @@ def _few_groups(by_id: dict[str, Measurement]) -> list[Note]:
         and m.value is not None
         and (m.n or 0) < FEW_GROUPS
     ]
+
+
+def _shared_tasks(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
+    """Say that the model's interval of r is too narrow where groups share tasks."""
+    r = by_id.get("agreement.pearson_r")
+    if r is None or r.interval is None or not r.interval.method.startswith(METHOD):
+        return []
+    if len({group.task for group in groups}) == len(groups):
+        return []
+    return [("agreement.pearson_r", SHARED_TASKS)]
 
 
 def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
