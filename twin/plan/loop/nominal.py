@@ -118,7 +118,7 @@ class Transfer:
     @property
     def end_rad(self) -> Float[np.ndarray, " num_joints"]:
         """Arm when it has let go and left."""
-        return self.legs[-1].movement.path.joints_rad[-1]
+        return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
 
 class PlanProposer:
@@ -161,10 +161,16 @@ class PlanProposer:
     def _pushed(self, problem: Problem, **asked: Any) -> list[Candidate]:
         """Tasks that push go the straight geometric way."""
         found = GeometricProposer().propose(problem, **asked)
-        named = {"planner": PLANNER, "policy": self._policy.name}
         kept = found[:1] if self._policy.grasps == 1 else found
         remark = "pushed straight, tool down; no distance was looked at"
-        return [replace(each, plan=replace(each.plan, **named), remarks=(remark,)) for each in kept]
+        return [
+            replace(
+                each,
+                plan=replace(each.plan, planner=PLANNER, policy=self._policy.name),
+                remarks=(remark,),
+            )
+            for each in kept
+        ]
 
 
 class _Lazy:
