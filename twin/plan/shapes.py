@@ -108,18 +108,18 @@ def _shape_of(folder: Path, model: ObjectModel) -> Shape:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     known_low, known_high = _extents(model)
     off = float(np.max(np.abs((high - low) / (known_high - known_low) - 1.0)))
-    said = f"scan ({source})"
+    told = f"scan ({source})"
     if model.shape != SCANNED:
         if off > MOST_OFF:
             return _task_shape(model, f"task file: an extent of the scene's mesh is {off:.0%} off")
         shift = (known_low + known_high - low - high) / 2
         shift[2] = known_low[2] - low[2]  # it stands on the table
         vertices = vertices + shift
-        said += f", moved by {np.linalg.norm(shift) * 1e3:.1f} mm onto the task's shape"
+        told += f", moved by {np.linalg.norm(shift) * 1e3:.1f} mm onto the task's shape"
     return Shape(
         vertices_m=vertices,
         triangles=triangles,
-        source=said,
+        source=told,
         trusted_from_m=float(vertices[:, 2].min()) + truncation_m,
         error_m=voxel_m,
     )

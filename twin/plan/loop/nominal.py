@@ -289,7 +289,7 @@ class _Search:
                 release=release,
                 legs=legs,
                 T_base_lies=lying_there(problem, release),
-                cost=release.cost + _chance_to_miss(grasp.margin),
+                cost=release.cost + _miss_probability(grasp.margin),
                 remarks=options.remarks_of(grasp, release, legs),
             )
         if failure is None:
@@ -297,7 +297,7 @@ class _Search:
         raise failure
 
 
-def _chance_to_miss(margin: float) -> float:
+def _miss_probability(margin: float) -> float:
     """Of a normal variable, beyond so many standard deviations."""
     return erfc(margin / sqrt(2.0)) / 2
 
