@@ -118,7 +118,7 @@ class Transfer:
     @property
     def end_rad(self) -> Float[np.ndarray, " num_joints"]:
         """Arm when it has let go and left."""
-        return self.legs[-1].movement.path.joints_rad[-1]
+        return np.asarray(self.legs[-1].movement.path.joints_rad[-1])
 
 
 class PlanProposer:
@@ -161,10 +161,16 @@ class PlanProposer:
     def _pushed(self, problem: Problem, **asked: Any) -> list[Candidate]:
         """Tasks that push go the straight geometric way."""
         found = GeometricProposer().propose(problem, **asked)
-        named = {"planner": PLANNER, "policy": self._policy.name}
         kept = found[:1] if self._policy.grasps == 1 else found
         remark = "pushed straight, tool down; no distance was looked at"
-        return [replace(each, plan=replace(each.plan, **named), remarks=(remark,)) for each in kept]
+        return [
+            replace(
+                each,
+                plan=replace(each.plan, planner=PLANNER, policy=self._policy.name),
+                remarks=(remark,),
+            )
+            for each in kept
+        ]
 
 
 class _Lazy:
@@ -283,7 +289,7 @@ class _Search:
                 release=release,
                 legs=legs,
                 T_base_lies=lying_there(problem, release),
-                cost=release.cost + _chance_to_miss(grasp.margin),
+                cost=release.cost + _miss_probability(grasp.margin),
                 remarks=options.remarks_of(grasp, release, legs),
             )
         if failure is None:
@@ -291,7 +297,7 @@ class _Search:
         raise failure
 
 
-def _chance_to_miss(margin: float) -> float:
+def _miss_probability(margin: float) -> float:
     """Of a normal variable, beyond so many standard deviations."""
     return erfc(margin / sqrt(2.0)) / 2
 

@@ -18,7 +18,7 @@ _AREA_M = ((0.28, 0.68), (-0.36, 0.36))
 _STEP_M = 0.02
 _LEAST_GAP_M = 0.012
 _PLACES = 4
-_APART_M = 0.03
+_SPACING_M = 0.03
 
 
 def lying_there(problem: Problem, release: Release) -> Float[np.ndarray, "4 4"]:
@@ -66,18 +66,18 @@ def places_on_table(
         T_base_tcp=Ts,
         width_m=np.zeros(len(Ts)),
     )
-    apart = [
+    gaps = [
         compile_constraint(
             {"kind": "clearance", "obj": key, "against": name, "min": _LEAST_GAP_M}, problem
         )
         for name in problem.scene.Ts_base_object
         if name != key
     ]
-    excess = np.array([c.violation(state) / c.scale for c in (*goals, *apart)])
+    excess = np.array([c.violation(state) / c.scale for c in (*goals, *gaps)])
     total = np.maximum(excess, 0.0).sum(axis=0) if len(excess) else np.zeros(len(Ts))
     if not (total <= 0).any():
         best = int(total.argmin())
-        worst = (*goals, *apart)[int(excess[:, best].argmax())]
+        worst = (*goals, *gaps)[int(excess[:, best].argmax())]
         one = State(
             Ts_base_object={name: T[best : best + 1] for name, T in state.Ts_base_object.items()},
             T_base_tcp=Ts[best : best + 1],
@@ -88,7 +88,7 @@ def places_on_table(
     fits = np.flatnonzero(total <= 0)
     slack = np.minimum(-excess[:, fits].max(axis=0), 1.0)
     travel = np.linalg.norm(Ts[fits, :2, 3] - T_now[:2, 3], axis=1)
-    return _apart(Ts[fits[np.argsort(travel - 0.2 * slack, kind="stable")]])
+    return _spaced(Ts[fits[np.argsort(travel - 0.2 * slack, kind="stable")]])
 
 
 def _grid(
@@ -113,11 +113,11 @@ def _grid(
     return np.concatenate(found)
 
 
-def _apart(Ts: Float[np.ndarray, "num 4 4"]) -> list[Float[np.ndarray, "4 4"]]:
+def _spaced(Ts: Float[np.ndarray, "num 4 4"]) -> list[Float[np.ndarray, "4 4"]]:
     """The first few that are not next to each other."""
     kept: list[Float[np.ndarray, "4 4"]] = []
     for T in Ts:
-        if all(np.linalg.norm(T[:2, 3] - other[:2, 3]) > _APART_M for other in kept):
+        if all(np.linalg.norm(T[:2, 3] - other[:2, 3]) > _SPACING_M for other in kept):
             kept.append(T)
         if len(kept) == _PLACES:
             break

@@ -344,8 +344,8 @@ def _law(T: Float[np.ndarray, "4 4"], leg: _Leg) -> tuple[float, Float[np.ndarra
     far_m = float(np.linalg.norm(leg.T_base_tcp[:3, 3] - T[:3, 3]))
     seconds = far_m / leg.even_m_s + RAMP_S
     ramp = RAMP_S / seconds
-    u = np.arange(1, max(1, round(seconds / PUSH_STEP_S)) + 1)
-    u = u / len(u)
+    steps = max(1, round(seconds / PUSH_STEP_S))
+    u = np.arange(1, steps + 1) / steps
     begins, ends = np.minimum(u, ramp), np.maximum(u - 1 + ramp, 0.0)
     done = u - begins + begins**2 / (2 * ramp) - ends**2 / (2 * ramp)
     return seconds, done / (1 - ramp)
