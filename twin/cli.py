@@ -69,7 +69,7 @@ def plan(
     run: Path,
     /,
     *,
-    task: str = "",
+    task: str | None = None,
     dry: bool = False,
     live: bool = False,
     words: PlanConfig = PLAN,
@@ -86,8 +86,8 @@ def plan(
     Args:
         run: Run folder; its episodes and its scene say which objects there are, and where.
         task: The instruction in English, or the name or file of a task.
-        dry: Say what was understood and write nothing; without it the task goes into the run's
-            tasks/ and the plan into its plans/.
+        dry: Say what was understood and write nothing; without it an accepted plan goes into the
+            run's plans/ and its task into tasks/.
         live: Answer a cell's requests.
         words: How an instruction is planned.
         config: Settings of --live; its robot counts without it too.
@@ -101,7 +101,7 @@ def plan(
         from twin.plan.live import run_planner
 
         return run_planner(run, config, output)
-    if not task:
+    if task is None:
         message = (
             'say what to plan: robot-gst plan RUN --task "put the cube into the box", or --live to '
             "answer a cell's requests."
@@ -109,17 +109,23 @@ def plan(
         raise UsageError(message)
     folder = RunFolder.open(run)
     understood = understand(folder, task)
+    if dry and words.model:
+        message = "--dry asks no model, because it ends before the start is known. Leave one out."
+        raise UsageError(message)
     if dry:
         output.result({**understood.to_json(), "file": None}, "\n".join(understood.lines()))
         return 0
     from twin.gate.twin_process import judge_of
+    from twin.plan.model_stages import client_of
     from twin.plan.once import plan_once, proposer_of, start_of
 
     proposer_of(words.policy)
-    path = keep(folder, understood)
+    if words.model:
+        client_of(folder, words)
     start = start_of(folder, understood.file.task(), words, config.robot)
     judge = judge_of(folder.path, start.problem.scene)
     planned = plan_once(folder, understood, start, judge, words)
+    path = None if planned.path is None else keep(folder, understood)
     data = {**planned.to_json(), "file": None if path is None else str(path)}
     wrote = [] if path is None else [f"wrote {path}"]
     output.result(data, "\n".join([*planned.lines(), *wrote]))

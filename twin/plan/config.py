@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from bridge.errors import refuse_outside
+from bridge.errors import UsageError, refuse_outside
 from bridge.wire.config import DEFAULT_ENDPOINT
 
 
@@ -46,7 +46,20 @@ class PlanConfig:
     """Of everything that is drawn."""
     episode: str = ""
     """Whose start is planned from; none: the newest that shows all objects."""
+    model: str = ""
+    """Address of an OpenAI-compatible server whose model may add constraints, such as
+    http://127.0.0.1:8000/v1; its key comes from GST_MODEL_KEY. None: nobody is asked."""
+    model_name: str = ""
+    """The server's name for that model."""
+    send_images: bool = False
+    """Let a recorded image with numbered marks leave for that address."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers that plan nothing."""
+        """Refuse numbers that plan nothing, and half of what a model needs."""
         refuse_outside(self, {"rounds": (1, 1000), "seed": (0, 2**63 - 1)})
+        if bool(self.model) != bool(self.model_name) or (self.send_images and not self.model):
+            message = (
+                "a model is asked by its address and its name: --model URL --model-name NAME; "
+                "--send-images needs both."
+            )
+            raise UsageError(message)

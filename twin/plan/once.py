@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,18 @@ from bridge.errors import EpisodeError, UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
-from bridge.task.plan import Plan, Stage
+from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.ground.model_client import BY_GRAMMAR
 from twin.plan.ground.run_tasks import UnderstoodTask
 from twin.plan.live import PROPOSERS
 from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
+from twin.plan.model_stages import Asked, ask_about
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
 from twin.replay.job import recorded_start
@@ -154,6 +156,8 @@ class Planned:
     attempts: Sequence[Attempt]
     path: Path | None
     """Where the accepted plan lies; None: none was accepted."""
+    asked: Asked | None = None
+    """What a model said; None: nobody was asked."""
 
     @property
     def last(self) -> Attempt:
@@ -162,7 +166,10 @@ class Planned:
 
     def lines(self) -> list[str]:
         """Everything for a person."""
-        told = [*self.understood.lines(), "", *self.start.lines(), "", "constraints:"]
+        told = [*self.understood.lines(), "", *self.start.lines()]
+        if self.asked is not None:
+            told += ["", *self.asked.lines()]
+        told += ["", "constraints:"]
         plan = self.last.candidate.plan
         for stage in plan.stages:
             told += _explained(self.start.problem, plan, stage)
@@ -183,6 +190,7 @@ class Planned:
         return {
             **self.understood.to_json(),
             "start": {"episode": self.start.episode},
+            "model": None if self.asked is None else self.asked.to_json(),
             "plan": None if self.path is None else str(self.path),
             "attempts": [
                 {
@@ -223,25 +231,51 @@ def plan_once(
         config: Policy, rounds and seed.
 
     Raises:
-        NoPlanError: There is no candidate at all.
+        NoPlanError: There is no candidate at all, not even without what a model added.
     """
-    task = understood.file.task()
-    attempts = plan_and_verify(
-        proposer_of(config.policy),
-        start.problem,
-        judge,
-        plan_id=f"{task.name}.{config.policy}.{config.seed}",
-        seed=config.seed,
-        rounds=config.rounds,
-        task_sha256=understood.file.sha256,
-    )
+    asked = ask_about(run, start.episode, start.problem, config) if config.model else None
+    try:
+        attempts = _attempts(
+            understood, start.problem if asked is None else asked.problem, judge, config, asked
+        )
+    except NoPlanError as error:
+        if asked is None or asked.problem is start.problem:
+            raise
+        why = f"no plan keeps what the model added, so its constraints were left out: {error}"
+        asked = replace(
+            asked,
+            problem=start.problem,
+            answered_by=BY_GRAMMAR,
+            remarks=(*asked.remarks, why),
+        )
+        attempts = _attempts(understood, start.problem, judge, config, asked)
     path = None
     if attempts[-1].verdict.accepted is True:
         plan = attempts[-1].candidate.plan
         path = run.path / PLANS / f"{plan.id}.json"
         path.parent.mkdir(exist_ok=True)
         write_whole(path, plan.to_json())
-    return Planned(understood=understood, start=start, attempts=attempts, path=path)
+    return Planned(understood=understood, start=start, attempts=attempts, path=path, asked=asked)
+
+
+def _attempts(
+    understood: UnderstoodTask,
+    problem: Problem,
+    judge: Callable[[Plan], Verdict],
+    config: PlanConfig,
+    asked: Asked | None,
+) -> list[Attempt]:
+    name = understood.file.task().name
+    return plan_and_verify(
+        proposer_of(config.policy),
+        problem,
+        judge,
+        plan_id=f"{name}.{config.policy}.{config.seed}",
+        seed=config.seed,
+        rounds=config.rounds,
+        task_sha256=understood.file.sha256,
+        grounding_source="" if asked is None else asked.answered_by,
+    )
 
 
 def proposer_of(policy: str) -> Proposer:
@@ -291,12 +325,19 @@ def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
     Ts: dict[str, Float[np.ndarray, "4 4"]] = dict(problem.scene.Ts_base_object)
     at = plan.tau[0]
     if stage is not None:
+        at = [w for w in plan.tau if w.t_ns <= stage.t_end_ns][-1]
         for each in plan.stages[: plan.stages.index(stage) + 1]:
             Ts |= {key: se3.pose_from_record(T) for key, T in each.predicted_objects.items()}
-        at = [w for w in plan.tau if w.t_ns <= stage.t_end_ns][-1]
-    T_tcp = se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))
+            closed = [w for w in plan.tau if w.t_ns >= each.t_start_ns and w.g == 1]
+            if each.grasp is not None and closed:  # from here on it moves with the tool
+                T_tcp_object = se3.invert(_tool(closed[0])) @ Ts[each.grasp]
+                Ts[each.grasp] = _tool(at) @ T_tcp_object
     return State(
         Ts_base_object={key: T[None] for key, T in Ts.items()},
-        T_base_tcp=T_tcp[None],
+        T_base_tcp=_tool(at)[None],
         width_m=np.array([at.width_m or 0.0]),
     )
+
+
+def _tool(at: Waypoint) -> Float[np.ndarray, "4 4"]:
+    return se3.transform_from(np.array(at.q_wxyz), np.array(at.p_m))

@@ -6,7 +6,7 @@ many are asked for: the surest grasps with their cheapest final state first, the
 states. What a refusal asks to change is left out, or tried first.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import erfc, sqrt
 from typing import Any
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.plan import Plan
-from twin.plan.constrain.constraint import Constraint, worst_along
+from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import lying_there, places_on_table
@@ -323,7 +323,8 @@ class _Options:
         self._seed, self._steer = seed, steer
         found = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed)).search(key)
         self._remarks = found.remarks
-        self._grasps = self._ordered(list(found.grasps))[: policy.grasps]
+        kept = _kept_at_the_grasp(problem, found.grasps)
+        self._grasps = self._ordered(kept)[: policy.grasps]
         self.num_grasps = len(found.grasps)
         records = goals_of(problem.scene.task, key)
         self._relation = problem.scene.task.goal_of(key)
@@ -331,7 +332,7 @@ class _Options:
             compile_constraint(record, problem)
             for record in records
             if record["kind"] not in _PLACED or record.get("support") == TABLE
-        ]
+        ] + _subgoals(problem, key, "release")
         self.why = ""
         self._given_up: list[Grasp] = []
 
@@ -428,6 +429,45 @@ class _Options:
         )
 
 
+def _subgoals(problem: Problem, key: str, verb: str) -> list[Constraint]:
+    """What somebody added for the end of the stage in which an object is grasped or the like."""
+    stage = stages_of(problem.scene.task, key).get(verb)
+    return [
+        compile_constraint(goal, problem)
+        for table in problem.scene.task.stages
+        if str(table["id"]) == stage
+        for goal in table.get("subgoal", ())
+    ]
+
+
+def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]:
+    """Those that satisfy what was added for the end of the grasp.
+
+    Raises:
+        NoPlanError: None does; says what the surest one has.
+    """
+    asked = _subgoals(problem, grasps[0].object_id, "grasp")
+    if not asked:
+        return list(grasps)
+    states = [_state_at(problem, grasp) for grasp in grasps]
+    violations = [violated(asked, state) for state in states]
+    kept = [grasp for grasp, wrong in zip(grasps, violations, strict=True) if not wrong]
+    if not kept:
+        message = f"no grasp of {grasps[0].object_id} keeps what is asked: {violations[0][0]}"
+        raise NoPlanError(message)
+    return kept
+
+
+def _state_at(problem: Problem, grasp: Grasp) -> State:
+    """As the fingers have closed."""
+    Ts = problem.scene.Ts_base_object
+    return State(
+        Ts_base_object={name: T[None] for name, T in Ts.items()},
+        T_base_tcp=(Ts[grasp.object_id] @ grasp.T_object_tcp)[None],
+        width_m=np.array([grasp.width_m]),
+    )
+
+
 def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...]], None]:
     """Ask the constraints of the object's stages of each leg that belongs to them."""
     task, key = problem.scene.task, grasp.object_id
@@ -437,15 +477,21 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
         stage: [compile_constraint(way, problem) for way in tables[stage].get("path", ())]
         for stage in ids.values()
     }
+    at_the_end = _subgoals(problem, key, "carry")
 
     def check(legs: tuple[Leg, ...]) -> None:
         for leg in legs:
             stage = _stage_of_leg(leg.name, ids)
-            if stage is None or not of_stage[stage]:
+            if stage is None:
                 continue
             states = _states_along(problem, grasp, leg)
-            for constraint in of_stage[stage]:
-                f = float(worst_along(constraint, states, times_s=leg.movement.path.times_s)[0])
+            times_s = leg.movement.path.times_s
+            asked = [(each, worst_along(each, states, times_s=times_s)) for each in of_stage[stage]]
+            if leg.name == "carry":
+                last = flattened(states)
+                asked += [(each, each.violation(last)[-1:]) for each in at_the_end]
+            for constraint, worst in asked:
+                f = float(worst[0])
                 if f > 0:
                     detail = f"{constraint.kind} is violated by {f:.3g} {constraint.unit}"
                     error = NoPathError(reason=NOT_KEPT, detail=detail)

@@ -150,6 +150,7 @@ def plan_and_verify(
     seed: int,
     rounds: int,
     task_sha256: str = "",
+    grounding_source: str = "",
 ) -> list[Attempt]:
     """Propose and have judged until one is accepted; the last attempt is the one that counts.
 
@@ -164,6 +165,7 @@ def plan_and_verify(
         seed: Of everything that is drawn.
         rounds: Candidates that may be judged.
         task_sha256: Of the task file; empty: not known.
+        grounding_source: Who said what is to be kept; empty: the task file alone.
 
     Raises:
         NoPlanError: When there is not even a first candidate.
@@ -192,6 +194,7 @@ def plan_and_verify(
             parent_id=parent,
             round=round_,
             task_sha256=task_sha256,
+            grounding_source=grounding_source,
         )
         candidate = replace(candidate, plan=plan)
         verdict = judge(plan)

@@ -122,7 +122,10 @@ def plan_stage(
     return Stage(
         id=stage_id,
         text=str(table.get("text", "")),
-        subgoal=tuple(goals_of(task, str(release))) if release is not None else (),
+        subgoal=(
+            *(goals_of(task, str(release)) if release is not None else ()),
+            *(dict(goal) for goal in table.get("subgoal", ())),
+        ),
         path=tuple(dict(way) for way in table.get("path", ())),
         grasp=table.get("grasp"),
         release=table.get("release"),

@@ -1,0 +1,190 @@
+"""``plan RUN --task --model``: a stub server on the loopback adds constraints, or does not."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / "constrain")]
+
+from hostile_replies import TASK, valid_reply
+from scripted_plans import scene_of_test
+from test_model_client import Server, images_in, says, serving
+
+import robot_gst
+from bridge.data_files import datasets_folder
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
+from bridge.task.plan import Plan
+from bridge.task.task_file import TaskFile
+from bridge.task.verdict import Factor, Verdict
+from twin.gate import twin_process
+from twin.plan import model_stages, once
+from twin.plan.constrain.reply import read_reply
+from twin.plan.constrain.schema import Vocabulary
+from twin.plan.problem import Problem
+from twin.plan.shapes import shapes_of
+from twin.robot.model import load_robot
+
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+TOP = {"obj": "cube", "anchor": "top"}
+LOW = {"kind": "height", "a": TOP, "min": -0.01, "max": 0.5}
+NEVER = {"kind": "height", "a": TOP, "min": 0.9}
+
+
+def problem_of_test() -> Problem:
+    scene = scene_of_test()
+    return Problem(
+        scene=replace(scene, start_rad=HOME),
+        robot=load_robot(scene.urdf),
+        shapes=shapes_of(None, scene.task),
+    )
+
+
+def reply(*path: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A reply with these constraints on the way."""
+    record = valid_reply()
+    for stage in record["stages"]:
+        stage |= {"subgoal": [], "path": [], **more}
+    record["stages"][1]["path"] = list(path)
+    return record
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+    """A run of one episode whose start and twin are those of the tests."""
+    folder = RunFolder.create(tmp_path / "run")
+    file = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
+    with EpisodeWriter(folder.episodes_dir / "a.mcap") as writer:
+        info = EpisodeInfo(id="a", kind="scan", task=file.task().name, task_sha256=file.sha256)
+        writer.describe(info)
+        writer.attach(ATTACHMENT, file.data, media_type=MEDIA_TYPE, log_time_ns=1)
+
+    def start_of(run: RunFolder, task: Any, config: Any, robot: str = "") -> once.Start:
+        problem = problem_of_test()
+        problem = replace(problem, scene=replace(problem.scene, task=task))
+        return once.Start(episode="a", localised={}, problem=problem, urdf=problem.scene.urdf)
+
+    def judge_of(path: Path, scene: Any) -> Callable[[Plan], Verdict]:
+        yes = Factor(value=True)
+        return lambda plan: Verdict(
+            plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
+            ik=yes, clearance=yes, terminal=yes,
+        )  # fmt: skip
+
+    image = np.full((24, 32, 3), 200, dtype=np.uint8)
+    monkeypatch.setattr(once, "start_of", start_of)
+    monkeypatch.setattr(twin_process, "judge_of", judge_of)
+    monkeypatch.setattr(model_stages, "marked_view", lambda *_: (image, {"cube": 1}))
+    return folder
+
+
+def planned(
+    run: RunFolder, server: Server, capsys: pytest.CaptureFixture[str], *more: str
+) -> tuple[dict[str, Any], Plan]:
+    command = ["plan", str(run.path), "--task", TASK, "--policy", "single", "--json"]
+    asked = ["--model", server.url, "--model-name", "stub", *more]
+    assert robot_gst.run([*command, *asked]) == 0, capsys.readouterr().err
+    data = json.loads(capsys.readouterr().out)
+    return data, Plan.from_json(Path(data["plan"]).read_bytes())
+
+
+def test_what_the_model_adds_joins_the_stages_and_nothing_else(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(says(json.dumps(reply(LOW)))) as server:
+        data, plan = planned(run, server, capsys)
+    assert (data["model"]["answered_by"], data["model"]["address"]) == ("model", server.url)
+    assert data["model"]["images_sent"] is False
+    assert plan.grounding_source == "model"
+    assert [LOW in stage.path for stage in plan.stages] == [False, True, True]
+    task = TaskFile.read(Path(data["file"])).task()
+    assert [dict(item) for item in task.success] == [
+        dict(item) for item in plan.stages[-1].terminal
+    ]
+    assert [{frozenset(pair) for pair in stage.allowed_contacts} for stage in plan.stages] == [
+        {frozenset(pair) for pair in table["allowed_contacts"]} for table in task.stages
+    ]
+    assert images_in(server.asked[0]) == []
+    assert "image" not in json.dumps(server.asked[0]["messages"][1])
+
+
+def test_an_image_leaves_where_that_is_asked_for(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(says(json.dumps(reply()))) as server:
+        data, _ = planned(run, server, capsys, "--send-images")
+    assert data["model"]["images_sent"] is True
+    assert len(images_in(server.asked[0])) == 1
+
+
+def test_garbage_leaves_it_to_the_grammar(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(says("Sure! Here you go.")) as server:
+        data, plan = planned(run, server, capsys)
+    assert len(server.asked) == 2
+    assert data["model"]["answered_by"] == plan.grounding_source == "grammar"
+    assert not any(stage.path for stage in plan.stages)
+
+
+@pytest.mark.slow
+def test_what_no_plan_keeps_is_left_out_and_said(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(says("no"), says(json.dumps(reply(NEVER)))) as server:
+        data, plan = planned(run, server, capsys)
+    assert data["model"]["answered_by"] == plan.grounding_source == "grammar"
+    assert any("no plan keeps what the model added" in text for text in data["model"]["remarks"])
+    assert not any(stage.path for stage in plan.stages)
+
+
+def test_a_models_stages_find_those_of_the_task() -> None:
+    """Grasp, way and release go where they belong; where things end is the task file's."""
+    problem = problem_of_test()
+    task = problem.scene.task
+    record = reply()
+    grasp, place = record["stages"]
+    inside = {"kind": "inside", "obj": "cube", "container": "box"}
+    grasp["subgoal"], place["subgoal"], place["path"] = [LOW], [inside], [NEVER]
+    lift = {**place, "id": "lift", "subgoal": [NEVER], "path": [LOW], "allowed_contacts": []}
+    del lift["release"]
+    record["stages"] = [grasp, lift, place]
+    stages = read_reply(json.dumps(record), Vocabulary.of_task(task), TASK)
+    changed, remarks = model_stages.with_added(problem, stages)
+    found = [(each.get("subgoal"), each.get("path")) for each in changed.scene.task.stages]
+    assert found == [([LOW], None), (None, [LOW, NEVER])]  # this task carries as it releases
+    assert len(remarks) == 2
+    assert "height of stage lift: the task has no stage of its own to carry cube" in remarks[0]
+    assert "inside of stage place" in remarks[1]
+    assert changed.scene.task.success == task.success
+    carry = {"id": "carry", "carry": "cube", "text": "", "allowed_contacts": []}
+    three = replace(task, stages=(task.stages[0], carry, task.stages[1]))
+    problem = replace(problem, scene=replace(problem.scene, task=three))
+    changed, _ = model_stages.with_added(problem, stages)
+    found = [(each.get("subgoal"), each.get("path")) for each in changed.scene.task.stages]
+    assert found == [([LOW], None), ([NEVER], [LOW]), (None, [NEVER])]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--model", "http://127.0.0.1:9/v1"], "--model-name"),
+        (["--send-images"], "--model URL"),
+        (["--model", "nowhere", "--model-name", "m"], "must begin with http"),
+        (["--model", "http://127.0.0.1:9/v1", "--model-name", "m", "--dry"], "asks no model"),
+    ],
+)
+def test_half_a_model_is_wrong_use(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    assert robot_gst.run(["plan", str(run.path), "--task", TASK, *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not run.tasks_dir.exists()

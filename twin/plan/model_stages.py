@@ -1,0 +1,249 @@
+"""What a vision-language model adds to a task: constraints of its stages, and nothing else.
+
+What counts as success and what may touch what stay those of the task file. A model cuts a task into
+stages of its own; what it asks joins the stage of the task in which the same object is grasped,
+carried or released.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from bridge.geometry import se3
+from bridge.task.plan import Stage
+from bridge.task.task_file import Task
+from twin.plan.config import PlanConfig
+from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.constrain.schema import Vocabulary
+from twin.plan.ground.marks import draw_marks
+from twin.plan.ground.model_client import (
+    BY_GRAMMAR,
+    ModelConfig,
+    Question,
+    ask_model,
+)
+from twin.plan.ground.vocabulary import vocabulary_of
+from twin.plan.loop.tau import goals_of, stages_of
+from twin.plan.problem import Problem
+from twin.scene.localise.episode import first_execution_ns
+from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
+from twin.scene.store.calibration import read_calibration
+from twin.scene.store.folder import read_record
+
+REPLIES = "model_replies"
+"""Folder of the run's ``derived/`` with replies that were taken."""
+_PLACES = ("inside", "on", "outside", "beside", "between", "moved")
+"""Kinds that say where an object ends: those are the task file's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """What came of asking a model."""
+
+    problem: Problem
+    """Its task has the constraints that were added; as it was where the grammar answered."""
+    answered_by: str
+    address: str
+    images_sent: bool
+    remarks: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """For a person: who answered, whom was asked, what was sent."""
+        sent = "one image was sent" if self.images_sent else "no image was sent"
+        head = f"stages: answered by {self.answered_by}; asked {self.address}; {sent}"
+        return [head, *(f"  {remark}" for remark in self.remarks)]
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as data."""
+        return {
+            "answered_by": self.answered_by,
+            "address": self.address,
+            "images_sent": self.images_sent,
+            "remarks": list(self.remarks),
+        }
+
+
+def ask_about(run: RunFolder, episode: str, problem: Problem, config: PlanConfig) -> Asked:
+    """Ask the model of the settings for constraints; the grammar's stages are the fallback.
+
+    Args:
+        run: Its scene says what the objects look like; replies that were taken are kept in it.
+        episode: Shows the start.
+        problem: Whose task is planned.
+        config: Names the model and says whether an image may leave.
+    """
+    task = problem.scene.task
+    instances = ((read_record(run) or {}).get("semantics") or {}).get("instances", ())
+    things = vocabulary_of(task, instances).things
+    image, marks = marked_view(run, episode, problem)
+    question = Question(
+        task=task.instruction,
+        vocabulary=Vocabulary.of_task(task),
+        labels={key: thing.describe() for key, thing in things.items()},
+        image_u8=image,
+        marks=marks,
+    )
+    answer = ask_model(question, client_of(run, config), lambda: stages_in(task))
+    remarks = answer.remarks
+    if answer.answered_by != BY_GRAMMAR:
+        problem, left_out = with_added(problem, answer.stages)
+        remarks += left_out
+    return Asked(
+        problem=problem,
+        answered_by=answer.answered_by,
+        address=config.model,
+        images_sent=config.send_images and image is not None,
+        remarks=remarks,
+    )
+
+
+def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
+    """Whom the settings ask.
+
+    Args:
+        run: Where replies are kept.
+        config: Names the model.
+
+    Raises:
+        UsageError: The address is none.
+    """
+    return ModelConfig(
+        url=config.model,
+        model=config.model_name,
+        send_images=config.send_images,
+        cache=run.derived_dir / REPLIES,
+    )
+
+
+def marked_view(
+    run: RunFolder, episode: str, problem: Problem
+) -> tuple[UInt8[np.ndarray, "height width 3"] | None, dict[str, int]]:
+    """The recorded image that shows most objects, with a number on each; None where there is none.
+
+    Args:
+        run: With the episode.
+        episode: Its name.
+        problem: Says where the objects are.
+    """
+    path = next((path for path in run.episodes() if path.stem == episode), None)
+    if path is None:
+        return None, {}
+    recorded = Episode.open(path)
+    poses = calibrated_cameras(recorded, read_calibration(run))
+    try:
+        frames = stationary_frames(recorded, 1, before_ns=first_execution_ns(recorded), poses=poses)
+    except GstError:
+        return None, {}
+    middles = {
+        key: se3.apply(T, problem.shapes[key].vertices_m.mean(axis=0))
+        for key, T in problem.scene.Ts_base_object.items()
+    }
+    views = [
+        draw_marks(frame.image_u8, frame.color_camera, frame.T_base_color, middles)
+        for frame in frames
+    ]
+    return max(views, key=lambda view: len(view[1]), default=(None, {}))
+
+
+def stages_in(task: Task) -> tuple[Stage, ...]:
+    """The stages of a task file, as the grammar or a person wrote them."""
+    return tuple(
+        Stage(
+            id=str(table["id"]),
+            text=str(table.get("text", "")),
+            path=tuple(dict(way) for way in table.get("path", ())),
+            grasp=table.get("grasp"),
+            release=table.get("release"),
+            push=table.get("push"),
+            allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", ())),
+        )
+        for table in task.stages
+    )
+
+
+def with_added(problem: Problem, stages: tuple[Stage, ...]) -> tuple[Problem, tuple[str, ...]]:
+    """Add the constraints of a model's stages to those of the task's.
+
+    Args:
+        problem: Its task keeps its objects, contacts and success predicates.
+        stages: Judged by ``twin.plan.constrain.reply``.
+
+    Returns:
+        The problem with them, and what was left out.
+    """
+    task, remarks = problem.scene.task, list[str]()
+    added: dict[str, list[dict[str, Any]]] = {}
+    held: str | None = None
+    for stage in stages:
+        held = stage.grasp or held
+        if held is None:
+            if stage.subgoal or stage.path:
+                remarks.append(f"left out stage {stage.id}: nothing is held in it")
+            continue
+        ids, verbs = stages_of(task, held), _verbs(stage, held, stages)
+        for kind, names in (("subgoal", verbs[-1:]), ("path", verbs)):
+            for record in getattr(stage, kind):
+                why = _misfit(problem, record, kind)
+                if kind == "subgoal" and verbs[-1] not in ids:
+                    why = f"the task has no stage of its own to {verbs[-1]} {held}"
+                if why:
+                    remarks.append(f"left out {record['kind']} of stage {stage.id}: {why}")
+                    continue
+                for verb in names:
+                    stage_id = ids.get(verb, ids.get("release", ""))
+                    added.setdefault(f"{stage_id} {kind}", []).append(dict(record))
+        held = None if stage.release is not None else held
+    tables = tuple(_joined(table, added) for table in task.stages)
+    changed = replace(task, stages=tables)
+    return replace(problem, scene=replace(problem.scene, task=changed)), tuple(remarks)
+
+
+def _verbs(stage: Stage, held: str, stages: tuple[Stage, ...]) -> tuple[str, ...]:
+    """What a model's stage is about; a release with no stage before it carries, too."""
+    if stage.grasp is not None:
+        return ("grasp",)
+    if stage.release is None:
+        return ("carry",)
+    return ("release",) if _carried(stages, held) else ("carry", "release")
+
+
+def _misfit(problem: Problem, record: Mapping[str, Any], kind: str) -> str:
+    """Why a constraint cannot be added; empty: it can."""
+    if kind == "subgoal" and record["kind"] in _PLACES:
+        if record in goals_of(problem.scene.task, str(record.get("obj"))):
+            return "the task file asks it already"
+        return "where objects end is the task file's to say"
+    try:
+        compile_constraint(record, problem)
+    except GstError as error:
+        return str(error)
+    return ""
+
+
+def _carried(stages: tuple[Stage, ...], key: str) -> bool:
+    """Whether a model has a stage between the grasp and the release of an object."""
+    held = False
+    for stage in stages:
+        if held and stage.grasp is None and stage.release is None:
+            return True
+        held = stage.grasp == key or (held and stage.release is None)
+    return False
+
+
+def _joined(
+    table: Mapping[str, Any], added: Mapping[str, Sequence[dict[str, Any]]]
+) -> dict[str, Any]:
+    """A stage's table with more constraints, none twice; contacts as they were."""
+    joined = dict(table)
+    for kind in ("subgoal", "path"):
+        for record in added.get(f"{table['id']} {kind}", ()):
+            before = joined.get(kind, [])
+            if record not in before:
+                joined[kind] = [*before, record]
+    return joined
