@@ -31,6 +31,7 @@ from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_veri
 from twin.plan.model_stages import Asked, ask_about
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.job import recorded_start
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
@@ -83,7 +84,8 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
     Raises:
         UsageError: No episode is called as asked, or there is none.
-        NoPlanError: No episode shows all of them; says what is missing in the newest.
+        NoPlanError: No episode shows all of them; says what is missing in the newest. Or nothing
+            can be planned from what was found.
         EpisodeError: The robot was not described.
     """
     paths = run.episodes()
@@ -144,6 +146,9 @@ def _start(
     seen_ns = max(item.stamp_ns for item in found.values())
     start_rad = recorded_start(episode, seen_ns, robot_of(urdf).joints)
     problem = problem_of(run, task, found, urdf, start_rad)
+    if not robot:
+        refuse_other_robot(run, problem.robot.record)
+    refuse_unusable(problem)
     return Start(episode=episode.path.stem, localised=found, problem=problem, urdf=urdf)
 
 

@@ -355,7 +355,7 @@ def _reach(record: Record, problem: Problem) -> Constraint:
 
     Inverse kinematics decides; this says by how much a tool is too far off, which that does not.
     """
-    p_shoulder, length_m = _outer_reach(problem)
+    p_shoulder, length_m = outer_reach(problem)
     return Constraint.of(
         record,
         Term(
@@ -368,7 +368,7 @@ def _reach(record: Record, problem: Problem) -> Constraint:
     )
 
 
-def _outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
+def outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
     """Where the arm's first joint is in the base frame, and the lengths of the links behind it [m].
 
     The placements of the joints and the tool in the robot description, one behind the other.

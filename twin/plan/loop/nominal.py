@@ -25,7 +25,7 @@ from twin.plan.loop.propose import Candidate, NoPlanError
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.straight import GeometricProposer
 from twin.plan.loop.tau import Trajectory, goals_of, plan_stage, stages_of
-from twin.plan.path.planner import NoPathError, PathConfig, plan_move
+from twin.plan.path.planner import START_TOUCHES, NoPathError, PathConfig, plan_move
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
@@ -237,6 +237,11 @@ class _Search:
                     transfer = self._moved(problem, grasp, release, start_rad, options)
                 except NoPathError as error:
                     self.why = f"{key}: {error}"
+                    if error.reason == START_TOUCHES and error.leg == "around":
+                        self.why = (
+                            f"the arm starts in collision: {' touches '.join(error.bodies)}. Move "
+                            "it clear, and record the start again: robot-gst record RUN."
+                        )
                     if error.leg in _OF_GRASP:
                         options.give_up(grasp)
                     continue

@@ -25,8 +25,9 @@ from twin.replay.config import ReplayConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
+START_TOUCHES = "start touches"
 REASONS = {
-    1: "start touches",
+    1: START_TOUCHES,
     2: "goal touches",
     3: "budget spent",
     4: "outside the joint limits",

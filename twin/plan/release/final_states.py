@@ -218,7 +218,8 @@ class ReleaseSearch:
             message = (
                 f"{self._grasp.object_id} ({extents[0] * 1e3:.0f} x {extents[1] * 1e3:.0f} mm at "
                 f"its narrowest) does not fit into {target.name} "
-                f"({room[0] * 1e3:.0f} x {room[1] * 1e3:.0f} mm inside)."
+                f"({room[0] * 1e3:.0f} x {room[1] * 1e3:.0f} mm inside). "
+                "Name a larger one."
             )
             raise NoFinalStateError(cause="container_too_small", message=message)
 

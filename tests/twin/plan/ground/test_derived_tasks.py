@@ -174,6 +174,17 @@ def test_the_command_prints_what_was_understood(
     assert robot_gst.run([*command, "cube_into_box", "--dry"]) == 0
 
 
+def test_what_was_not_localised_ends_with_1_and_writes_nothing(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(run.path.rglob("*"))
+    assert robot_gst.run(["plan", str(run.path), "--task", "put the cube into the box"]) == 1
+    said = capsys.readouterr().err
+    assert "not localised: cube" in said
+    assert "record again" in said
+    assert sorted(run.path.rglob("*")) == before
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

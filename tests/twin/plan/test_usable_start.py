@@ -1,0 +1,126 @@
+"""Starts from which nothing can be planned: one sentence each, with what, where and what to do."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scripted_plans import scene_of_test
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.geometry import se3
+from bridge.robots.default import ROBOT
+from bridge.robots.robot import read_robot
+from twin.plan.loop.nominal import SINGLE, PlanProposer
+from twin.plan.loop.propose import NoPlanError
+from twin.plan.problem import Problem
+from twin.plan.shapes import shapes_of
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable
+from twin.robot.model import load_robot
+from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
+
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+SURE = np.eye(6) * 1e-6
+Change = Callable[[Problem], Problem]
+
+
+def scene_with(**changes: Any) -> Change:
+    return lambda problem: replace(problem, scene=replace(problem.scene, **changes))
+
+
+def placed(name: str, *p_m: float, scale: float = 1.0) -> Change:
+    T = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array(p_m))
+    T[:3, :3] *= scale
+
+    def change(problem: Problem) -> Problem:
+        return scene_with(Ts_base_object={**problem.scene.Ts_base_object, name: T})(problem)
+
+    return change
+
+
+def sized(name: str, *size_m: float) -> Change:
+    def change(problem: Problem) -> Problem:
+        task = problem.scene.task
+        model = replace(task.objects[name], size_m=size_m)
+        task = replace(task, objects={**task.objects, name: model})
+        return replace(scene_with(task=task)(problem), shapes=shapes_of(None, task))
+
+    return change
+
+
+@pytest.fixture
+def problem() -> Problem:
+    scene = scene_of_test()
+    return Problem(
+        scene=replace(scene, start_rad=HOME),
+        robot=load_robot(scene.urdf),
+        shapes=shapes_of(None, scene.task),
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "to_do"),
+    [
+        (placed("cube", np.nan, 0, 0.02), "pose of cube is not made of numbers", "Localise"),
+        (placed("box", 0.5, np.inf, 0.0), "pose of box is not made of numbers", "Localise"),
+        (placed("cube", 0.5, 0, 0.02, scale=2.0), "pose of cube has a rotation", "Localise"),
+        (placed("cube", 2.0, 0, 0.02), r"cube at \(2000, 0, 20\) mm is out of reach", "nearer"),
+        (placed("box", 0.5, 2.5, 0.0), r"box at \(500, 2500, 0\) mm is out of reach", "nearer"),
+        (scene_with(start_rad=HOME * np.nan), "joints at the start are not", "Record"),
+        (scene_with(start_rad=HOME[:4]), "gives 4 joints, and ur5", "--robot"),
+        (scene_with(start_rad=HOME + 20), "rad, beyond its limits", "Move it back"),
+        (scene_with(covariances={"box": SURE * np.nan}), "covariance of box", "Localise"),
+        (scene_with(covariances={"box": SURE * 900}), "box is known to 30 mm", "Localise"),
+        (sized("box", 0.05, 0.05, 0.056), r"does not fit into box \(38 x 38 mm", "larger"),
+        (sized("cube", 0.2, 0.2, 0.2), "wider than the hand opens", "wider gripper"),
+        (
+            scene_with(start_rad=np.array([0, 0.6, 1.2, 0, 0, 0.0])),
+            "starts in collision: upper_arm_link touches table",
+            "Move it clear",
+        ),
+    ],
+)
+def test_a_start_that_cannot_be_used_is_refused_in_one_sentence(
+    problem: Problem, change: Change, said: str, to_do: str
+) -> None:
+    bad = change(problem)
+
+    def plan() -> None:
+        refuse_unusable(bad)
+        PlanProposer(SINGLE).propose(bad, plan_id="p", seed=0, count=1, steer=None)
+
+    with pytest.raises(NoPlanError, match=said) as caught:
+        plan()
+    assert to_do in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_good_start_is_not_refused(problem: Problem) -> None:
+    refuse_unusable(scene_with(covariances={"cube": SURE, "box": SURE})(problem))
+
+
+def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    other = read_robot("ur10_parallel_gripper")
+    for name, urdf in (("scan", other.description()), ("trial", ROBOT.urdf_text())):
+        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
+            writer.describe(EpisodeInfo(id=name, kind="scan"))
+            data = urdf.encode()
+            writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
+    run.scene_dir.mkdir()
+
+    def made_of(name: str) -> None:
+        record = dict.fromkeys(NEEDED, "") | {"schema_version": SCENE_VERSION}
+        record["sources"] = [{"id": name}]
+        (run.scene_dir / SCENE_FILE).write_text(json.dumps(record))
+
+    made_of("trial")
+    refuse_other_robot(run, ROBOT)
+    made_of("scan")
+    with pytest.raises(NoPlanError, match=f"with robot {other.name} .*rebuild"):
+        refuse_other_robot(run, ROBOT)
