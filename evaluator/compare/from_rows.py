@@ -114,7 +114,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     study, study_tables, void = study_results(rows, void_causes, method=method)
     measurements = (
         *rates,
-        *(rate for group in groups for rate in group.pair),
+        *(rate for group in groups for rate in (group.sim_common, group.recorded_common) if rate),
         *averages(groups, method=method),
         *agreement(rows, method=method),
         *group_agreement(groups),

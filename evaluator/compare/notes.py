@@ -136,8 +136,8 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
     except UndefinedStatisticError:
         return []
     inside, across = (by_id.get(f"agreement.model.r_{name}") for name in ("within", "between"))
-    apart = _apart(inside, across)
-    if within * between >= 0 and not apart:
+    disjoint = _disjoint(inside, across)
+    if within * between >= 0 and not disjoint:
         return []
     r = by_id.get("agreement.pearson_r")
     whole = (
@@ -147,7 +147,7 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
         f"{whole}inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
     )
     opposed = by_id.get("agreement.model.opposed")
-    if apart:
+    if disjoint:
         text += "; without the noise of counting their intervals do not meet"
     elif opposed is not None and opposed.value is not None:
         text += f"; that the signs really differ has a probability of {opposed.value:.2f}"
@@ -156,7 +156,7 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
     return [("agreement.pearson_r", text)]
 
 
-def _apart(first: Measurement | None, second: Measurement | None) -> bool:
+def _disjoint(first: Measurement | None, second: Measurement | None) -> bool:
     """Whether two numbers have intervals that do not meet."""
     if first is None or second is None or first.interval is None or second.interval is None:
         return False

@@ -183,7 +183,7 @@ def _from_benchmark(
 
 def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
     """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
-    apart = unpaired_keys(rows)
+    unpaired = unpaired_keys(rows)
     return [
         Exclusion(episode=row.episode, scope="agreement", reason=reason)
         for row in rows
@@ -192,7 +192,9 @@ def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
             ("sim_planned is unknown", row.sim_planned is None),
         )
         if lacks
-        and ((row.task, row.condition, row.policy) not in apart or row.recorded == row.sim_planned)
+        and (
+            (row.task, row.condition, row.policy) not in unpaired or row.recorded == row.sim_planned
+        )
     ]
 
 

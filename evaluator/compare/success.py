@@ -52,8 +52,8 @@ def unpaired_keys(rows: Iterable[TrialRow]) -> set[Key]:
     for row in rows:
         known = (row.recorded is not None, row.sim_planned is not None)
         seen.setdefault((row.task, row.condition, row.policy), set()).add(known)
-    apart = {(True, False), (False, True)}
-    return {key for key, known in seen.items() if apart <= known and (True, True) not in known}
+    one_sided = {(True, False), (False, True)}
+    return {key for key, known in seen.items() if one_sided <= known and (True, True) not in known}
 
 
 def trials_in(rows: Iterable[TrialRow]) -> int:
@@ -197,11 +197,9 @@ def rate_groups(
             sim=sim,
         )
         if not both and recorded.n and sim.n:  # each side has trials of its own
-            rates_apart = fraction_of(recorded), fraction_of(sim)
+            own_rates = fraction_of(recorded), fraction_of(sim)
             names = (*recorded.episodes, *sim.episodes)
-            groups.append(
-                group(recorded_rate=rates_apart[0], sim_rate=rates_apart[1], episodes=names)
-            )
+            groups.append(group(recorded_rate=own_rates[0], sim_rate=own_rates[1], episodes=names))
             continue
         groups.append(
             group(

@@ -40,7 +40,8 @@ METHOD_NAMES = {
 def _brackets(shown: Sequence[Measurement]) -> str:
     """Name the intervals that stand in brackets, and say that some are left out if they are."""
     found = [m.interval.method for m in shown if m.interval is not None]
-    names = " and ".join(METHOD_NAMES.get(name, name) for name in dict.fromkeys(found))
+    known = {name: METHOD_NAMES.get(name.removeprefix("mean-"), name) for name in found}
+    names = " and ".join(dict.fromkeys(known.values()))
     text = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
     if any("; use " in (m.reason_without_interval or "") for m in shown):
         text += " One that would cover too little is left out; measurements say which to use."

@@ -299,8 +299,10 @@ def test_a_published_tum_folder_keeps_the_distances_between_its_times(
         def put(self, data: bytes, *, source_ns: int) -> None:
             self._sent.append(source_ns)
 
+    from bridge.sources.folder import publish
     from bridge.sources.folder.publish import FolderSource
 
+    monkeypatch.setattr(publish, "announce", lambda *_: None)
     session = Session()
     slept_s = [0.0]
     now_s = time.monotonic()

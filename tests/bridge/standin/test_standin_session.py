@@ -229,7 +229,8 @@ def test_both_conditions_share_start_ids_but_not_the_exact_poses(
 
 
 def listed(name: str, condition: str = "", start_seed: int = 0) -> dict[str, str]:
-    return {"id": name, "condition": condition, "start_id": f"cube_into_box/{start_seed}"}
+    start_id = f"cube_into_box/{start_seed}"
+    return {"id": name, "condition": condition, "start_id": start_id, "policy": "perturbed"}
 
 
 def test_a_second_session_goes_on_with_the_numbering_of_the_run(

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,9 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         return [draw(like(schema.get("items", True), root, odd=odd)) for _ in range(size)]
     if kind == "string":
         pattern = schema.get("pattern")
-        return draw(st.sampled_from(["ab", "c_1"]) if pattern else st.text("ab", min_size=1))
+        if pattern is None:
+            return draw(st.text("ab", min_size=1))
+        return draw(st.sampled_from([t for t in ("ab", "c_1", "0a" * 32) if re.search(pattern, t)]))
     if kind == "number":
         most, below = schema.get("maximum", 9), schema.get("exclusiveMaximum", 10)
         fitting = [n for n in (0.05, 0.25, 0.5, *range(1, 10)) if n <= most and n < below]

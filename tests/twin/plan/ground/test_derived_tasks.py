@@ -189,7 +189,7 @@ def test_what_was_not_localised_ends_with_1_and_writes_nothing(
     ("text", "said"),
     [
         ("put the green cube into the box", "no green cube here. There is: cube"),
-        ("", "the instruction is empty"),
+        ("   ", "the instruction is empty"),
         ("juggle the cube", "nothing this robot can do"),
         ("put the cube into the box; $(reboot)", "not understood"),
         ("no_such_task", "no task named"),
