@@ -33,6 +33,8 @@ class Shape:
     """How far the surface may be off."""
     sdf: SdfGrid | None = None
     """Distances to it in its own frame, where the rebuilt scene has them."""
+    parts_m: Mapping[str, Float[np.ndarray, "num_points 3"]] = field(default_factory=dict)
+    """Points of its parts in its own frame, by their names in the rebuilt scene."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,10 +20,13 @@ from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.plan.problem import Problem, Shape
 from twin.replay.rebuilt_scene import MOST_OFF, RebuiltScene, read_rebuilt_scene
 from twin.robot.model import load_robot
+from twin.scene.gaussians import read_ply
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import shape_mesh
+from twin.scene.semantics.store import BACKGROUND_KEY, SEMANTICS_FILE, read_semantics
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
+from twin.scene.store.folder import SPLATS, read_record
 
 GUESSED_SHARE = 0.1
 """Of its largest extent, a scanned object may be off that no scan has shown yet."""
@@ -78,15 +81,47 @@ def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
         scene_dir: The rebuilt scene; None: there is none.
         task: Its nominal shapes stand in for what the scene lacks.
     """
+    if scene_dir is None:
+        return {
+            key: _task_shape(model, "task file: there is no scene")
+            for key, model in task.objects.items()
+        }
+    taken = {str(table["grasp"]) for table in task.stages if "part" in table}
     return {
-        key: _task_shape(model, "task file: there is no scene")
-        if scene_dir is None
-        else _shape_of(scene_dir / "objects" / key, model)
+        key: _shape_of(scene_dir, key, model, with_parts=key in taken)
         for key, model in task.objects.items()
     }
 
 
-def _shape_of(folder: Path, model: ObjectModel) -> Shape:
+def _parts_of(scene_dir: Path, key: str) -> dict[str, Float[np.ndarray, "num_points 3"]]:
+    """Middles of the Gaussians of each part, in the object's frame; none where there are none.
+
+    Raises:
+        UnreadableSemanticsError: Parts that are there cannot be read.
+        UnreadablePlyError: Likewise the Gaussians.
+    """
+    if not (scene_dir / SEMANTICS_FILE).is_file():
+        return {}
+    record = read_record(RunFolder(path=scene_dir.parent))
+    if record is None:
+        return {}
+    rows = {BACKGROUND_KEY: int(record["background"]["num_splats"])}
+    rows |= {name: int(about["num_splats"]) for name, about in record["objects"].items()}
+    if key not in rows:
+        return {}
+    scene = read_semantics(scene_dir, rows)
+    first = sum(count for name, count in list(rows.items())[: list(rows).index(key)])
+    own = slice(first, first + rows[key])
+    middles_m = read_ply(scene_dir / "objects" / key / SPLATS).means_m
+    about = max(scene.instances, key=lambda item: int(item.mask[own].sum()), default=None)
+    if about is None:
+        return {}
+    found = {name: middles_m[mask[own]].astype(np.float64) for name, mask in about.parts.items()}
+    return {name: points for name, points in found.items() if len(points)}
+
+
+def _shape_of(scene_dir: Path, key: str, model: ObjectModel, *, with_parts: bool) -> Shape:
+    folder = scene_dir / "objects" / key
     if not (folder / MESH).is_file():
         return _task_shape(model, "task file: the scene has no mesh of it")
     try:
@@ -109,12 +144,14 @@ def _shape_of(folder: Path, model: ObjectModel) -> Shape:
     known_low, known_high = _extents(model)
     off = float(np.max(np.abs((high - low) / (known_high - known_low) - 1.0)))
     source_text = f"scan ({source})"
+    parts_m = _parts_of(scene_dir, key) if with_parts else {}
     if model.shape != SCANNED:
         if off > MOST_OFF:
             return _task_shape(model, f"task file: an extent of the scene's mesh is {off:.0%} off")
         shift = (known_low + known_high - low - high) / 2
         shift[2] = known_low[2] - low[2]  # it stands on the table
         vertices = vertices + shift
+        parts_m = {name: points + shift for name, points in parts_m.items()}
         source_text += f", moved by {np.linalg.norm(shift) * 1e3:.1f} mm onto the task's shape"
     return Shape(
         vertices_m=vertices,
@@ -122,6 +159,7 @@ def _shape_of(folder: Path, model: ObjectModel) -> Shape:
         source=source_text,
         trusted_from_m=float(vertices[:, 2].min()) + truncation_m,
         error_m=voxel_m,
+        parts_m=parts_m,
     )
 
 

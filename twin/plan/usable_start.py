@@ -1,4 +1,4 @@
-"""What of a start makes planning pointless, said in a sentence before anything is searched."""
+"""What of a start makes planning pointless, said before anything is searched."""
 
 from typing import Any
 

@@ -50,7 +50,7 @@ def problem_of_test() -> Problem:
 
 def reply(*path: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A reply with these constraints on the way."""
-    record = valid_reply()
+    record: dict[str, Any] = valid_reply()
     for stage in record["stages"]:
         stage |= {"subgoal": [], "path": [], **more}
     record["stages"][1]["path"] = list(path)

@@ -43,10 +43,10 @@ def placed(name: str, *p_m: float, scale: float = 1.0) -> Change:
     return change
 
 
-def sized(name: str, *size_m: float) -> Change:
+def sized(name: str, x_m: float, y_m: float, z_m: float) -> Change:
     def change(problem: Problem) -> Problem:
         task = problem.scene.task
-        model = replace(task.objects[name], size_m=size_m)
+        model = replace(task.objects[name], size_m=(x_m, y_m, z_m))
         task = replace(task, objects={**task.objects, name: model})
         return replace(scene_with(task=task)(problem), shapes=shapes_of(None, task))
 
@@ -115,7 +115,7 @@ def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:
     run.scene_dir.mkdir()
 
     def made_of(name: str) -> None:
-        record = dict.fromkeys(NEEDED, "") | {"schema_version": SCENE_VERSION}
+        record: dict[str, Any] = {**dict.fromkeys(NEEDED, ""), "schema_version": SCENE_VERSION}
         record["sources"] = [{"id": name}]
         (run.scene_dir / SCENE_FILE).write_text(json.dumps(record))
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.check import TABLE
+from bridge.task.check import TABLE, nearest
 from bridge.task.plan import Plan
 from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
 from twin.plan.constrain.kinds import compile_constraint
@@ -326,7 +326,8 @@ class _Options:
     ) -> None:
         self._problem, self._key, self._policy = problem, key, policy
         self._seed, self._steer = seed, steer
-        found = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed)).search(key)
+        searcher = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed))
+        found = searcher.search(key, _part_points(problem, key))
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
         self._grasps = self._ordered(kept)[: policy.grasps]
@@ -432,6 +433,28 @@ class _Options:
             + "; ".join(release.checked_against),
             f"{self._key}: {postures:.0f} postures looked at on the way",
         )
+
+
+def _part_points(problem: Problem, key: str) -> Float[np.ndarray, "num_points 3"] | None:
+    """Points of the part that the task grasps an object by; None: it names none.
+
+    Raises:
+        NoPlanError: The scene has no such part.
+    """
+    tables = (table for table in problem.scene.task.stages if table.get("grasp") == key)
+    part = next((str(table["part"]) for table in tables if "part" in table), None)
+    if part is None:
+        return None
+    shape = problem.shapes[key]
+    if part in shape.parts_m:
+        return shape.parts_m[part]
+    known = f"It has: {', '.join(shape.parts_m)}." if shape.parts_m else "It has none of it."
+    message = (
+        f"task {problem.scene.task.name} takes {key} by its {part}, and the scene has no such part "
+        f"of it (its surface: {shape.source}). {known}{nearest(part, shape.parts_m)} Leave the "
+        "part out, or scan and rebuild the scene: robot-gst rebuild RUN."
+    )
+    raise NoPlanError(message)
 
 
 def _subgoals(problem: Problem, key: str, verb: str) -> list[Constraint]:
