@@ -50,8 +50,8 @@ class SessionConfig:
     first_probe: int | None = None
     """Number of the first probe's episode; without it the run's numbering goes on."""
     planner: str = BUILT_IN
-    """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan (robot-gst
-    plan RUN --live)."""
+    """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan
+    (robot-gst plan RUN --live)."""
     policy: str = ""
     """How it plans; empty: perturbed for the built-in planner, nominal for one on the wire."""
     planner_timeout_s: float = 600.0

@@ -71,15 +71,18 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         size = max(0, size + draw(st.sampled_from([0] * 9 + [-1, 1]))) if odd else size
         return [draw(like(schema.get("items", True), root, odd=odd)) for _ in range(size)]
     if kind == "string":
-        pattern = schema.get("pattern")
-        if pattern is None:
-            return draw(st.text("ab", min_size=1))
-        return draw(st.sampled_from([t for t in ("ab", "c_1", "0a" * 32) if re.search(pattern, t)]))
+        return draw(_text(schema.get("pattern")))
     if kind == "number":
         most, below = schema.get("maximum", 9), schema.get("exclusiveMaximum", 10)
         fitting = [n for n in (0.05, 0.25, 0.5, *range(1, 10)) if n <= most and n < below]
         return draw(st.sampled_from(fitting))
     return draw({"integer": st.integers(1, 9), "boolean": st.booleans(), "null": st.none()}[kind])
+
+
+def _text(pattern: str | None) -> st.SearchStrategy[str]:
+    if pattern is None:
+        return st.text("ab", min_size=1)
+    return st.sampled_from([t for t in ("ab", "c_1", "0a" * 32) if re.search(pattern, t)])
 
 
 @st.composite

@@ -116,6 +116,7 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
     assert "image" not in json.dumps(server.asked[0]["messages"][1])
 
 
+@pytest.mark.slow
 def test_an_image_leaves_where_that_is_asked_for(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:

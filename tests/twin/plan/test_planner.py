@@ -73,6 +73,7 @@ def test_the_twin_accepts_the_first_plan(problem: Problem) -> None:
     assert plan.tau[-1].joints_rad == pytest.approx(HOME, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_order_of_candidates_is_that_of_a_longer_list(problem: Problem) -> None:
     """Asked for two or for one, the first is the same to the byte; no two are alike."""
     proposer = PlanProposer(QUICK)
@@ -95,6 +96,7 @@ def test_a_refused_grasp_gives_another_grasp(problem: Problem) -> None:
     assert away_m > 0.01 or turned > np.radians(10)
 
 
+@pytest.mark.slow
 def test_a_refused_release_keeps_the_grasp(problem: Problem) -> None:
     first = chosen(problem, 0)
     touches = Factor(value=False, cause="contact", bodies=("cube", "box"))

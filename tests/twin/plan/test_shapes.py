@@ -179,6 +179,7 @@ def test_parts_of_the_scene_are_where_the_surface_is(tmp_path: Path, task: Task)
     assert shapes_of(folder, task)["cube"].parts_m == {}
 
 
+@pytest.mark.slow
 def test_a_part_restricts_the_grasp_or_is_said_to_be_missing(tmp_path: Path, task: Task) -> None:
     folder = written(tmp_path / "scene", task)
     sure = {name: np.eye(6) * 1e-8 for name in task.objects}
