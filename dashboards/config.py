@@ -89,8 +89,8 @@ class DemoConfig:
     """Tasks of the trials, names or files: without and with replanning by the cell's own planner.
     The first one is scanned. Default: cube_into_box and cube_on_block; --quick: the first."""
     policies: tuple[str, ...] = ()
-    """Policies that try every task too, without replanning, as in robot-gst plan --live.
-    Default: geometric; --quick: none."""
+    """Policies that try every task too, without replanning, as in robot-gst plan --live, such as
+    nominal. Default: none."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
@@ -109,8 +109,7 @@ class DemoConfig:
     @property
     def other_policies(self) -> tuple[str, ...]:
         """Policies that are not the cell's own planner's."""
-        asked = self.policies or (() if self.quick else ("geometric",))
-        return tuple(each for each in asked if each != BUILT_IN_POLICY)
+        return tuple(each for each in self.policies if each != BUILT_IN_POLICY)
 
     @property
     def trials(self) -> int:

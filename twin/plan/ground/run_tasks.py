@@ -1,5 +1,6 @@
 """What a run says an instruction can be about, and the task that comes of it."""
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,7 +70,20 @@ def understand(run: RunFolder, words: str) -> UnderstoodTask:
         return UnderstoodTask(file=file, grounding=None)
     base = task_files_of(run)
     grounding = ground(words, vocabulary_of_run(run, base))
-    return UnderstoodTask(file=derive_task(grounding, base), grounding=grounding)
+    return UnderstoodTask(file=derive_task(grounding, _shown(grounding, base)), grounding=grounding)
+
+
+def _shown(grounding: Grounding, base: Sequence[TaskFile]) -> Sequence[TaskFile]:
+    """The smallest task with all that an instruction is about: its episodes show just its objects.
+
+    With several tasks in a run no episode shows the objects of all; only an instruction about
+    objects of several tasks needs them.
+    """
+    limits = [dict(limit.constraint) for limit in grounding.path]
+    text = json.dumps([[dict(goal) for goal in grounding.goals], grounding.order, limits])
+    about = {key for file in base for key in file.task().objects if f'"{key}"' in text}
+    holding = [file for file in base if about <= set(file.task().objects)]
+    return base if not holding else [min(holding, key=lambda file: len(file.task().objects))]
 
 
 def keep(run: RunFolder, understood: UnderstoodTask) -> Path | None:

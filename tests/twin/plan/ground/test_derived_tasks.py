@@ -185,6 +185,18 @@ def test_what_was_not_localised_ends_with_1_and_writes_nothing(
     assert sorted(run.path.rglob("*")) == before
 
 
+def test_objects_that_only_another_task_shows_are_no_part_of_the_derived_one(
+    run: RunFolder,
+) -> None:
+    other = TaskFile.read(datasets_folder() / "tasks" / "cube_on_block.toml")
+    with EpisodeWriter(run.episodes_dir / "c.mcap") as writer:
+        writer.describe(EpisodeInfo(id="c", kind="trial", task=other.task().name))
+        writer.attach(ATTACHMENT, other.data, media_type=MEDIA_TYPE, log_time_ns=1)
+    assert set(understand(run, "put the cube into the box").file.task().objects) == {"cube", "box"}
+    onto = understand(run, "put the cube on the block").file.task()
+    assert set(onto.objects) == set(other.task().objects)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
