@@ -87,7 +87,7 @@ class DemoConfig:
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: tuple[str, ...] = ()
     """Tasks of the trials, names or files: without and with replanning by the cell's own planner.
-    The first one is scanned. Default: cube_into_box and cube_on_block; --quick: the first."""
+    The first one is scanned. Default: cube_into_box."""
     policies: tuple[str, ...] = ()
     """Policies that try every task too, without replanning, as in robot-gst plan --live, such as
     nominal. Default: none."""
@@ -103,8 +103,7 @@ class DemoConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """Tasks of the trials."""
-        both = ("cube_into_box", "cube_on_block")
-        return self.task or (both[:1] if self.quick else both)
+        return self.task or ("cube_into_box",)
 
     @property
     def other_policies(self) -> tuple[str, ...]:
