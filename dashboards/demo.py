@@ -324,35 +324,31 @@ def _record_trials(
     output: Output,
 ) -> None:
     connect, logs = ["--connect", endpoint], run.notes_dir / "logs"
-    for number, group in enumerate(groups_of(config)):
-        count = len(set(missing) & set(group.trials(config)))
-        if not count:
-            continue
-        words = [*standin, "--task", group.chosen, "--trials", str(config.trials)]
-        words += ["--no-scan", "--ask-always", "--missing", "--policy", group.policy]
-        words += [word for each in group.conditions for word in ("--conditions", each)]
-        how = "and with " if len(group.conditions) > 1 else ""
-        label = (
-            f"4/6 {count} trials of {Path(group.chosen).stem} by the policy {group.policy}, "
-            f"{config.trials} starts without {how}replanning"
-        )
-        # A session's clock runs faster than the wall's, and the next one starts at the wall's: for
-        # a gate that has heard the first one, the second one is in the past.
-        with ExitStack() as stack:
-            there = [recorder, _ready(stack, ["gate", str(run.path), *connect], logs, number)]
+    gate_log, planner_log = logs / "gate.log", logs / "plan.log"
+    left = [(each, len(set(missing) & set(each.trials(config)))) for each in groups_of(config)]
+    with ExitStack() as stack:
+        gate = stack.enter_context(running(["gate", str(run.path), *connect], gate_log))
+        gate.wait_until(lambda: "ready" in gate_log.read_text(errors="replace"))
+        there = [recorder, gate]
+        if any(count and group.policy != BUILT_IN_POLICY for group, count in left):
+            live = ["plan", str(run.path), "--live", *connect]
+            planner = stack.enter_context(running(live, planner_log))
+            planner.wait_until(lambda: "ready" in planner_log.read_text(errors="replace"))
+            there.append(planner)
+        for group, count in left:
+            if not count:
+                continue
+            words = [*standin, "--task", group.chosen, "--trials", str(config.trials)]
+            words += ["--no-scan", "--ask-always", "--missing", "--policy", group.policy]
+            words += [word for each in group.conditions for word in ("--conditions", each)]
             if group.policy != BUILT_IN_POLICY:
                 words += ["--planner", "wire"]
-                live = ["plan", str(run.path), "--live", *connect]
-                there.append(_ready(stack, live, logs, number))
+            how = "and with " if len(group.conditions) > 1 else ""
+            label = (
+                f"4/6 {count} trials of {Path(group.chosen).stem} by the policy {group.policy}, "
+                f"{config.trials} starts without {how}replanning"
+            )
             step(output, label, words, *there)
-
-
-def _ready(stack: ExitStack, words: list[str], logs: Path, number: int) -> Background:
-    """Start a command of one session, with a log of its own, and wait until it is ready."""
-    log = logs / f"{words[0]}_{number}.log"
-    started = stack.enter_context(running(words, log))
-    started.wait_until(lambda: "ready" in log.read_text(errors="replace"))
-    return started
 
 
 def _scene(run: RunFolder) -> Mapping[str, Any]:
