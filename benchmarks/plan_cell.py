@@ -3,26 +3,21 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, load_task
 from twin.plan.problem import Grasp, Problem, Shape
 from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
+from twin.scene.objects.decompose import shape_mesh
 
 
-def box_shape(size_m: tuple[float, ...]) -> Shape:
+def box_shape(size_m: tuple[float, float, float]) -> Shape:
     """A box as a closed mesh."""
-    corners = box_corners(np.array(size_m))
-    hull = ConvexHull(corners)
-    triangles = hull.simplices.copy()
-    a, b, c = (corners[triangles[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return Shape(vertices_m=corners, triangles=triangles, source="task file")
+    model = ObjectModel(id="box", shape="box", size_m=size_m, color_srgb=(0, 0, 0))
+    vertices, triangles = shape_mesh(model)
+    return Shape(vertices_m=vertices, triangles=triangles, source="task file")
 
 
 def upright(x: float, y: float, z: float, yaw_rad: float = 0.0) -> np.ndarray:

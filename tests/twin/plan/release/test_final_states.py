@@ -6,10 +6,8 @@ import coal
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.plan.constrain.bodies import surface_points
@@ -23,6 +21,7 @@ from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of, signed_distance
 from twin.robot.model import load_robot
+from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 from twin.scene.shape.static import StaticSdf
 
@@ -30,14 +29,10 @@ SURE = np.diag([1e-8] * 6)
 QUICK = ReleaseConfig(num_starts=6, num_ways=2, num_samples=256)
 
 
-def box_shape(size_m: tuple[float, ...]) -> Shape:
-    corners = box_corners(np.array(size_m))
-    hull = ConvexHull(corners)
-    triangles = hull.simplices.copy()
-    a, b, c = (corners[triangles[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return Shape(vertices_m=corners, triangles=triangles, source="test")
+def box_shape(size_m: tuple[float, float, float]) -> Shape:
+    model = ObjectModel(id="box", shape="box", size_m=size_m, color_srgb=(0, 0, 0))
+    vertices, triangles = shape_mesh(model)
+    return Shape(vertices_m=vertices, triangles=triangles, source="test")
 
 
 def upright(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
