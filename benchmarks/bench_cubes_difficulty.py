@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_lab_difficulty import as_published, laboratory
+from bench_lab_difficulty import as_published, laboratory, planned
 
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR, draw_errors, perceive, plan_pick_and_place
+from bridge.sources.standin.planner import NO_ERROR, draw_errors, perceive
 from bridge.sources.standin.settings import SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
@@ -41,17 +41,7 @@ def trial(cell: StandinCell, start_seed: int, *, errs: bool) -> dict[str, Any]:
     drawn = draw_errors(noise, count, start_seed=start_seed, round_=0)
     row: dict[str, Any] = {"start": start_seed}
     try:
-        plan = plan_pick_and_place(
-            task,
-            seen,
-            drawn if errs else NO_ERROR,
-            kinematics=cell.kinematics,
-            joints_start_rad=cell.home_rad,
-            max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
-            plan_id="plan",
-            condition="without_replanning",
-            start_id="start",
-        )
+        plan = planned(cell, seen, drawn if errs else NO_ERROR)
     except UnreachablePoseError as error:
         return row | {"result": "failure", "k": 0, "cause": "no plan", "detail": str(error)}
     cell.truth.clear()

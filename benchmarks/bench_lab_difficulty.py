@@ -14,6 +14,7 @@ import argparse
 import json
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
+from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
 from bridge.sources.standin.settings import SEEDS_PER_SESSION
 from bridge.sources.standin.streams import Streams
 from bridge.task.plan import Plan
@@ -121,12 +122,16 @@ def trial(cell: StandinCell, start_seed: int, lab: int | None = None) -> dict[st
     }
 
 
-def planned(cell: StandinCell, perceived: dict[str, np.ndarray]) -> Plan:
-    """The scripted plan, without an error of its own."""
+def planned(
+    cell: StandinCell,
+    perceived: dict[str, np.ndarray],
+    errors: GraspError | Sequence[GraspError] = NO_ERROR,
+) -> Plan:
+    """The scripted plan; without errors of its own unless some are given."""
     return plan_pick_and_place(
         cell.task,
         perceived,
-        NO_ERROR,
+        errors,
         kinematics=cell.kinematics,
         joints_start_rad=cell.home_rad,
         max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
