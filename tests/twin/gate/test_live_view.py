@@ -7,8 +7,14 @@ from live_cell import IMAGE, S, calibrate, event, look, place, shoot
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact
-from bridge.episode.cdr.messages import CompressedColor, DepthImage, PoseSample, string_to_cdr
-from twin.scene.localise.live import KEPT_IMAGES, LiveView
+from bridge.episode.cdr.messages import (
+    CompressedColor,
+    DepthImage,
+    JointSample,
+    PoseSample,
+    string_to_cdr,
+)
+from twin.scene.localise.live import KEPT_IMAGES, SET_BACK_SAMPLES, LiveView
 
 
 def ready() -> LiveView:
@@ -172,3 +178,55 @@ def test_the_robot_description_is_remembered() -> None:
     told = LiveView("standin", urdf='<robot name="panda"/>')
     told.take("/robot_description", string_to_cdr("<robot/>"), 0)
     assert told.urdf() == '<robot name="panda"/>'
+
+
+def feel(view: LiveView, stamp_ns: int, count: int = 1) -> None:
+    """Joint states of an arm, 8 ms apart."""
+    for k in range(count):
+        sample = JointSample(
+            stamp_ns=stamp_ns + k * S // 125,
+            names=("a", "b"),
+            position=np.array([0.0, 1.0]),
+            velocity=np.zeros(0),
+            effort=np.zeros(0),
+        )
+        view.take("/standin/joint_states", sample.to_cdr(), 0)
+
+
+def test_a_cell_that_starts_again_with_its_clock_set_back_is_seen_as_it_is_now() -> None:
+    """The stand-in runs faster than the wall's clock, and each session starts by that."""
+    view = ready()
+    place(view, 49 * S, topic="/tf")
+    shoot(view, 50 * S)
+    event(view, "execution_ended", 49 * S)
+    feel(view, 50 * S)
+    feel(view, S, SET_BACK_SAMPLES)
+    assert view.newest_ns() == S + (SET_BACK_SAMPLES - 1) * S // 125
+    assert look(view).frames == []  # what the old clock showed is no longer there to be seen
+    shoot(view, 3 * S)
+    feel(view, 3 * S)
+    assert [frame.stamp_ns for frame in look(view).frames] == [3 * S]
+    assert view.newest_ns() == 3 * S
+
+
+def test_late_joint_states_and_those_of_another_publisher_do_not_set_the_clock_back() -> None:
+    view = ready()
+    shoot(view, 50 * S)
+    feel(view, 50 * S)
+    for k in range(4):  # an old recording is played beside the arm, three times as fast
+        feel(view, S + k * S, SET_BACK_SAMPLES - 1)
+        feel(view, 50 * S + k)
+    assert view.newest_ns() == 50 * S + 3
+    assert look(view).frames
+    feel(view, S, SET_BACK_SAMPLES - 1)
+    heard = view.joints()
+    assert heard is not None
+    assert view.newest_ns() - heard.stamp_ns > 40 * S  # the gate refuses joints of that age
+
+
+def test_an_execution_goes_on_when_the_clock_is_set_back() -> None:
+    view = ready()
+    feel(view, 50 * S)
+    event(view, "execution_started", 50 * S)
+    feel(view, S, 2 * SET_BACK_SAMPLES)
+    assert view.executing() == "plan_1"

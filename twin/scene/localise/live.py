@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from bridge.clock import STEP_NS
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -209,6 +210,9 @@ def _frame(
 KEPT_TRANSFORMS = 1000
 KEPT_JOINTS = 2000
 """Four seconds of a robot that sends at 500 Hz."""
+SET_BACK_SAMPLES = 25
+"""So many joint states of the arm in a row from before the newest: the cell's clock was set back.
+Fewer may be late, or another publisher's that speaks in between."""
 MAX_CAMERAS = 16
 MAX_FRAMES = 1000
 """Static frames; a flood of names must not fill the memory."""
@@ -262,6 +266,8 @@ class LiveView:
         self._executing: str | None = None
         self._quiet_since_ns = 0
         self._newest_ns = 0
+        self._newest_joint_ns = 0
+        self._num_behind = 0
         self._heard_ns = 0
         self.malformed = 0
 
@@ -304,6 +310,8 @@ class LiveView:
 
     def _take_joints(self, data: bytes, received_ns: int) -> None:
         sample = JointSample.from_cdr(data)
+        if self._is_of_arm(sample.names):
+            self._watch_clock(sample.stamp_ns)
         self._joints.append(data)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         # A gripper may publish beside the arm: it does not take the arm's place.
@@ -315,6 +323,27 @@ class LiveView:
                 stamp_ns=sample.stamp_ns,
                 received_ns=received_ns,
             )
+
+    def _watch_clock(self, stamp_ns: int) -> None:
+        """Notice a clock that was set back: a cell started again, a simulation from its start.
+
+        What was seen by the old clock would be younger than all that follows, so it is forgotten,
+        as tf2 clears its buffer when time jumps back. An execution that is running goes on.
+        """
+        if stamp_ns >= self._newest_joint_ns - STEP_NS:
+            self._num_behind = 0
+            self._newest_joint_ns = max(self._newest_joint_ns, stamp_ns)
+            return
+        self._num_behind += 1
+        if self._num_behind < SET_BACK_SAMPLES:
+            return
+        self._num_behind = 0
+        self._newest_joint_ns = self._newest_ns = self._quiet_since_ns = stamp_ns
+        self._joints.clear()
+        self._moving.clear()
+        for camera in self._cameras.values():
+            camera.colors.clear()
+            camera.depths.clear()
 
     def _is_of_arm(self, names: Sequence[str]) -> bool:
         """Whether joint states name the whole arm; before its description, as many as ever."""
