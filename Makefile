@@ -17,7 +17,7 @@ DEMO_READY := .venv/.demo
 WITHOUT := $(filter no,$(TORCH))
 READY := .venv/.ready$(if $(WITHOUT),-no-torch)
 PYTEST := $(if $(WITHOUT),PYTHONPATH=.ci )$(BIN)/python -m pytest $(if $(WITHOUT),-p no_torch )-q
-NATIVE := $(wildcard twin/scene/native/* bridge/media/native/* bridge/episode/native/* twin/physics/native/* twin/replay/native/*)
+NATIVE := $(wildcard bridge/*/native/* twin/*/native/* twin/*/*/native/*)
 RUN ?= runs/demo
 BENCH ?=
 export OMP_WAIT_POLICY ?= passive
