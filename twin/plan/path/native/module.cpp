@@ -173,7 +173,7 @@ public:
         pair.kind = what;
         pair.other = other;
         pair.limit = limit;
-        world_.pairs.push_back(std::move(pair));
+        world_.pairs.push_back(pair);
     }
 
     void prepare() { world_.prepare(); }
@@ -307,7 +307,7 @@ private:
 
 }  // namespace
 
-NB_MODULE(_motion, module) {
+NB_MODULE(_motion, module) {  // NOLINT(performance-unnecessary-value-param): nanobind's
     module.doc() = "Paths of a serial arm: search, shortcuts, times.";
     nb::class_<Motion>(module, "Motion")
         .def(nb::init<const Frames&, const Matrix&, const Flags&, const Doubles&, const Doubles&,

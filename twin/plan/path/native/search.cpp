@@ -56,7 +56,8 @@ public:
     void draw(std::int64_t round, double* row) {
         constexpr double kAround = 0.8;
         constexpr std::int64_t kRounds = 60;
-        const double around = kAround * static_cast<double>(1 + round / kRounds);
+        const std::int64_t grown = round / kRounds;  // whole steps
+        const double around = kAround * static_cast<double>(1 + grown);
         for (std::size_t j = 0; j < low_.size(); ++j) {
             const double low = std::max(low_[j] - around, world_.joints[j].lower);
             const double high = std::min(high_[j] + around, world_.joints[j].upper);
