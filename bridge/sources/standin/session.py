@@ -126,6 +126,8 @@ class StandinSource:
             stop: Looked at every 8 ms of the cell's time; the open episode is then finished.
             output: For progress and remarks.
         """
+        # Without an answer to @clock: the stamps are simulated time, not that of this host.
+        session.declare_alive(f"{self.config.cell}/alive")
         return run_session(session, self.config, output, should_stop=stop.is_set)
 
 

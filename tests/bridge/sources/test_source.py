@@ -19,6 +19,7 @@ from bridge.sources.ur.config import UrConfig
 from bridge.sources.ur.publish import UrSource
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
+from bridge.wire.session import open_session
 
 INDEX = FolderIndex.__new__(FolderIndex)
 vars(INDEX)["name"] = "kitchen"
@@ -64,3 +65,12 @@ def test_a_source_ends_by_a_signal_or_when_its_time_is_over(
     result = run_source(source, wire, Output(verbose=True), duration_s=duration_s)
     assert result == {"stopped": True}
     assert "waiting publishes /lab/event" in capsys.readouterr().err
+
+
+def test_the_stand_in_says_that_it_is_alive() -> None:
+    endpoint = free_endpoint()
+    idle = SessionConfig(cell="lab", task="cube_into_box", scan=False, trials=0)
+    with open_session(WireConfig(mode="router", listen=(endpoint,), connect=())) as recorder:
+        with open_session(WireConfig(connect=(endpoint,))) as client:
+            StandinSource(idle).run(client, threading.Event(), Output(quiet=True))
+            assert recorder.query_alive("**") == ["lab/alive"]
