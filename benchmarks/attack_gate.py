@@ -28,7 +28,9 @@ from measure import ROOT, Target, report_targets
 from plan_mutations import FAMILIES, mutated
 from plan_oracle import Cell, Oracle
 
-TASK, CELL = "cube_into_box", "standin"
+CELL, FIRST = "standin", "cube_into_box"
+NUM_PLANS = {"cube_into_box": 10_000, "push_cube_to_mark": 1_000}
+"""By task: how many are enough."""
 SEED = 700
 """Of the stand-in session that plays the cell."""
 NUM_BASES = 12
@@ -38,7 +40,8 @@ ENDPOINT = "tcp/127.0.0.1:17447"
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("plans", nargs="?", type=int, default=10_000)
+    parser.add_argument("plans", nargs="?", type=int, help="else as many as are enough")
+    parser.add_argument("--task", choices=list(NUM_PLANS), default=FIRST)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--endpoint", default=ENDPOINT, help="on this machine alone")
     parser.add_argument("--max-s", type=float, default=1e9, help="stop asking after so long")
@@ -82,12 +85,13 @@ class Stage:
     """The cell as it is played, and plans that are fine in it."""
 
     run: Path
+    task: str
     messages: list[Any]
     oracle: Oracle
     bases: list[dict[str, Any]]
 
 
-def prepare(folder: Path) -> Stage:
+def prepare(folder: Path, task_name: str) -> Stage:
     """Record a trial unless it is there, localise its objects, and plan from where the arm is."""
     from cell_run import record_ungated
 
@@ -103,13 +107,13 @@ def prepare(folder: Path) -> Stage:
 
     path = folder / "run"
     run = RunFolder.open(path) if path.is_dir() else RunFolder.create(path)
-    episode = Episode.open(record_ungated(run, TASK, SEED, 1)[0])
+    episode = Episode.open(record_ungated(run, task_name, SEED, 1, cell_file=CELL)[0])
     ((stamp_ns, _),) = streams.plans(episode)
     messages = [m for m in episode.messages() if m.log_time_ns < stamp_ns and not is_truth(m.topic)]
     view = LiveView(CELL)
     for message in messages:
         view.take(message.topic, message.data, message.log_time_ns, message.type_name)
-    task = load_task(TASK)
+    task = load_task(task_name)
     frames = view.frames(max_age_ns=5 * 10**9, max_per_camera=3).frames
     found = look(Look(run_path=run.path, frames=frames, task=task))
     poses = {name: item.T_base_object for name, item in found.items()}
@@ -128,7 +132,7 @@ def prepare(folder: Path) -> Stage:
             max_width_m=MAX_WIDTH_M,
         )
     )
-    return Stage(run.path, messages, oracle, plans_from(task, poses, start))
+    return Stage(run.path, task_name, messages, oracle, plans_from(task, poses, start))
 
 
 def plans_from(task: Any, poses: Any, start: np.ndarray) -> list[dict[str, Any]]:
@@ -169,7 +173,7 @@ def gate_of(stage: Stage, endpoint: str, log: Path) -> Iterator[Any]:
     from bridge.wire.session import open_session
 
     wire = WireConfig(mode="router", connect=(), listen=(endpoint,))
-    command = ["gate", str(stage.run), "--cell", CELL, "--task", TASK, "--connect", endpoint]
+    command = ["gate", str(stage.run), "--cell", CELL, "--task", stage.task, "--connect", endpoint]
     with open_session(wire) as cell, log.open("w") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "robot_gst", *command], cwd=ROOT, stdout=said, stderr=said
@@ -238,11 +242,12 @@ def ask(cell: Any, payload: bytes) -> tuple[str, str]:
 def main() -> None:
     """Attack, then report."""
     options = arguments()
+    options.plans = options.plans or NUM_PLANS[options.task]
     options.folder.mkdir(parents=True, exist_ok=True)
     kept = options.folder / f"answers_{options.seed}.jsonl"
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.is_file() else []
     known = {row["number"] for row in rows}
-    stage, solve = prepare(options.folder), Kinematics()
+    stage, solve = prepare(options.folder, options.task), Kinematics()
     oracle_turn, writing = threading.Lock(), threading.Lock()
     ends = time.monotonic() + options.max_s
 
@@ -300,7 +305,7 @@ def summarise(
     targets = [
         Target(what="yes for an unsafe plan", measured=len(bad), limit=0),
         Target(what="answers without a cause", measured=len(nameless), limit=0),
-        Target(what="plans asked", measured=len(rows), limit=10_000, at_most=False),
+        Target(what="plans asked", measured=len(rows), limit=NUM_PLANS[options.task], at_most=False),
         Target(what="share of valid plans accepted", measured=fine["yes"] / max(1, fine["plans"]),
                limit=0.8, at_most=False),
     ]  # fmt: skip
@@ -308,9 +313,10 @@ def summarise(
     if asked:
         details["cpu_s_per_plan"] = round(cpu_s / asked, 3)
         details["asked_in_last_run"] = asked
-    report_targets("attack_gate", targets, note="stand-in cell, cube_into_box", **details)
-    for name, row in families.items():
-        print(f"  {name:<16}", {key: value for key, value in row.items() if key != "causes"})
+    name = "attack_gate" + ("" if options.task == FIRST else f"_{options.task}")
+    report_targets(name, targets, note=f"stand-in cell, {options.task}", **details)
+    for family, row in families.items():
+        print(f"  {family:<16}", {key: value for key, value in row.items() if key != "causes"})
         print(f"  {'':<16}", row["causes"])
 
 

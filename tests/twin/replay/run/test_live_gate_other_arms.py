@@ -105,7 +105,7 @@ def test_the_gate_judges_plans_for_the_arm_that_the_cell_describes(
     plan = script.with_joints(script.plan(scene), scene)
     start_rad = np.array(plan.tau[0].joints_rad)
     said = [*messages, *heard_of(robot, start_rad, stamp_ns)]
-    stage = Stage(run=run.path, messages=said, oracle=None, bases=[])
+    stage = Stage(run=run.path, task="cube_into_box", messages=said, oracle=None, bases=[])
     with gate_of(stage, free_endpoint(), tmp_path / "gate.log") as cell:
 
         def ask(plan: Any) -> Verdict:
