@@ -305,7 +305,8 @@ def summarise(
     targets = [
         Target(what="yes for an unsafe plan", measured=len(bad), limit=0),
         Target(what="answers without a cause", measured=len(nameless), limit=0),
-        Target(what="plans asked", measured=len(rows), limit=NUM_PLANS[options.task], at_most=False),
+        Target(what="plans asked", measured=len(rows), limit=NUM_PLANS[options.task],
+               at_most=False),
         Target(what="share of valid plans accepted", measured=fine["yes"] / max(1, fine["plans"]),
                limit=0.8, at_most=False),
     ]  # fmt: skip
