@@ -2,8 +2,8 @@
 
 ``/plans/<id>`` is one plan of the recording, from when it was published on: ``tool_path`` in the
 colour of its verdict, ``grasps/<object>/<rank>`` as open hands, the chosen one strong,
-``predicted/<object>`` where the object should lie at the end of a stage. The arm along the plan is
-``robot``, of one plan only. Of a plan that was steered, those refused before it are shown too.
+``predicted/<object>`` where the object should lie at the end of a stage. ``/planned_arm`` follows
+the plan that counts. Of a plan that was steered, those refused before it are shown too.
 """
 
 import re
@@ -31,6 +31,8 @@ from dashboards.wording import verdict_word
 
 NOT_IN_A_PATH = r"[^A-Za-z0-9_.-]"
 ROOT = "plans"
+ARM = "planned_arm"
+"""One part: Rerun's robot descriptions take a prefix of several for one with strokes in it."""
 ACCEPTED, REFUSED, UNDECIDED = (38, 154, 82), (205, 52, 52), (128, 137, 153)
 CHOSEN, OTHER = (38, 154, 82), (150, 160, 175)
 PATH_RADIUS_M, CHOSEN_RADIUS_M, OTHER_RADIUS_M = 0.002, 0.0025, 0.0009
@@ -148,7 +150,7 @@ def log_plans(
     if joints is None:
         file.note(f"plan {last.plan.id} says nothing of the arm's joints")
         return False
-    return log_robot(file, urdf, last.entity, joints=joints, widths=widths)
+    return log_robot(file, urdf, ARM, joints=joints, widths=widths)
 
 
 def _log_way(file: RerunFile, shown: ShownPlan) -> None:
@@ -196,6 +198,7 @@ def _log_grasps(file: RerunFile, shown: ShownPlan) -> None:
         ).partition([2])
         entity = f"{shown.entity}/grasps/{grasp.object}/{rank}"
         file.rows(entity, np.array([shown.stamp_ns]), columns)
+        file.always(entity, rr.LineStrips3D.from_fields(show_labels=grasp.chosen))
 
 
 def _hand(

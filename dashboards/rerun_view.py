@@ -28,12 +28,12 @@ from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording, read_recording
 from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats
 from dashboards.rerun_file import TIMELINE, RerunFile
-from dashboards.rerun_plan import NOT_IN_A_PATH, ROOT, ShownPlan, log_plans, shown_plans
+from dashboards.rerun_plan import ARM, NOT_IN_A_PATH, ROOT, ShownPlan, log_plans, shown_plans
 from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
 """Looking at the table in front of the robot from its left."""
-PLANS_EYE_M, PLANS_TARGET_M = (1.15, -0.55, 0.6), (0.45, 0.0, 0.1)
+PLANS_EYE_M, PLANS_TARGET_M = (1.15, -0.45, 0.5), (0.42, 0.02, 0.14)
 """Nearer, for grasps are small."""
 GOOD, WARN = "INFO", "WARN"
 MIN_CLEARANCE = "clearance_m"
@@ -234,7 +234,7 @@ def layout(shown: Shown) -> rrb.Blueprint:
 
 def _space(shown: Shown) -> rrb.Spatial3DView:
     """Show all poses; depth as points only where there are no splats, which show the same."""
-    contents = ["+ /**", f"- /{ROOT}/**"]
+    contents = ["+ /**", f"- /{ROOT}/**", f"- /{ARM}/**"]
     if shown.splats:
         contents += [
             f"- /{entity}/**" for entity in shown.camera_entities if entity.endswith("/depth")
@@ -247,7 +247,7 @@ def _space(shown: Shown) -> rrb.Spatial3DView:
 
 def _plans(shown: Shown) -> rrb.Spatial3DView:
     """Plans among the scene's objects, and where the twin's replays of them took the tool."""
-    contents = [f"+ /{ROOT}/**", "+ /scene/**", "+ /localised/**"]
+    contents = [f"+ /{ROOT}/**", f"+ /{ARM}/**", "+ /scene/**", "+ /localised/**"]
     for side in shown.sides:
         contents += [f"+ /{side}/objects/**"]
         contents += [f"+ /{side}/tcp_path"] if side.startswith("replayed/planned") else []

@@ -128,9 +128,10 @@ def test_the_way_is_the_plans_and_its_colour_says_the_verdict(
 
 def test_the_arm_follows_the_plan_at_its_own_times(synthetic: ModuleType, content: Content) -> None:
     plan = planned(synthetic, 2)
-    joints = content[f"/plans/trial_0001_p2/robot_joints/{plan.joint_names[0]}"]
+    joints = content[f"/planned_arm/robot_joints/{plan.joint_names[0]}"]
     stamps = [stamp for stamp in joints["source_time"] if stamp is not None]
     np.testing.assert_array_equal(stamps, AT_NS + plan.times_ns())
+    assert [name for name in content if name.startswith("/planned_arm/robot/visual_geometries/")]
 
 
 def test_the_object_is_shown_where_the_plan_leaves_it(content: Content) -> None:
