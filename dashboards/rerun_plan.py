@@ -76,10 +76,10 @@ class ShownPlan:
             words.append(f"after `{plan.parent_id}`")
         if plan.steered_by is not None:
             words.append(f"steered by {plan.steered_by.clause}")
-        said = "not judged" if verdict is None else verdict_word(verdict.accepted)
+        judged = "not judged" if verdict is None else verdict_word(verdict.accepted)
         if verdict is not None and verdict.first_failing is not None:
-            said += f" by {verdict.first_failing}.{verdict.factors()[verdict.first_failing].cause}"
-        return ", ".join([*words, said])
+            judged += f" by {verdict.first_failing}.{verdict.factors()[verdict.first_failing].cause}"
+        return ", ".join([*words, judged])
 
 
 def shown_plans(
@@ -93,13 +93,13 @@ def shown_plans(
         clock: Knows when which plan was executed.
         run: Where refused plans lie; None: nowhere.
     """
-    said = {verdict.plan_id: verdict for _, verdict in recording.verdicts}
+    verdicts_of = {verdict.plan_id: verdict for _, verdict in recording.verdicts}
     found = [
         ShownPlan(
             plan=plan,
             stamp_ns=stamp_ns,
             start_ns=clock.starts_ns.get(plan.id, stamp_ns),
-            verdict=said.get(plan.id),
+            verdict=verdicts_of.get(plan.id),
         )
         for stamp_ns, plan in recording.plans
     ]
