@@ -78,26 +78,29 @@ def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTP
 
 
 def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:
-    """Write an episode with its replays as a Rerun file.
+    """Write an episode with its replays, or a plan with its own, as a Rerun file.
 
     Example: robot-gst export rrd runs/monday/episodes/trial_0001.mcap --out trial_0001.rrd
 
     Args:
-        episode: An episode file; of one inside a run, the replays and the rebuilt scene come along.
+        episode: An episode file, or a plan of a run's plans/; of one inside a run, the replays and
+            the rebuilt scene come along.
         out: The .rrd file to write; an older one is replaced.
         output: How to talk.
     """
-    _export(episode, out, output)
+    from dashboards.rerun_viewer import episode_of
+
+    _export(episode_of(episode), out, output)
     return 0
 
 
 def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -> int:
-    """Look at an episode with its replays in Rerun's own window, or say how to where none opens.
+    """Look at an episode or a plan in Rerun's own window, or say how to where none opens.
 
     Example: robot-gst view runs/monday
 
     Args:
-        target: An episode file, or a run folder for its newest trial.
+        target: An episode file, a plan of a run's plans/, or a run folder for its newest trial.
         out: The .rrd file to write; beside the run's derived episodes without it.
         output: How to talk.
     """

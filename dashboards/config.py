@@ -47,6 +47,8 @@ class TrialsConfig:
     of the study."""
     rounds: int = 5
     """Plans per trial in the arms with and control."""
+    retry: bool = False
+    """After each failed execution, reset, localise and plan anew, once. Counted and shown apart."""
     seed: int = 1
     """Draws the laboratory and the starts."""
     study_seed: int = 0

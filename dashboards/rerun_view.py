@@ -2,7 +2,7 @@
 
 ``/recorded/...`` is the episode, ``/replayed/<planned|executed>/<dynamic|kinematic>/...`` what the
 twin made of it, ``/localised/...`` where it found the objects, ``/scene/background`` the rebuilt
-scene. Stand-in truth is never shown.
+scene, ``/plans/<id>`` what a planner had in mind. Stand-in truth is never shown.
 """
 
 import re
@@ -28,10 +28,13 @@ from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording, read_recording
 from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats
 from dashboards.rerun_file import TIMELINE, RerunFile
+from dashboards.rerun_plan import ARM, NOT_IN_A_PATH, ROOT, ShownPlan, log_plans, shown_plans
 from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
 """Looking at the table in front of the robot from its left."""
+PLANS_EYE_M, PLANS_TARGET_M = (1.15, -0.45, 0.5), (0.42, 0.02, 0.14)
+"""Nearer, for grasps are small."""
 GOOD, WARN = "INFO", "WARN"
 MIN_CLEARANCE = "clearance_m"
 PATH_RADIUS_M = 0.0025
@@ -42,7 +45,6 @@ JOINT_COLORS = (
     *((31, 119, 180), (255, 127, 14), (44, 160, 44)),
     *((214, 39, 40), (148, 103, 189), (140, 86, 75)),
 )
-NOT_IN_A_PATH = r"[^A-Za-z0-9_.-]"
 RECORDED = (128, 137, 153)
 REPLAYED = {"planned": (29, 100, 216), "executed": (217, 115, 13)}
 """As on the review pages, with a grey that shows on dark and light ground."""
@@ -189,11 +191,16 @@ class Shown:
     splats: bool
     clearance: bool
     stages: bool
+    plans: bool
+    plans_first: bool
+    """Whether the view begins with them."""
 
 
 def layout(shown: Shown) -> rrb.Blueprint:
     """Place 3D view and cameras on the left, series and text on the right."""
     left: list[rrb.View | rrb.Container] = [_space(shown)]
+    if shown.plans:
+        left = [rrb.Tabs(left[0], _plans(shown), active_tab=int(shown.plans_first))]
     if shown.camera_entities:
         left.append(rrb.Grid(*(_image(entity) for entity in shown.camera_entities)))
     right: list[rrb.View | rrb.Container] = [
@@ -227,7 +234,7 @@ def layout(shown: Shown) -> rrb.Blueprint:
 
 def _space(shown: Shown) -> rrb.Spatial3DView:
     """Show all poses; depth as points only where there are no splats, which show the same."""
-    contents = ["+ /**"]
+    contents = ["+ /**", f"- /{ROOT}/**", f"- /{ARM}/**"]
     if shown.splats:
         contents += [
             f"- /{entity}/**" for entity in shown.camera_entities if entity.endswith("/depth")
@@ -236,6 +243,18 @@ def _space(shown: Shown) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="/", contents=contents, name=shown.name, eye_controls=eye if shown.robot else None
     )
+
+
+def _plans(shown: Shown) -> rrb.Spatial3DView:
+    """Plans among the scene's objects, and where the twin's replays of them took the tool."""
+    contents = [f"+ /{ROOT}/**", f"+ /{ARM}/**", "+ /scene/**", "+ /localised/**"]
+    for side in shown.sides:
+        contents += [f"+ /{side}/objects/**"]
+        contents += [f"+ /{side}/tcp_path"] if side.startswith("replayed/planned") else []
+    eye = rrb.EyeControls3D(
+        position=PLANS_EYE_M, look_target=PLANS_TARGET_M, eye_up=(0.0, 0.0, 1.0)
+    )
+    return rrb.Spatial3DView(origin="/", contents=contents, name="plans", eye_controls=eye)
 
 
 def _image(entity: str) -> rrb.Spatial2DView:
@@ -287,9 +306,10 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
         main = sides[0]
         task = _task(file, recording)
         cameras = log_cameras(file, episode, main.prefix, clock.zero_ns)
+        urdf = streams.robot_description(episode)
         robot = log_robot(
             file,
-            streams.robot_description(episode),
+            urdf,
             main.prefix,
             joints=recording.joints,
             widths=recording.widths,
@@ -300,7 +320,10 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
         for side in sides:
             log_side(file, side, task)
         _localised(file, recording, task, run)
-        file.always("about", _about(recording, _outcome(file, episode, run), sides, file.notes))
+        plans = shown_plans(file, recording, clock, run)
+        log_plans(file, plans, task, urdf)
+        outcome = _outcome(file, episode, run)
+        file.always("about", _about(recording, outcome, sides, plans, file.notes))
         file.stream.send_blueprint(
             layout(
                 Shown(
@@ -311,6 +334,8 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
                     splats=splats,
                     clearance=any(side.recording.clearance is not None for side in sides),
                     stages=any(side.recording.events for side in sides),
+                    plans=bool(plans),
+                    plans_first=run is not None and episode_path.parent == run.plans_dir,
                 )
             )
         )
@@ -327,7 +352,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
 def run_of(episode_path: Path) -> RunFolder | None:
     """Return the run an episode lies in, or None for a file elsewhere."""
     parent = episode_path.resolve().parent
-    return RunFolder(parent.parent) if parent.name in ("episodes", "derived") else None
+    return RunFolder(parent.parent) if parent.name in ("episodes", "derived", "plans") else None
 
 
 def _main_side(recording: Recording) -> Side:
@@ -446,7 +471,11 @@ def _outcome(file: RerunFile, episode: Episode, run: RunFolder | None) -> Outcom
 
 
 def _about(
-    recording: Recording, outcome: Outcome | None, sides: list[Side], notes: list[str]
+    recording: Recording,
+    outcome: Outcome | None,
+    sides: list[Side],
+    plans: list[ShownPlan],
+    notes: list[str],
 ) -> rr.TextDocument:
     info = recording.info
     lines = [f"# {recording.path.stem}", ""]
@@ -463,5 +492,7 @@ def _about(
     lines += [f"- {name}: {value}" for name, value in facts.items()]
     shown = [f"- `/{side.prefix}`: {side.recording.path.name}" for side in sides]
     lines += ["", "## Shown", "", *shown]
+    if plans:
+        lines += ["", "## Plans", "", *(f"- {each.line()}" for each in plans)]
     lines += ["", "## Not shown", "", *(f"- {note}" for note in notes or ["nothing is left out"])]
     return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)

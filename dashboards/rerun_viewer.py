@@ -8,16 +8,18 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import PLAN_REPLAY, REFUSED_PLAN, RunFolder
 from bridge.errors import GstError, PathNotFoundError, UsageError
 
 
 def episode_of(target: Path) -> Path:
-    """Return the episode to show: the file itself, or the newest trial of a run folder.
+    """Return the episode to show: the file itself, a plan's replay, or the run's newest trial.
 
     Raises:
         UsageError: When there is no such file or folder, or the run has no episode.
     """
+    if target.is_file() and target.suffix == ".json":
+        return _replay_of_plan(target)
     if target.is_file():
         return target
     if not target.is_dir():
@@ -28,6 +30,24 @@ def episode_of(target: Path) -> Path:
         message = f"{target} holds no episodes. Record some: robot-gst record {target}."
         raise UsageError(message)
     return max(found, key=_rank)
+
+
+def _replay_of_plan(path: Path) -> Path:
+    """The twin's replay that lies beside a plan.
+
+    Raises:
+        UsageError: There is none, or the file is no plan.
+    """
+    name = path.name.removesuffix(REFUSED_PLAN).removesuffix(".json")
+    found = path.with_name(f"{name}{PLAN_REPLAY}")
+    if not found.is_file():
+        message = (
+            f"beside {path} there is no {found.name}, the twin's replay that is shown with a plan. "
+            "Give a plan of a run's plans/, and make an older one again: robot-gst plan RUN --task "
+            '"...".'
+        )
+        raise UsageError(message)
+    return found
 
 
 def _rank(path: Path) -> tuple[bool, int]:

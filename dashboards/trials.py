@@ -21,6 +21,7 @@ import numpy as np
 from bridge.data_files import datasets_folder
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.mcap.part_file import lock_dead
+from bridge.episode.metadata import RETRY, retried_trial
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
@@ -98,7 +99,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
     jobs = jobs_of(protocol, chosen)
     with ending_on_signals():
         keep_protocol(run.path, protocol, has_trials=bool(run.episodes()))
-        left = _clear(run, jobs, output)
+        left = _clear(run, jobs, output, retry=config.retry)
         if left:
             _do(run, config, left, output)
         step(
@@ -137,7 +138,11 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
     )
     protocol = Protocol(
-        tasks=tasks, policies=policies, rounds=config.rounds, study_seed=config.study_seed
+        tasks=tasks,
+        policies=policies,
+        rounds=config.rounds,
+        study_seed=config.study_seed,
+        retry=config.retry,
     )
     if "control" not in config.arms:
         return protocol, chosen
@@ -205,11 +210,46 @@ def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
     return [jobs[index] for index in order]
 
 
-def _clear(run: RunFolder, jobs: Sequence[Job], output: Output) -> list[Job]:
+@dataclass(frozen=True, kw_only=True)
+class _There:
+    """What a run holds of a study already, by job."""
+
+    trials: dict[tuple[str, str, int], dict[str, Path]]
+    """By study arm."""
+    broken: dict[tuple[str, str, int], list[Path]]
+    retries: dict[str, Path]
+    """By the id of the trial that failed."""
+    failed: dict[tuple[str, str, int], set[str]]
+    """Ids of trials whose execution failed."""
+
+    def lacks(self, job: Job, *, retry: bool) -> bool:
+        """Whether a start has to be tried, or tried anew."""
+        unretried = self.failed.get(job.key, set()) - self.retries.keys() if retry else set()
+        whole = set(self.trials[job.key]) == set(job.arms)
+        return job.key in self.broken or not whole or bool(unretried)
+
+    def files(self, job: Job) -> set[Path]:
+        """Everything of a start."""
+        trials = self.trials[job.key].values()
+        followed = {self.retries[path.stem] for path in trials if path.stem in self.retries}
+        return {*trials, *followed, *self.broken.get(job.key, [])}
+
+
+def _clear(
+    run: RunFolder, jobs: Sequence[Job], output: Output, *, retry: bool = False
+) -> list[Job]:
     """Set aside every start that is there in part, and return the jobs that are to be done."""
-    found: dict[tuple[str, str, int], dict[str, Path]] = {job.key: {} for job in jobs}
+    there = _there(run, jobs)
+    left = [job for job in jobs if there.lacks(job, retry=retry)]
+    for job in left:
+        for path in there.files(job):
+            set_aside(run, path, "its start was interrupted", output)
+    return left
+
+
+def _there(run: RunFolder, jobs: Sequence[Job]) -> _There:
+    there = _There(trials={job.key: {} for job in jobs}, broken={}, retries={}, failed={})
     numbers = {job.first_trial + k: job.key for job in jobs for k in range(len(STUDY_ARMS))}
-    broken: dict[tuple[str, str, int], list[Path]] = {}
     for path in sorted(run.episodes_dir.glob("*.part")):
         descriptor = lock_dead(path)
         if descriptor is None:
@@ -218,32 +258,29 @@ def _clear(run: RunFolder, jobs: Sequence[Job], output: Output) -> list[Job]:
         os.close(descriptor)
         key = numbers.get(_number(path))
         if key is not None:
-            broken.setdefault(key, []).append(path)
+            there.broken.setdefault(key, []).append(path)
     for path in run.episodes():
         try:
             episode = Episode.open(path)
-            why = cut_short(episode, outcome_of(run, episode))
+            outcome = outcome_of(run, episode)
         except GstError:
             key = numbers.get(_number(path))
             if key is not None:
-                broken.setdefault(key, []).append(path)
+                there.broken.setdefault(key, []).append(path)
             continue
         info = episode.info
         key = (info.task, info.policy, info.start_seed or 0)
-        if key not in found:
+        if key not in there.trials:
             continue
-        found[key][info.study_arm] = path
-        if why:
-            broken.setdefault(key, []).append(path)
-    left = []
-    for job in jobs:
-        there = found[job.key]
-        if job.key not in broken and set(there) == set(job.arms):
+        if cut_short(episode, outcome):
+            there.broken.setdefault(key, []).append(path)
+        if info.kind == RETRY:
+            there.retries[retried_trial(info)] = path
             continue
-        for path in {*there.values(), *broken.get(job.key, [])}:
-            set_aside(run, path, "its start was interrupted", output)
-        left.append(job)
-    return left
+        there.trials[key][info.study_arm] = path
+        if outcome is not None and outcome.is_failed_execution:
+            there.failed.setdefault(key, set()).add(info.id)
+    return there
 
 
 def _number(path: Path) -> int:
@@ -384,6 +421,7 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
     words = ["publish", "standin", "--no-scan"]
     for name, value in options.items():
         words += [name, str(value)]
+    words += ["--retry"] if config.retry else []
     for arm in job.arms:
         words += ["--study-arms", arm]
     return words

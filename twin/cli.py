@@ -86,8 +86,8 @@ def plan(
     Args:
         run: Run folder; its episodes and its scene say which objects there are, and where.
         task: The instruction in English, or the name or file of a task.
-        dry: Say what was understood and write nothing; without it an accepted plan goes into the
-            run's plans/ and its task into tasks/.
+        dry: Say what was understood and write nothing; without it plans go into the run's
+            plans/ and their task into tasks/.
         live: Answer a cell's requests.
         words: How an instruction is planned.
         config: Settings of --live; its robot counts without it too.
@@ -125,7 +125,7 @@ def plan(
     start = start_of(folder, understood.file.task(), words, config.robot)
     judge = judge_of(folder.path, start.problem.scene)
     planned = plan_once(folder, understood, start, judge, words)
-    path = None if planned.path is None else keep(folder, understood)
+    path = keep(folder, understood)
     data = {**planned.to_json(), "file": None if path is None else str(path)}
     wrote = [] if path is None else [f"wrote {path}"]
     output.result(data, "\n".join([*planned.lines(), *wrote]))

@@ -171,7 +171,7 @@ class CatalogueQuery:
     """Filters; an episode must pass all that are given. One given twice takes either value."""
 
     kind: tuple[str, ...] = ()
-    """scan, trial, probe or imported."""
+    """scan, trial, retry, probe or imported."""
     task: tuple[str, ...] = ()
     """Id of the task file."""
     condition: tuple[str, ...] = ()

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple, TypeVar, get_origin
 from bridge.task.verdict import SAME_ENGINE, is_same_engine
 
 SCHEMA_VERSION = 1
-KINDS = ("scan", "trial", "probe", "imported")
+RETRY = "retry"
+"""A new start after an execution that failed: labelled, shown apart, in no rate of trials."""
+KINDS = ("scan", "trial", RETRY, "probe", "imported")
 WITHOUT, WITH = "without_replanning", "with_replanning"
 """The two conditions of a trial that evaluation compares."""
 
@@ -25,7 +27,7 @@ class EpisodeInfo:
 
     id: str
     kind: str
-    """One of scan, trial, probe, imported."""
+    """One of scan, trial, retry, probe, imported."""
     task: str = ""
     task_sha256: str = ""
     """Of the task file it was recorded with, which is attached; empty: not known."""
@@ -49,6 +51,7 @@ class EpisodeInfo:
         return study_arm_of(self.tags)
 
 
+RETRY_OF_TAG = "retry_of:"
 STUDY_ARM_TAG = "study_arm:"
 
 
@@ -66,6 +69,12 @@ def treatment_of(condition: str, study_arm: str) -> str:
     return CONTROL if study_arm == CONTROL else condition
 
 
+def retried_trial(info: EpisodeInfo) -> str:
+    """Id of the trial that a retry follows; empty where it does not say."""
+    found = (tag for tag in info.tags if tag.startswith(RETRY_OF_TAG))
+    return next(found, "").removeprefix(RETRY_OF_TAG)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
     """The ``outcome`` metadata record: what the operator says happened."""
@@ -79,6 +88,11 @@ class Outcome:
     detail: str | None = None
     stages: tuple[dict[str, str], ...] = ()
     schema_version: int = SCHEMA_VERSION
+
+    @property
+    def is_failed_execution(self) -> bool:
+        """Whether something was executed, stage by stage, and did not do the task."""
+        return self.result == "failure" and bool(self.stages)
 
 
 BY_DISK = "disk: "

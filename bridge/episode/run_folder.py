@@ -7,6 +7,8 @@ from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
 
+REFUSED_PLAN, PLAN_REPLAY = ".refused.json", ".replay.mcap"
+"""What files in ``plans/`` end in: plans that the twin did not accept, and its replays of plans."""
 EPISODE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,120}")
 _LATER_PART = re.compile(rf"({EPISODE_ID.pattern})\.([1-9][0-9]{{0,5}})\.mcap")
 
@@ -89,7 +91,7 @@ def first_part(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """``episodes/``, ``tasks/``, ``scene/``, ``derived/``, ``results/`` and ``notes/``."""
+    """``episodes/``, ``tasks/``, ``scene/``, ``plans/``, ``derived/``, ``results/``, ``notes/``."""
 
     path: Path
 
@@ -135,6 +137,11 @@ class RunFolder:
     def derived_dir(self) -> Path:
         """Replays, localisations and views made by the twin."""
         return self.path / "derived"
+
+    @property
+    def plans_dir(self) -> Path:
+        """Plans made from words, each with the twin's replay of it beside it."""
+        return self.path / "plans"
 
     @property
     def results_dir(self) -> Path:

@@ -214,7 +214,7 @@ def field_text(value: Value) -> str:
 EPISODE_COLUMNS = {
     "file": "the episode file, relative to the run",
     "id": "its id",
-    "kind": "scan, trial, probe or imported",
+    "kind": "scan, trial, retry, probe or imported",
     "task": "what was to be achieved",
     "instruction": "in words",
     "condition": "without_replanning or with_replanning",

@@ -128,7 +128,7 @@ class EpisodeAbout:
     """What is being recorded; stored in the episode."""
 
     kind: str = "trial"
-    """scan, trial, probe or imported."""
+    """scan, trial, retry, probe or imported."""
     task: str = ""
     """Task: its file (my_task.toml), or a name of the run's tasks/ or of datasets/tasks."""
     instruction: str = ""

@@ -55,6 +55,8 @@ class Protocol:
     """Where the coins' chances are from, in words."""
     stopping: str = "fixed"
     """fixed: after all starts of every task; nobody looks before."""
+    retry: bool = False
+    """Whether each failed execution is followed by one new start of the same trial."""
     void_causes: tuple[str, ...] = VOID_CAUSES
     """How outcomes begin that make a start void in all arms; all others are failures."""
 

@@ -25,6 +25,7 @@ from evaluator.compare.notes import check_settings, with_notes
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
+from evaluator.compare.study import retry_table
 from evaluator.compare.summaries import evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_protocol import ImageOptions
@@ -97,6 +98,8 @@ def compare_run(
         base,
         tables=with_notes(base.tables, check_settings(trials, contents.derived)),
     )
+    retried = retry_table([(each.facts.info, each.facts.outcome) for each in contents.recorded])
+    base = replace(base, tables=(*base.tables, *retried))
     missing = [] if rows else ["trials: the run holds no recorded trial"]
     base = replace(
         base,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from bridge.episode.metadata import RETRY, EpisodeInfo, Outcome, treatment_of
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow, is_streamed
@@ -276,3 +277,35 @@ def _gains_table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
             "tasks.",
         ),
     )
+
+
+def retry_table(recorded: Sequence[tuple[EpisodeInfo, Outcome | None]]) -> tuple[Table, ...]:
+    """Count new starts after failed executions, beside the first attempts and in none of them.
+
+    Args:
+        recorded: Every episode of a run with its label.
+
+    Returns:
+        The table ``retries``; nothing where no execution was retried.
+    """
+    groups: dict[tuple[str, str, str], list[Outcome | None]] = {}
+    for info, outcome in recorded:
+        if info.kind == RETRY:
+            name = info.study_arm or treatment_of(info.condition, "")
+            groups.setdefault((info.task, info.policy, name), []).append(outcome)
+    if not groups:
+        return ()
+    lines: list[tuple[Cell, ...]] = []
+    for key, outcomes in groups.items():
+        results = ["unknown" if each is None else each.result for each in outcomes]
+        lines.append((*key, results.count("success"), len(results), results.count("unknown")))
+    table = Table(
+        id="retries",
+        title="New starts after a failed execution",
+        columns=("task", "policy", "treatment", "k", "retried", "unknown"),
+        rows=tuple(lines),
+        note="Each is one new start of a trial whose execution failed: objects put back, localised "
+        "and planned anew. Only failures are retried, so these are no success rates of trials, and "
+        "no other number of this report counts them.",
+    )
+    return (table,)

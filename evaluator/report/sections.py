@@ -91,7 +91,7 @@ SECTIONS: tuple[Section, ...] = (
             ("sequence.replanning_evidence.recorded", "Evidence, valid at any time"),
             ("study.*", ""),
         ),
-        tables=("study_arms", "study_gains", "gains"),
+        tables=("study_arms", "study_gains", "gains", "retries"),
         figures=("gains",),
     ),
     Section(

@@ -26,6 +26,7 @@ SHOWN = (
     "study_arms",
     "study_gains",
     "gains",
+    "retries",
     "image_methods",
     "stopping",
     "notes",

@@ -13,7 +13,14 @@ from typing import Any
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, why_not_counted
+from bridge.episode.metadata import (
+    RETRY,
+    Derived,
+    EpisodeInfo,
+    Outcome,
+    build,
+    why_not_counted,
+)
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
@@ -165,6 +172,8 @@ def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
         EpisodeError: When its metadata was written by another program and cannot be read.
     """
     info, outcome = episode.info, episode.outcome
+    if info.kind == RETRY:
+        return RecordedFacts(info=info, outcome=outcome_of(run, episode))
     if info.kind != "trial":
         return RecordedFacts(info=info, outcome=outcome)
     try:

@@ -74,29 +74,58 @@ def test_the_command_of_a_job_names_its_start_policy_and_arms() -> None:
     words = command_of(built_in, STUDY, "tcp/127.0.0.1:7447")
     assert words[words.index("--planner") + 1] == "built_in"
     assert "--coin" not in words
+    assert "--retry" not in words
+    assert "--retry" in command_of(built_in, replace(STUDY, retry=True), "tcp/127.0.0.1:7447")
 
 
-def record(run: RunFolder, job: Job, arm: str, detail: str | None = None) -> Path:
+def record(
+    run: RunFolder,
+    job: Job,
+    arm: str,
+    detail: str | None = None,
+    *,
+    kind: str = "trial",
+    failed: bool = False,
+) -> Path:
     number = job.first_trial + job.arms.index(arm)
+    follows = (f"retry_of:trial_{number:04d}",) if kind == "retry" else ()
     info = EpisodeInfo(
-        id=f"trial_{number:04d}",
-        kind="trial",
+        id=f"{kind}_{number:04d}",
+        kind=kind,
         task=job.task,
         condition="without_replanning",
         policy=job.policy,
         start_id=f"{job.task}/{job.start_seed}",
         start_seed=job.start_seed,
-        tags=(f"study_arm:{arm}",),
+        tags=(f"study_arm:{arm}", *follows),
         stand_in=True,
     )
     path = run.episodes_dir / f"{info.id}.mcap"
-    result = "unknown" if detail else "success"
+    result = "unknown" if detail else "failure" if failed else "success"
+    stages = ({"id": "grasp", "result": "failure"},) if failed else ()
     with EpisodeWriter(path) as writer:
         writer.describe(info)
         writer.add_metadata("recorder", {"stopped_by": json.dumps("command")})
-        outcome = Outcome(result=result, k=1, detail=detail)
+        outcome = Outcome(result=result, k=1, detail=detail, stages=stages)
         writer.add_metadata("outcome", to_strings(outcome))
     return path
+
+
+def test_a_failed_start_is_whole_with_its_retry_and_goes_with_it(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    job, other = (job for job in jobs() if job.policy == "single")
+    record(run, job, "without", failed=True)
+    assert trials._clear(run, [job], QUIET) == [], "nobody asked for a retry"
+    retry = record(run, job, "without", kind="retry")
+    assert trials._clear(run, [job], QUIET, retry=True) == []
+    alone = record(run, other, "without", failed=True)
+    assert trials._clear(run, [job, other], QUIET, retry=True) == [other]
+    assert not alone.exists()
+    record(run, other, "without", "interrupted")
+    unfinished = record(run, other, "without", kind="retry")
+    assert trials._clear(run, [job, other], QUIET, retry=True) == [other]
+    assert retry.exists()
+    assert not unfinished.exists()
 
 
 def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(tmp_path: Path) -> None:

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from bridge.episode.metadata import treatment_of
+from bridge.episode.metadata import EpisodeInfo, Outcome, treatment_of
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.rows import TrialRow
-from evaluator.compare.study import study_results, study_starts
+from evaluator.compare.study import retry_table, study_results, study_starts
 from evaluator.result import Measurement
 from evaluator.statistics.differences import sign_test, tango_difference
 
@@ -138,3 +138,23 @@ def test_without_a_control_only_the_other_arm_is_compared() -> None:
     found = by_id(two)
     assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(6, 1)[1]
     assert not [name for name in found if "control" in name]
+
+
+def test_retries_are_counted_by_treatment_and_nothing_else_is() -> None:
+    def one(kind: str, condition: str, result: str | None) -> tuple[EpisodeInfo, Outcome | None]:
+        info = EpisodeInfo(id="x", kind=kind, task="stack", condition=condition, policy="nominal")
+        return info, None if result is None else Outcome(result=result)
+
+    recorded = [
+        one("trial", "with_replanning", "failure"),
+        one("retry", "with_replanning", "success"),
+        one("retry", "with_replanning", "failure"),
+        one("retry", "with_replanning", None),
+        one("retry", "without_replanning", "failure"),
+    ]
+    (table,) = retry_table(recorded)
+    assert table.rows == (
+        ("stack", "nominal", "with_replanning", 1, 3, 1),
+        ("stack", "nominal", "without_replanning", 0, 1, 0),
+    )
+    assert retry_table(recorded[:1]) == ()

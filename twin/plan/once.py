@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import PLAN_REPLAY, REFUSED_PLAN, RunFolder
 from bridge.episode.topics import ROBOT_DESCRIPTION
 from bridge.errors import EpisodeError, UsageError
 from bridge.geometry import se3
@@ -32,7 +33,11 @@ from twin.plan.model_stages import Asked, ask_about
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
-from twin.replay.job import recorded_start
+from twin.replay.config import ReplayConfig
+from twin.replay.job import cell_of, planned_grips, recorded_start
+from twin.replay.output import ReplayOrigin, write_replay
+from twin.replay.rebuilt_scene import calibrated, for_task
+from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
 from twin.scene.localise.objects import LocaliseConfig
@@ -40,22 +45,21 @@ from twin.scene.localise.result import LocalisedObject
 from twin.scene.localise.stationary_frames import calibrated_cameras
 from twin.scene.store.calibration import read_calibration
 
-PLANS = "plans"
-"""Folder of the run that plans go to."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
     """What was recorded before anything moved."""
 
-    episode: str
+    episode: Episode
+    seen_ns: int
+    """When the last of its objects was seen [ns]."""
     localised: Mapping[str, LocalisedObject]
     problem: Problem
     urdf: str
 
     def lines(self) -> list[str]:
         """Where each object is, how sure, and by what."""
-        found = [f"start: as recorded at the beginning of {self.episode}"]
+        found = [f"start: as recorded at the beginning of {self.episode.path.stem}"]
         for key, item in self.localised.items():
             if item.T_base_object is None:
                 continue
@@ -149,7 +153,7 @@ def _start(
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
-    return Start(episode=episode.path.stem, localised=found, problem=problem, urdf=urdf)
+    return Start(episode=episode, seen_ns=seen_ns, localised=found, problem=problem, urdf=urdf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,14 +191,14 @@ class Planned:
         if self.path is not None:
             told += ["", f"wrote {self.path}"]
         else:
-            told += ["", "no candidate was accepted; nothing was written and nothing was sent"]
+            told += ["", "no candidate was accepted; nothing was sent"]
         return told
 
     def to_json(self) -> dict[str, Any]:
         """The same as data."""
         return {
             **self.understood.to_json(),
-            "start": {"episode": self.start.episode},
+            "start": {"episode": self.start.episode.path.stem},
             "model": None if self.asked is None else self.asked.to_json(),
             "plan": None if self.path is None else str(self.path),
             "attempts": [
@@ -226,10 +230,10 @@ def plan_once(
     judge: Callable[[Plan], Verdict],
     config: PlanConfig,
 ) -> Planned:
-    """Propose, have the twin judge, steer, until a plan is accepted; write that one.
+    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay.
 
     Args:
-        run: The plan goes into its ``plans/``.
+        run: The accepted plan goes into its ``plans/``, those refused before beside it.
         understood: The task.
         start: From where.
         judge: The twin, as a gate asks it.
@@ -238,7 +242,7 @@ def plan_once(
     Raises:
         NoPlanError: There is no candidate at all, not even without what a model added.
     """
-    asked = ask_about(run, start.episode, start.problem, config) if config.model else None
+    asked = ask_about(run, start.episode.path.stem, start.problem, config) if config.model else None
     try:
         attempts = _attempts(
             understood, start.problem if asked is None else asked.problem, judge, config, asked
@@ -254,13 +258,52 @@ def plan_once(
             remarks=(*asked.remarks, why),
         )
         attempts = _attempts(understood, start.problem, judge, config, asked)
-    path = None
-    if attempts[-1].verdict.accepted is True:
-        plan = attempts[-1].candidate.plan
-        path = run.path / PLANS / f"{plan.id}.json"
-        path.parent.mkdir(exist_ok=True)
-        write_whole(path, plan.to_json())
+    paths = [_kept(run, start, each) for each in attempts]
+    path = paths[-1] if attempts[-1].verdict.accepted is True else None
     return Planned(understood=understood, start=start, attempts=attempts, path=path, asked=asked)
+
+
+def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
+    """Write a plan, and beside it the twin's replay of it; return where the plan lies."""
+    plan, verdict = attempt.candidate.plan, attempt.verdict
+    run.plans_dir.mkdir(exist_ok=True)
+    ending = ".json" if verdict.accepted is True else REFUSED_PLAN
+    path = run.plans_dir / f"{plan.id}{ending}"
+    write_whole(path, plan.to_json())
+    scene, episode = start.problem.scene, start.episode
+    config = for_task(calibrated(ReplayConfig(mode="dynamic"), read_calibration(run)), scene.task)
+    result = replace(replay_plan(plan, scene, config), verdict=verdict)
+    replay_path = run.plans_dir / f"{plan.id}{PLAN_REPLAY}"
+    replay_path.unlink(missing_ok=True)
+    origin = ReplayOrigin(
+        info=replace(
+            episode.info,
+            task=scene.task.name,
+            task_sha256=plan.task_sha256,
+            instruction=plan.instruction,
+            policy=plan.policy,
+        ),
+        derived=Derived(
+            kind="replay",
+            source_episode=episode.info.id,
+            source_sha256=episode.sha256(),
+            plan_id=plan.id,
+            trajectory="planned",
+            mode="dynamic",
+            scene_hash=scene.scene_hash,
+            engine=verdict.engine,
+            seed=config.seed,
+            calibration_id=scene.calibration_id,
+        ),
+        cell=cell_of(episode),
+        start_ns=start.seen_ns,
+        urdf=scene.urdf,
+        stages=plan.stages,
+        gripper=planned_grips(plan),
+        end_ns=plan.tau[-1].t_ns,
+    )
+    write_replay(replay_path, result, plan, origin)
+    return path
 
 
 def _attempts(

@@ -625,14 +625,14 @@ def _origin(
         stages=source.plan_as_executed.stages,
         gripper=_recorded_grips(plan, source.events, job.start_ns)
         if source.executed
-        else _planned_grips(plan),
+        else planned_grips(plan),
         end_ns=source.end_ns,
         divergence=divergence,
         images=images,
     )
 
 
-def _planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
+def planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
     """When the plan changes its mind about the gripper; it starts open."""
     before = [0, *(waypoint.g for waypoint in plan.tau)]
     return tuple(

@@ -4,7 +4,7 @@ import contextlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.metadata import (
+    RETRY,
+    RETRY_OF_TAG,
     STUDY_ARM_TAG,
     WITH,
     WITHOUT,
@@ -193,6 +195,10 @@ def _pieces(plan: Plan) -> list[tuple[int, int]]:
 RESET_STREAM = 404
 RESETS = {WITHOUT: 0, WITH: 1, "without": 0, "with": 1, "control": 3}
 RESET_OF_A_SCAN = 2
+RESETS_OF_RETRIES = 10
+"""Added to the number of the first one's, so that the objects are put back independently."""
+RETRY_SEEDS = 10**13
+"""Added to a start's seed, so that what is drawn for a retry is drawn for no trial."""
 ORDER_STREAM = 606
 PROBE_STREAM = 505
 PROBE_TRIES = 100
@@ -260,6 +266,7 @@ class Operator:
         self.scanned = False
         self.num_probes = 0
         self.results: list[tuple[EpisodeInfo, Outcome]] = []
+        self.retries: list[tuple[EpisodeInfo, Outcome]] = []
 
     def start_seeds(self, count: int) -> list[int]:
         """One seed per start; both conditions share them."""
@@ -310,17 +317,20 @@ class Operator:
         }
         return [(s, t) for s, t in all_ if (f"{task}/{s}", t.study_arm, policy) not in tried]
 
-    def start_poses(self, start_seed: int, treatment: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+    def start_poses(
+        self, start_seed: int, treatment: str, *, retry: bool = False
+    ) -> dict[str, Float[np.ndarray, "4 4"]]:
         """The declared start as a person puts it down: a little off, differently each time.
 
         Args:
             start_seed: Number of the start; the same one declares the same poses.
             treatment: Which trial of that start it is, by its condition or study arm; the
                 deviations differ between them.
+            retry: Whether they are put back after a failure; the deviations differ again.
         """
         noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))
-        index = RESETS.get(treatment, RESET_OF_A_SCAN)
+        index = RESETS.get(treatment, RESET_OF_A_SCAN) + (RESETS_OF_RETRIES if retry else 0)
         rng = np.random.default_rng([RESET_STREAM, start_seed, index])
         for T in poses.values():
             turn = rng.normal(0.0, noise.reset_rad)
@@ -371,22 +381,33 @@ class Operator:
     def _trial(
         self, number: int, start_seed: int, treatment: Treatment
     ) -> tuple[EpisodeInfo, Outcome]:
-        cell = self._cell
-        cell.reset(self.start_poses(start_seed, treatment.name))
         info = self._info(
             f"trial_{number:04d}",
             kind="trial",
             condition=treatment.condition,
             policy=self._decider.policy,
             trial=number,
-            start_id=f"{cell.task.name}/{start_seed}",
+            start_id=f"{self._cell.task.name}/{start_seed}",
             start_seed=start_seed,
             tags=treatment.tags,
         )
+        outcome = self._attempt(info, treatment, start_seed)
+        if self._config.retry and outcome.is_failed_execution:
+            tags = (*info.tags, f"{RETRY_OF_TAG}{info.id}")
+            again = replace(info, id=f"{RETRY}_{number:04d}", kind=RETRY, tags=tags)
+            second = self._attempt(again, treatment, start_seed + RETRY_SEEDS)
+            self.retries.append((again, second))
+            self._output.detail(f"{again.id} {treatment.name}: {second.result}")
+        return info, outcome
+
+    def _attempt(self, info: EpisodeInfo, treatment: Treatment, seed: int) -> Outcome:
+        """Put the objects down, look, plan, execute and label, in an episode."""
+        cell, retry = self._cell, info.kind == RETRY
+        cell.reset(self.start_poses(info.start_seed or 0, treatment.name, retry=retry))
         self._begin(info)
         cell.cameras_running = True
         cell.wait(LOOK_S)
-        decision = self._decider.decide(info, start_seed)
+        decision = self._decider.decide(info, seed)
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:
@@ -402,7 +423,7 @@ class Operator:
         cell.streams.event("label", cell.now_ns, text=text, outcome=asdict(outcome))
         cell.cameras_running = False
         self._end(outcome)
-        return info, outcome
+        return outcome
 
     def probes(self) -> None:
         """Record every probe of every round, each from a start of its own."""

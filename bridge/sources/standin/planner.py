@@ -5,8 +5,9 @@ one candidate; its errors depend on the start and the round only, so that both c
 start begin with the same idea.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -275,34 +276,16 @@ def plan_pick_and_place(
     """
     count = len(task.manipulated)
     errors = [error] * count if isinstance(error, GraspError) else list(error)
+    follow = partial(
+        follow_legs, kinematics=kinematics, max_joint_speed_rad_s=max_joint_speed_rad_s
+    )
     T_home = kinematics.T_base_tcp(joints_start_rad)
-    places: dict[str, Destination | None] = {
-        key: None if pushing_stage(task, key) else destination_of(task, key, seen)
-        for key in task.manipulated
-    }
-    slots = slots_of({key: place for key, place in places.items() if place is not None})
     track = Track.at_rest(T_home, joints_start_rad)
-    legs_of: dict[str, list[Leg]] = {}
-    then = dict(seen)
-    for index, key in enumerate(task.manipulated):
-        if places[key] is None:
-            ways = _pushes(task, key, seen[key], errors[index])
-        else:
-            place = destination_of(task, key, then)  # which may have been moved before
-            places[key] = place
-            ways = _ways(task, key, seen[key], place, errors[index], slots[key])
-        # From object to object the wrist can wind up until each way goes past a joint's limit.
-        unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
-        track, legs_of[key] = _first_reachable(
-            track, [*ways, *unwound], kinematics, max_joint_speed_rad_s
-        )
-        released = {"release": key}
-        then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
+    track, legs_of, places = _each_in_turn(task, seen, errors, track, T_home, follow)
     targets = (place.id for place in places.values() if place is not None and place.id != TABLE)
     keypoints = dict.fromkeys((*task.manipulated, *targets))
     last = legs_of[task.manipulated[-1]][-1].stage
-    home = Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)
-    track = follow_legs(track, [home], kinematics, max_joint_speed_rad_s)
+    track = follow(track, [Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)])
     return Plan(
         id=plan_id,
         parent_id=parent_id,
@@ -324,19 +307,51 @@ def plan_pick_and_place(
     )
 
 
-def _first_reachable(
+Follow = Callable[[Track, list[Leg]], Track]
+"""``follow_legs`` of one arm."""
+
+
+def _each_in_turn(
+    task: Task,
+    seen: Mapping[str, Float[np.ndarray, "4 4"]],
+    errors: Sequence[GraspError],
     track: Track,
-    choices: Sequence[list[Leg]],
-    kinematics: Kinematics,
-    max_joint_speed_rad_s: float,
+    T_home: Float[np.ndarray, "4 4"],
+    follow: Follow,
+) -> tuple[Track, dict[str, list[Leg]], dict[str, Destination | None]]:
+    """Move each object from where it is seen, past what was moved before it."""
+    places: dict[str, Destination | None] = {
+        key: None if pushing_stage(task, key) else destination_of(task, key, seen)
+        for key in task.manipulated
+    }
+    slots = slots_of({key: place for key, place in places.items() if place is not None})
+    legs_of: dict[str, list[Leg]] = {}
+    then = dict(seen)
+    for index, key in enumerate(task.manipulated):
+        if places[key] is None:
+            ways = _pushes(task, key, seen[key], errors[index])
+        else:
+            place = destination_of(task, key, then)  # which may have been moved before
+            places[key] = place
+            ways = _ways(task, key, seen[key], place, errors[index], slots[key])
+        # From object to object the wrist can wind up until each way goes past a joint's limit.
+        unwound = [[_turned_back(track, T_home, legs[0].stage), *legs] for legs in ways]
+        track, legs_of[key] = _first_reachable(track, [*ways, *unwound], follow)
+        released = {"release": key}
+        then[key] = _predicted(task.objects[key], places[key], legs_of[key], seen[key], released)
+    return track, legs_of, places
+
+
+def _first_reachable(
+    track: Track, choices: Sequence[list[Leg]], follow: Follow
 ) -> tuple[Track, list[Leg]]:
     """Take the first way the arm can follow; the last one's error when there is none."""
     for legs in choices[:-1]:
         try:
-            return follow_legs(track, legs, kinematics, max_joint_speed_rad_s), legs
+            return follow(track, legs), legs
         except UnreachablePoseError:
             continue
-    return follow_legs(track, choices[-1], kinematics, max_joint_speed_rad_s), choices[-1]
+    return follow(track, choices[-1]), choices[-1]
 
 
 def _turned_back(track: Track, T_home: Float[np.ndarray, "4 4"], stage: str) -> Leg:

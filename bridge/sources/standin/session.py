@@ -150,9 +150,18 @@ def _summary(
         "probes": operator.num_probes,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
         "objects": objects,
+        "retries": _retry_counts(operator),
         "unknown": {i.id: o.detail for i, o in operator.results if o.result == "unknown"},
         "stopped": stopped,
     }
+
+
+def _retry_counts(operator: Operator) -> dict[str, dict[str, int]]:
+    """Per treatment, how new starts after a failed execution ended; in no count of trials."""
+    counts: dict[str, Counter[str]] = {}
+    for info, outcome in operator.retries:
+        counts.setdefault(_treatment(info), Counter())[outcome.result] += 1
+    return {treatment: dict(counter) for treatment, counter in counts.items()}
 
 
 def _treatment(info: EpisodeInfo) -> str:
@@ -168,6 +177,9 @@ def describe(summary: dict[str, Any]) -> str:
         sums = summary["objects"].get(condition)
         told = f"; {sums['k']} of {sums['n']} objects" if sums else ""
         lines.append(f"  {condition}: {total} trials, {listed}{told}")
+    for condition, counts in summary.get("retries", {}).items():
+        listed = ", ".join(f"{count} {result}" for result, count in sorted(counts.items()))
+        lines.append(f"  {condition}: {sum(counts.values())} retried after a failure, {listed}")
     lines += [f"  {name} unknown: {why}" for name, why in summary.get("unknown", {}).items()]
     if summary.get("probes"):
         lines.append(f"  {summary['probes']} probes")

@@ -67,6 +67,9 @@ class SessionConfig:
     seeds."""
     rounds: int = 5
     """Plans the gate may see per trial."""
+    retry: bool = False
+    """After an execution that failed, put the objects back, look and plan anew: one new start of
+    the same trial, in an episode of its own (retry_...), which counts in no rate of trials."""
     gate_cell: str = ""
     """Cell name the gate was started with; empty: the same."""
     gate_timeout_s: float = 600.0

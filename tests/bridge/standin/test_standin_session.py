@@ -228,6 +228,35 @@ def test_both_conditions_share_start_ids_but_not_the_exact_poses(
     assert 0 < np.linalg.norm(without[:3, 3] - with_[:3, 3]) < 0.01
 
 
+def test_a_failed_execution_is_tried_anew_once_and_counts_in_no_trial(
+    make_session: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operator, "execute_plan", lambda cell, plan: None)  # the cube stays
+    session = make_session()
+    config = settings(conditions=("without_replanning",), retry=True)
+    summary = run_session(session, config, QUIET, start_ns=1_700_000_000_000_000_000)
+    started = [request for verb, request in session.control if verb == "start"]
+    assert [each["id"] for each in started] == ["trial_0001", "retry_0001"]
+    assert [each["info"]["kind"] for each in started] == ["trial", "retry"]
+    assert started[1]["info"]["tags"] == ["retry_of:trial_0001"]
+    assert started[1]["info"]["start_id"] == started[0]["info"]["start_id"]
+    assert summary["outcomes"] == {"without_replanning": {"failure": 1}}
+    assert summary["retries"] == {"without_replanning": {"failure": 1}}
+    assert "1 retried after a failure, 1 failure" in describe(summary)
+    first, second = (Plan.from_json(item.data) for item in session.of("/plan"))
+    assert (first.id, second.id) == ("trial_0001.plan_0", "retry_0001.plan_0")
+    assert first.tau != second.tau, "put back, looked at and planned anew"
+
+
+def test_what_was_not_executed_is_not_tried_anew(make_session: Callable[..., Any]) -> None:
+    session, summary = with_replanning(
+        make_session, lambda plan: verdict_record(plan, False), retry=True, rounds=1
+    )
+    assert summary["outcomes"] == {"with_replanning": {"failure": 1}}
+    assert summary["retries"] == {}
+    assert [verb for verb, _ in session.control] == ["start", "stop"]
+
+
 def listed(name: str, condition: str = "", start_seed: int = 0) -> dict[str, str]:
     start_id = f"cube_into_box/{start_seed}"
     return {"id": name, "condition": condition, "start_id": start_id, "policy": "perturbed"}

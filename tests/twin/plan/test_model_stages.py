@@ -19,6 +19,7 @@ from test_model_client import Server, images_in, says, serving
 import robot_gst
 from bridge.data_files import datasets_folder
 from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
@@ -70,7 +71,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     def start_of(run: RunFolder, task: Any, config: Any, robot: str = "") -> once.Start:
         problem = problem_of_test()
         problem = replace(problem, scene=replace(problem.scene, task=task))
-        return once.Start(episode="a", localised={}, problem=problem, urdf=problem.scene.urdf)
+        episode = Episode.open(run.episodes()[0])
+        urdf = problem.scene.urdf
+        return once.Start(episode=episode, seen_ns=1, localised={}, problem=problem, urdf=urdf)
 
     def judge_of(path: Path, scene: Any) -> Callable[[Plan], Verdict]:
         yes = Factor(value=True)

@@ -172,6 +172,11 @@ _SAFETY = 1.5
 """On the weight that friction must hold: the arm accelerates too."""
 _MIDDLE_SHARE = 0.05
 """Of its largest extent, how far the middle of an object's mass may be off."""
+_OPENINGS = (0.75, 0.55)
+"""Shares of its width to which the hand opens where the whole of it finds no way past what is
+beside the object."""
+_IN_THE_WAY = ("neighbour", "arm")
+"""Causes that a narrower hand may have not."""
 _COVERED_M = 0.006
 """Something whose underside is no more than this under the top of what it covers lies on it."""
 
@@ -221,10 +226,30 @@ class GraspSearcher:
             NoGraspError: There is none; the error says why, and counts what was rejected.
         """
         self._refuse(object_id)
+        hand, found, grasps = self._opened(object_id, part_points_m, self.max_width_m)
+        first = found, hand
+        for share in _OPENINGS:
+            if grasps or not any(found.rejected.get(cause) for cause in _IN_THE_WAY):
+                break
+            open_m = share * self.max_width_m
+            hand, found, grasps = self._opened(object_id, part_points_m, open_m)
+        if not grasps:
+            raise self._none(object_id, first[0].rejected, first[1])
+        return GraspSearch(
+            grasps=grasps, rejected=found.rejected, remarks=self._remarks(object_id, hand)
+        )
+
+    def _opened(
+        self,
+        object_id: str,
+        part_points_m: Float[np.ndarray, "num_points 3"] | None,
+        open_m: float,
+    ) -> tuple[OpenHand, _Candidates, tuple[Grasp, ...]]:
+        """Search with the hand opened so far."""
         config = self.config
         T = self.problem.scene.Ts_base_object[object_id]
-        pairs, rejected = self._pairs(object_id, part_points_m)
-        hand = open_hand(self.problem.robot, self.max_width_m, config.pregrasp_m)
+        pairs, rejected = self._pairs(object_id, part_points_m, open_m)
+        hand = open_hand(self.problem.robot, open_m, config.pregrasp_m)
         found = self._hands_on(pairs, T, hand, rejected)
         points = self._surface(object_id).samples(_TARGET_POINTS, config.seed)[0]
         around = self._neighbours(object_id, T)
@@ -232,12 +257,7 @@ class GraspSearcher:
         self._past_object(found, points, hand)
         self._past_neighbours(found, T, around, hand)
         margin = self._margins(found, object_id, points, hand)
-        grasps = self._choose(found, margin, object_id, hand)
-        if not grasps:
-            raise self._none(object_id, found.rejected, hand)
-        return GraspSearch(
-            grasps=grasps, rejected=found.rejected, remarks=self._remarks(object_id, hand)
-        )
+        return hand, found, self._choose(found, margin, object_id, hand)
 
     def _refuse(self, object_id: str) -> None:
         """Say what makes a search pointless."""
@@ -329,7 +349,10 @@ class GraspSearcher:
         return self._surfaces[object_id]
 
     def _pairs(
-        self, object_id: str, part_points_m: Float[np.ndarray, "num_points 3"] | None
+        self,
+        object_id: str,
+        part_points_m: Float[np.ndarray, "num_points 3"] | None,
+        open_m: float,
     ) -> tuple[Pairs, dict[str, int]]:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
@@ -348,7 +371,7 @@ class GraspSearcher:
             return pairs.chosen(mask)
 
         pairs = keep(pairs, pairs.cosines >= np.cos(config.cone_rad), "cone")
-        pairs = keep(pairs, pairs.widths_m <= self.max_width_m - 2 * config.clearance_m, "width")
+        pairs = keep(pairs, pairs.widths_m <= open_m - 2 * config.clearance_m, "width")
         seen = pairs.lowest_m >= shape.trusted_from_m
         if np.isfinite(shape.trusted_from_m):
             seen &= pairs.downward <= _UNDERSIDE
@@ -529,6 +552,10 @@ class GraspSearcher:
         if object_id not in scene.covariances:
             sigma_m = VariationConfig().unknown_pose_m
             remarks.append(f"nobody says how sure its pose is: {sigma_m * 1e3:.0f} mm assumed")
+        if hand.open_m < self.max_width_m:
+            remarks.append(
+                f"the hand opens to {hand.open_m * 1e3:.0f} mm only, to pass what is beside it"
+            )
         if hand.closed_in:
             remarks.append("the fingers' hulls fill the hand: they were not kept clear of it")
         unseen = [name for name in scene.missing() if name != object_id]

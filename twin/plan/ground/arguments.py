@@ -8,22 +8,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from bridge.task.check import TABLE
 from bridge.task.relations import SIDES
-from bridge.task.relations import WAYS as NAMED_WAYS
 from twin.plan.ground import noun_phrases
 from twin.plan.ground.goals import Goals, PathLimit
 from twin.plan.ground.noun_phrases import SAME_COLOURED, Memory, NounPhrase, Resolver
 from twin.plan.ground.path_clauses import LIMITS, SLOW_M_S, PathReader
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 from twin.plan.ground.words import (
+    A_LITTLE,
+    ABOUT,
     ADVERBS,
     ALTERNATIVES,
     COMMA,
     CONDITIONS,
     CONJUNCTIONS,
+    GAP_WORDS,
+    GAPS,
     LAYERS,
     LENGTH,
     NEGATIONS,
@@ -36,7 +37,6 @@ from twin.plan.ground.words import (
     Phrases,
     printable,
     tokens_of,
-    word_set,
 )
 from twin.scene.semantics.language import part_of
 
@@ -48,29 +48,6 @@ PARTICLES = frozenset({"up", "down", "over", "back", "out", "away", "off", "toge
 COLOURS = frozenset({"colour", "color", "colours", "colors"})
 VIEWERS = frozenset({"camera", "cam", "view", "viewpoint", "perspective", "image", "side"})
 ROBOTS = frozenset({"robot", "arm", "your", "base", "robot's", "yourself"})
-ABOUT = Phrases(
-    dict.fromkeys(
-        ("about", "roughly", "around", "approximately", "exactly", "by", "by about", "some",
-         "another", "a distance of", "by exactly", "by roughly", "for", "by another"),
-        "",
-    )
-)  # fmt: skip
-"""Words before a length that change nothing."""
-A_LITTLE = Phrases(
-    dict.fromkeys(("a bit", "a little", "slightly", "a little bit", "somewhat", "a bit more"), "")
-)
-GAPS = Phrases(
-    dict.fromkeys(
-        ("with", "with a", "with a gap of", "leaving", "leaving a gap of", "leaving a", "leave",
-         "with a distance of", "with a spacing of", "at a distance of", "leaving a space of",
-         "and leave", "and leave a gap of", "with a space of", "with a clearance of",
-         "with a gap between them of", "keeping a gap of", "with gaps of", "with a gap"),
-        "",
-    )
-)  # fmt: skip
-GAP_WORDS = word_set("gap space distance between them clearance apart the two of spacing")
-
-
 ITS_SIDES = {"its left": "left", "its right": "right"}
 ANY = "*"
 """Stands for objects that are named later."""
@@ -595,15 +572,8 @@ class ArgumentReader:
             told = "directions are as the robot sees them: forwards is away from its base"
             self.memory.explanation.append(told)
             return
-        R = self.vocabulary.cameras[clause.view][:3, :3]
-        ahead = R[:, 2] if np.linalg.norm(R[:2, 2]) > 0.5 else -R[:, 1]  # looking down: image up
-        right = np.array([ahead[1], -ahead[0], 0.0])
-        if right @ R[:, 0] < 0:  # hung upside down
-            right = -right
         for goal in spoken:
-            forwards, left, _ = {**SIDES, **NAMED_WAYS}[goal["direction"]]
-            way = forwards * np.array([ahead[0], ahead[1], 0.0]) - left * right
-            goal["direction"] = [round(float(part), 6) for part in way / np.linalg.norm(way)]
+            goal["direction"] = self.vocabulary.as_seen(clause.view, goal["direction"])
         self.memory.explanation.append(f"directions are as camera {clause.view} sees them")
 
     def _by_colour(self, clause: Clause, phrase: NounPhrase | None) -> None:

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -145,4 +148,32 @@ def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
         raise UsageError("no task file to take objects from.")
     record = read_record(run) or {}
     instances = (record.get("semantics") or {}).get("instances", ())
-    return vocabulary_of(task, instances)
+    return vocabulary_of(task, instances, cameras=standing_cameras(run))
+
+
+def standing_cameras(run: RunFolder) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """``T_base_camera`` of the cameras that stand still, as the newest readable episode has them.
+
+    A camera in the hand looks elsewhere as soon as the arm moves: what is left in it is not said.
+
+    Args:
+        run: With episodes.
+    """
+    for path in run.episodes()[::-1]:
+        try:
+            episode = Episode.open(path)
+            tree = streams.transform_tree(episode)
+            frames = {
+                camera_id: streams.camera_info(episode, camera_id).frame_id
+                for camera_id in streams.camera_ids(episode)
+            }
+            standing = {
+                camera_id: tree.T_root_frame(frame, 0)
+                for camera_id, frame in frames.items()
+                if len(tree.stamps_ns(frame)) == 1
+            }
+        except BridgeError:
+            continue  # nothing else of it is needed here
+        if standing:
+            return standing
+    return {}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.task.relations import SIDES, WAYS
 from bridge.task.task_file import BASKET, Task
 from twin.errors import TwinError
 from twin.scene.semantics.colour import COLOUR_NAMES, colour_name
@@ -114,6 +115,22 @@ class Vocabulary:
     things: Mapping[str, Thing]
     cameras: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """``T_base_camera`` by id, where calibrated: directions may be as a camera sees them."""
+
+    def as_seen(self, camera: str, direction: str) -> list[float]:
+        """A named direction of a camera's view, along the table in the base frame.
+
+        Args:
+            camera: One of ``cameras``.
+            direction: A side or a way, by its name.
+        """
+        R = self.cameras[camera][:3, :3]
+        ahead = R[:, 2] if np.linalg.norm(R[:2, 2]) > 0.5 else -R[:, 1]  # looking down: image up
+        right = np.array([ahead[1], -ahead[0], 0.0])
+        if right @ R[:, 0] < 0:  # hung upside down
+            right = -right
+        forwards, left, _ = {**SIDES, **WAYS}[direction]
+        way = forwards * np.array([ahead[0], ahead[1], 0.0]) - left * right
+        return [round(float(part), 6) for part in way / np.linalg.norm(way)]
 
     def movable(self) -> tuple[str, ...]:
         """Ids of what the robot can move."""

@@ -433,3 +433,25 @@ ADVERBS = Phrases(
                 "robot", "thanks", "thank you", "all the way", "straight", "down", "alone"))
 )  # fmt: skip
 """What may stand beside the relations of a clause."""
+
+ABOUT = Phrases(
+    dict.fromkeys(
+        ("about", "roughly", "around", "approximately", "exactly", "by", "by about", "some",
+         "another", "a distance of", "by exactly", "by roughly", "for", "by another"),
+        "",
+    )
+)  # fmt: skip
+"""Words before a length that change nothing."""
+A_LITTLE = Phrases(
+    dict.fromkeys(("a bit", "a little", "slightly", "a little bit", "somewhat", "a bit more"), "")
+)
+GAPS = Phrases(
+    dict.fromkeys(
+        ("with", "with a", "with a gap of", "leaving", "leaving a gap of", "leaving a", "leave",
+         "with a distance of", "with a spacing of", "at a distance of", "leaving a space of",
+         "and leave", "and leave a gap of", "with a space of", "with a clearance of",
+         "with a gap between them of", "keeping a gap of", "with gaps of", "with a gap"),
+        "",
+    )
+)  # fmt: skip
+GAP_WORDS = word_set("gap space distance between them clearance apart the two of spacing")

@@ -24,7 +24,7 @@ from twin.plan.loop.places import lying_there, places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.straight import GeometricProposer
-from twin.plan.loop.tau import Trajectory, goals_of, plan_stage, stages_of
+from twin.plan.loop.tau import Trajectory, candidate_grasp, goals_of, plan_stage, stages_of
 from twin.plan.path.planner import START_TOUCHES, NoPathError, PathConfig, plan_move
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
@@ -113,6 +113,8 @@ class Transfer:
     """Where the object is predicted to come to lie."""
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
+    looked_at: tuple[Grasp, ...] = ()
+    """All grasps of the object that were to be tried, in that order."""
     remarks: tuple[str, ...] = ()
 
     @property
@@ -295,6 +297,7 @@ class _Search:
                 legs=legs,
                 T_base_lies=lying_there(problem, release),
                 cost=release.cost + _miss_probability(grasp.margin),
+                looked_at=tuple(options.grasps),
                 remarks=options.remarks_of(grasp, release, legs),
             )
         if failure is None:
@@ -330,7 +333,7 @@ class _Options:
         found = searcher.search(key, _part_points(problem, key))
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
-        self._grasps = self._ordered(kept)[: policy.grasps]
+        self.grasps = self._ordered(kept)[: policy.grasps]
         self.num_grasps = len(found.grasps)
         records = goals_of(problem.scene.task, key)
         self._relation = problem.scene.task.goal_of(key)
@@ -384,14 +387,14 @@ class _Options:
         """Every grasp with its cheapest final state, then every grasp with the next, and so on."""
         states: dict[int, tuple[Release, ...]] = {}
         for rank in range(self._policy.release.max_releases):
-            for number, grasp in enumerate(self._grasps):
+            for number, grasp in enumerate(self.grasps):
                 if any(grasp is each for each in self._given_up):
                     continue
                 if number not in states:
                     states[number] = self._releases(grasp)
                 if rank < len(states[number]):
                     yield grasp, states[number][rank]
-        if not self._grasps:
+        if not self.grasps:
             self.why = f"no grasp of {self._key} is left that was not refused"
 
     def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
@@ -583,5 +586,10 @@ def _plan_of(
         joint_names=record.joints,
         stages=tuple(plan_stage(task, table, trajectory.bounds, there) for table in task.stages),
         tau=tuple(trajectory.tau),
+        grasps=tuple(
+            candidate_grasp(grasp, chosen=grasp is each.grasp)
+            for each in transfers
+            for grasp in each.looked_at
+        ),
     )
     return plan, remarks

@@ -23,7 +23,7 @@ from twin.replay.result import ReplayResult
 from twin.robot.collision import hulls_of
 
 _STAGE = "move"
-AUDIT_STEP_M = 0.005
+AUDIT_STEP_M = 0.001
 """How much farther a pair is kept that python-fcl finds nearer than was said."""
 
 

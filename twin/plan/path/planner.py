@@ -134,6 +134,43 @@ class Movement:
     """Which of the goals was reached."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What every movement is asked with: the scene, the hand, what may touch."""
+
+    problem: Problem
+    config: PathConfig
+    width_m: float
+    carried: Carried | None
+    allowed: Allowed
+
+    def world(self, wider_m: Mapping[frozenset[str], float] | None = None) -> World:
+        """What the search keeps clear of, refused pairs farther."""
+        return build_world(
+            self.problem,
+            width_m=self.width_m,
+            eps_col_m=self.config.replay.eps_col_m,
+            carried=self.carried,
+            allowed=self.allowed,
+            wider_m=wider_m or {},
+        )
+
+    def decided(self, path: TimedPath, goal: int = 0) -> Movement:
+        """The movement with the exact checks' last word."""
+        decision = decide(
+            self.problem,
+            path,
+            width_m=self.width_m,
+            config=self.config.replay,
+            carried=self.carried,
+            allowed=self.allowed,
+            audited=self.config.audited,
+        )
+        return Movement(
+            path=path, decision=decision, width_m=self.width_m, carried=self.carried, goal=goal
+        )
+
+
 def plan_move(
     problem: Problem,
     start_rad: Float[np.ndarray, " num_joints"],
@@ -160,22 +197,18 @@ def plan_move(
             check refused every round.
     """
     check_numbers(start_rad, goals_rad)
+    asked = _Asked(
+        problem=problem, config=config, width_m=width_m, carried=carried, allowed=allowed
+    )
     wider: dict[frozenset[str], float] = {}
     work: dict[str, float] = {}
     refusals: tuple[Refusal, ...] = ()
     for turn in range(config.rounds):
-        world = build_world(
-            problem,
-            width_m=width_m,
-            eps_col_m=config.replay.eps_col_m,
-            carried=carried,
-            allowed=allowed,
-            wider_m=wider,
-        )
+        world = asked.world(wider)
         _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
         knots, goal = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
         path = timed_path(world, knots, config)
-        movement = _decided(problem, path, config, width_m, carried, allowed, goal)
+        movement = asked.decided(path, goal)
         work["rounds"] = float(turn + 1)
         if movement.decision.accepted:
             return replace(movement, path=replace(path, work={**work, **path.work}))
@@ -245,27 +278,6 @@ def _searched(
             reason=REASONS[outcome], bodies=bodies, detail=detail, work=int(work["postures"])
         )
     return knots, goal
-
-
-def _decided(
-    problem: Problem,
-    path: TimedPath,
-    config: PathConfig,
-    width_m: float,
-    carried: Carried | None,
-    allowed: Allowed,
-    goal: int = 0,
-) -> Movement:
-    decision = decide(
-        problem,
-        path,
-        width_m=width_m,
-        config=config.replay,
-        carried=carried,
-        allowed=allowed,
-        audited=config.audited,
-    )
-    return Movement(path=path, decision=decision, width_m=width_m, carried=carried, goal=goal)
 
 
 def timed_path(
@@ -355,17 +367,12 @@ def plan_straight(
             is in the way: a straight line cannot go around it.
     """
     check_numbers(start_rad, T_base_goal)
-    robot = problem.robot
-    knots = _straight_knots(robot, start_rad, T_base_goal, config)
-    world = build_world(
-        problem,
-        width_m=width_m,
-        eps_col_m=config.replay.eps_col_m,
-        carried=carried,
-        allowed=allowed,
+    asked = _Asked(
+        problem=problem, config=config, width_m=width_m, carried=carried, allowed=allowed
     )
-    path = timed_path(world, knots, config, tool_m_s=config.contact_m_s)
-    movement = _decided(problem, path, config, width_m, carried, allowed)
+    knots = _straight_knots(problem.robot, start_rad, T_base_goal, config)
+    path = timed_path(asked.world(), knots, config, tool_m_s=config.contact_m_s)
+    movement = asked.decided(path)
     if not movement.decision.accepted:
         first = movement.decision.refusals[0]
         raise NoPathError(reason="refused", bodies=first.bodies, detail=first.detail)

@@ -192,6 +192,49 @@ def test_what_stands_beside_is_kept_clear_of() -> None:
         assert abs(grasp.T_object_tcp[1, 1]) < 0.7
 
 
+def among_cubes(gap_m: float) -> Problem:
+    """A cube with one at each end of its y axis, so far away, and one right before it."""
+    side_m, task = 0.035, load_task("sort_by_colour")
+    far = {key: standing(0.3, 0.5, 0.0, 0.0) for key in ("pink_box", "cyan_box")}
+    near = {
+        "red": standing(0.45, -0.1, side_m / 2, 0.0),
+        "yellow": standing(0.45, -0.1 + side_m + gap_m, side_m / 2, 0.0),
+        "blue": standing(0.45, -0.1 - side_m - gap_m, side_m / 2, 0.0),
+        "green": standing(0.45 + side_m + 0.005, -0.1, side_m / 2, 0.0),
+    }
+    return problem(task, far | near)
+
+
+def test_the_hand_opens_as_far_as_its_neighbours_let_it() -> None:
+    free = GraspSearcher(among_cubes(0.06), FEW).search("red")
+    tight = GraspSearcher(among_cubes(0.025), FEW).search("red")
+    (whole_m,) = {grasp.open_m for grasp in free.grasps}
+    (less_m,) = {grasp.open_m for grasp in tight.grasps}
+    assert whole_m == read_robot(UR5).gripper.max_width_m
+    assert 0.035 < less_m < whole_m
+    assert any("mm only" in remark for remark in tight.remarks)
+    assert not any("mm only" in remark for remark in free.remarks)
+    given = among_cubes(0.025)
+    hulls = hulls_of(given.robot)
+    for grasp in tight.grasps:  # no corner of a finger is in a neighbour, on the way or at its end
+        for back_m in (0.0, 0.04, 0.08):
+            hulls.place(grasp.joints_rad, grasp.open_m)
+            T = given.scene.Ts_base_object["red"] @ grasp.T_object_tcp
+            corners = [
+                corner - back_m * T[:3, 2]
+                for hull, R, t in zip(hulls.hulls, hulls.rotations, hulls.translations, strict=True)
+                if hull.link in given.robot.record.gripper.finger_links
+                for corner in hull.points_m @ R.T + t
+            ]
+            for key in ("yellow", "blue", "green"):
+                inside = np.abs(np.array(corners) - given.scene.Ts_base_object[key][:3, 3])
+                assert not (inside < 0.035 / 2).all(axis=1).any()
+
+
+def test_where_no_finger_fits_the_neighbours_are_named() -> None:
+    assert refusal(among_cubes(0.008), "red").cause == "neighbour"
+
+
 def test_a_part_restricts_both_contacts() -> None:
     given = cube_problem()
     corner = np.array([[x, y, 0.015] for x in (0.012, 0.018) for y in (-0.02, 0.02)])

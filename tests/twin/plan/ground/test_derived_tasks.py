@@ -3,16 +3,26 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robot_gst
 from bridge.data_files import datasets_folder
+from bridge.episode import schema
+from bridge.episode.cdr.messages import (
+    CameraInfo,
+    CompressedColor,
+    FrameTransform,
+    transforms_to_cdr,
+)
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import Task, TaskFile
 from twin.plan.ground.derive import derive_task
@@ -153,6 +163,49 @@ def test_the_objects_are_those_of_the_episodes(run: RunFolder, tmp_path: Path) -
     assert named.file.data == understood.file.data
     with pytest.raises(UsageError, match="says which objects"):
         understand(RunFolder.create(tmp_path / "other"), "put the red cube into the box")
+
+
+def write_cameras(run: RunFolder) -> np.ndarray:
+    """A trial with a camera that stands still and one that moves; the pose of the first."""
+    T = se3.look_at(np.array([1.2, -0.5, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    moving = [
+        FrameTransform(stamp_ns=ns, parent="base_link", child="wrist_optical", T_parent_child=T)
+        for ns in (1, 2)
+    ]
+    still = FrameTransform(stamp_ns=1, parent="base_link", child="side_optical", T_parent_child=T)
+    camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0)
+    with EpisodeWriter(run.episodes_dir / "c.mcap") as writer:
+        info = EpisodeInfo(id="c", kind="trial", task="cube_into_box", task_sha256=CUBE.sha256)
+        writer.describe(info)
+        writer.attach(ATTACHMENT, CUBE.data, media_type=MEDIA_TYPE, log_time_ns=1)
+        data = transforms_to_cdr([still, *moving])
+        writer.write("/tf", data, type_name=schema.TF_MESSAGE, log_time_ns=1)
+        for name in ("side", "wrist"):
+            seen = CameraInfo(stamp_ns=1, frame_id=f"{name}_optical", camera=camera)
+            image = CompressedColor(
+                stamp_ns=1, frame_id=f"{name}_optical", format="jpeg", data=b"none"
+            )
+            for tail, type_name, record in (
+                ("info", schema.CAMERA_INFO, seen),
+                ("image", schema.COMPRESSED_IMAGE, image),
+            ):
+                topic = f"/standin/cam/{name}/color/{tail}"
+                writer.write(topic, record.to_cdr(), type_name=type_name, log_time_ns=1)
+    return T
+
+
+def test_a_camera_that_stands_still_lends_its_left_and_right(run: RunFolder) -> None:
+    words = "put the cube right of the box as seen from the {} camera"
+    with pytest.raises(GroundingError, match="no camera whose place is known"):
+        understand(run, words.format("side"))
+    T = write_cameras(run)
+    grounding = understand(run, words.format("side")).grounding
+    assert grounding is not None
+    way = np.array(grounding.goals[0]["direction"])
+    right = T[:3, 0] * [1, 1, 0]
+    np.testing.assert_allclose(way, right / np.linalg.norm(right), atol=1e-6)
+    with pytest.raises(GroundingError, match="There is: side"):
+        understand(run, words.format("wrist"))
 
 
 def test_the_command_prints_what_was_understood(

@@ -1,0 +1,120 @@
+"""What ``plan RUN`` leaves in a run: the accepted plan, those refused before, a replay of each."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scripted_plans import scene_of_test
+
+from bridge.data_files import datasets_folder
+from bridge.episode import streams
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
+from bridge.task.plan import Plan
+from bridge.task.task_file import TaskFile
+from bridge.task.verdict import Factor, Verdict
+from dashboards.rerun_view import export_rrd, run_of
+from dashboards.rerun_viewer import episode_of
+from twin.plan.config import PlanConfig
+from twin.plan.ground.run_tasks import UnderstoodTask
+from twin.plan.once import Planned, Start, plan_once
+from twin.plan.problem import Problem
+from twin.plan.shapes import shapes_of
+from twin.robot.model import load_robot
+
+FILE = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+SEEN_NS = 5_000_000_000
+
+
+def verdict(plan: Plan, accepted: bool) -> Verdict:
+    yes = Factor(value=True)
+    terminal = Factor(value=accepted, cause=None if accepted else "inside", bodies=("cube", "box"))
+    return Verdict(
+        plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
+        ik=yes, clearance=yes, terminal=terminal,
+    )  # fmt: skip
+
+
+def planned(run: RunFolder, answers: list[bool]) -> Planned:
+    """Two rounds of the geometric policy, judged as told."""
+    path = run.episodes_dir / "trial_0001.mcap"
+    with EpisodeWriter(path) as writer:
+        info = EpisodeInfo(
+            id="trial_0001", kind="trial", task="cube_into_box", task_sha256=FILE.sha256
+        )
+        writer.describe(info)
+        writer.attach(ATTACHMENT, FILE.data, media_type=MEDIA_TYPE, log_time_ns=1)
+    scene = replace(scene_of_test(), start_rad=HOME)
+    problem = Problem(scene=scene, robot=load_robot(scene.urdf), shapes=shapes_of(None, scene.task))
+    episode = Episode.open(path)
+    start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem, urdf=scene.urdf)
+    left = iter(answers)
+    understood = UnderstoodTask(file=FILE, grounding=None)
+    config = PlanConfig(policy="geometric", rounds=len(answers))
+    return plan_once(run, understood, start, lambda plan: verdict(plan, next(left)), config)
+
+
+@pytest.fixture(scope="module")
+def steered(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunFolder, Planned]:
+    run = RunFolder.create(tmp_path_factory.mktemp("once") / "run")
+    return run, planned(run, [False, True])
+
+
+def test_the_refused_plan_stays_beside_the_accepted_one(steered: tuple[RunFolder, Planned]) -> None:
+    run, done = steered
+    refused, accepted = (each.candidate.plan for each in done.attempts)
+    assert done.path == run.plans_dir / f"{accepted.id}.json"
+    there = {path.name for path in run.plans_dir.iterdir()}
+    assert there == {
+        f"{refused.id}.refused.json",
+        f"{accepted.id}.json",
+        f"{refused.id}.replay.mcap",
+        f"{accepted.id}.replay.mcap",
+    }
+    kept = Plan.from_json((run.plans_dir / f"{refused.id}.refused.json").read_bytes())
+    assert kept == refused
+    assert json.loads(done.path.read_bytes())["parent_id"] == refused.id
+
+
+def test_a_replay_holds_the_plan_its_verdict_and_the_moving_arm(
+    steered: tuple[RunFolder, Planned],
+) -> None:
+    run, done = steered
+    for attempt in done.attempts:
+        plan = attempt.candidate.plan
+        episode = Episode.open(run.plans_dir / f"{plan.id}.replay.mcap")
+        assert streams.plans(episode) == [(SEEN_NS, plan)]
+        assert [each for _, each in streams.verdicts(episode)] == [attempt.verdict]
+        joints = streams.joint_track(episode)
+        assert joints.stamps_ns[0] == SEEN_NS
+        assert np.abs(np.diff(joints.position, axis=0)).max() > 0
+    assert not run.derived_dir.exists(), "evaluation reads what is there"
+
+
+def test_the_view_shows_what_was_refused_too(
+    steered: tuple[RunFolder, Planned], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    _, done = steered
+    assert done.path is not None
+    path = episode_of(done.path)
+    out = tmp_path_factory.mktemp("view") / "plan.rrd"
+    shown = export_rrd(path, out, run_of(path))
+    assert shown.sides == ("replayed/planned/dynamic",)
+    assert not [note for note in shown.notes if "plan" in note]
+
+
+def test_where_nothing_is_accepted_only_refused_plans_are_kept(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    run = RunFolder.create(tmp_path_factory.mktemp("refused") / "run")
+    done = planned(run, [False])
+    assert done.path is None
+    assert "nothing was sent" in done.lines()[-1]
+    assert [path.name for path in run.plans_dir.glob("*.json")] == [
+        f"{done.last.candidate.plan.id}.refused.json"
+    ]
