@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
+from evaluator.compare.axes import axis_tables, progress_table
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
@@ -165,6 +166,8 @@ def _tables(
         *found.stage_tables,
         *failures_table(rows, word),
         *found.decision_tables,
+        *axis_tables(rows, word),
+        *progress_table(rows, word),
         *stopping_table(rows, goal),
         *(() if is_streamed(rows) else (trials_table(rows, word),)),
     )

@@ -10,7 +10,7 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 
-from bridge.exchange.trials_csv import SourceRow, TableError, read_rows
+from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
 from bridge.exchange.trials_rates import (
     COLUMNS,
     SIDES,
@@ -93,12 +93,15 @@ class PublishedCheck:
         return tuple(finding for finding in self.findings if finding.verdict in FAILED)
 
 
-def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
+def check_published(
+    path: Path, *, method: str = "wilson", options: TableOptions = AS_SAVED
+) -> PublishedCheck:
     """Recompute every printed figure of a table.
 
     Args:
         path: The table.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        options: Columns whose names differ from ours.
 
     Raises:
         TableError: Naming the row that cannot be read at all, or that is there twice.
@@ -106,7 +109,7 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
     records: list[RateRecord] = []
     claims: list[_Claim] = []
     findings: list[Finding] = []
-    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA)):
+    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA), options):
         if row.text("statistic"):
             claims.append(_claim(row))
             continue

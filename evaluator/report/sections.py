@@ -69,6 +69,8 @@ SECTIONS: tuple[Section, ...] = (
             "agreement_intervals",
             "decisions",
             "leave_one_task_out",
+            "axes",
+            "progress",
         ),
         figures=("scatter",),
     ),

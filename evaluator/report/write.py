@@ -20,6 +20,7 @@ from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
 SHOWN = (
+    "intake",
     "published",
     "success",
     "layout",
@@ -205,6 +206,9 @@ def summary_text(results: Results, written: Written) -> str:
     banner = stand_in_sentence(results)
     if banner:
         parts.append(banner)
+    understood = results.provenance.get("read_as")
+    if isinstance(understood, list) and understood:
+        parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))
     shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("bands_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
