@@ -45,8 +45,9 @@ PUBLISHED, SIMPLER, POLARIS, LEROBOT = "a published table", "SIMPLER", "PolaRiS"
 ROLLOUTS = (SIMPLER, POLARIS, LEROBOT)
 """Benchmarks whose files hold the sim side alone."""
 READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".mp4")
-STREAM_ABOVE_BYTES = 32 * 2**20
-"""A larger trials CSV is read row by row and only counted: about 300,000 trials."""
+STREAM_ABOVE_BYTES = 4 * 2**20
+"""A larger trials CSV is read row by row and only counted: about 50,000 trials, whose single rows
+take some 200 MB."""
 MOST_FILES = 20_000
 """Files of a folder that are looked at."""
 

@@ -73,7 +73,7 @@ def _count(table: TableText, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
                 raise table.row(number, cells).refuse("trial_id is empty", "Every trial needs one")
             ids.add(trial_id)
         for name, at in checked:
-            if cells[at]:
+            if not _is_fraction(cells[at]):
                 table.row(number, cells).fraction(name)
         pattern = counted([*cells, ""])
         known = counts.get(pattern)
@@ -90,6 +90,14 @@ def _count(table: TableText, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
         single = {"trial_id": "", "start_id": None, "p_success": None}
         trials.append(replace(trial, **single, progress=None, sim_progress=None))
     return list(zip(trials, counts.values(), strict=True))
+
+
+def _is_fraction(text: str) -> bool:
+    """Say of most fields without further ado that they hold a number from 0 to 1, or nothing."""
+    try:
+        return not text or 0 <= float(text) <= 1
+    except ValueError:
+        return False
 
 
 class _Ids:
