@@ -7,6 +7,7 @@ from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.axes import axis_tables, progress_table
 from evaluator.compare.baselines import baseline_results
+from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
@@ -154,6 +155,7 @@ def _tables(
     """Lay out what was found; ``word`` is what the recorded side is called."""
     groups, measurements = found.groups, found.measurements
     return (
+        *conclusions_table(groups, rows),
         success_table(groups, word),
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),

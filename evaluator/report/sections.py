@@ -23,6 +23,12 @@ class Section:
 
 SECTIONS: tuple[Section, ...] = (
     Section(
+        id="conclusions",
+        title="Task by task",
+        lead="The numbers behind the sentences of the first page.",
+        tables=("conclusions", "intake"),
+    ),
+    Section(
         id="published",
         title="The printed figures, recomputed",
         lead="A published table is taken at its rows; every printed figure that does not follow "
@@ -72,7 +78,7 @@ SECTIONS: tuple[Section, ...] = (
             "axes",
             "progress",
         ),
-        figures=("scatter",),
+        figures=("scatter", "tasks"),
     ),
     Section(
         id="replanning",
