@@ -1,6 +1,6 @@
 """What an evaluation means, task by task: bias, worth of a yes, whether the ranking is settled.
 
-And what it could not have seen: the smallest difference that so many trials would call real.
+And what it could not have seen: the smallest difference that so many trials would show.
 """
 
 import math
@@ -47,7 +47,7 @@ def conclusions_table(
         "success, and those that then succeeded. Ranked: whether the recorded trials settle which "
         "candidate is best; more trials, of the best and the next together, that would with 80 % "
         "power if the rates are as they look. Smallest: the difference of two candidates, and of "
-        "sim and recorded, that so many trials would call real with 80 % power (unpaired)."
+        "sim and recorded, that so many trials would show with 80 % power (unpaired)."
     )
     return (Table.of(lines, id="conclusions", title="What it means, task by task", note=note),)
 
@@ -151,5 +151,3 @@ def direction(low: float | None, high: float | None) -> str:
     if low > 0:
         return "optimistic"
     return "pessimistic" if high < 0 else ""
-
-

@@ -13,6 +13,7 @@ SHOWN_TASKS = 8
 SHOWN_MISSING = 6
 LONGEST = 150
 """Characters of one reason; the whole stands further down."""
+LONGEST_NOTE = 260
 FIGURES = ("tasks", "scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -45,7 +46,7 @@ def front(results: Results) -> Front:
         summary=_summary(results),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
-        notes=[(a, _short(b)) for a, b in about[:2]],
+        notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
         unseen=_unseen(rows),
         missing=[_short(text) for text in results.missing[:SHOWN_MISSING]],
         more_missing=max(0, len(results.missing) - SHOWN_MISSING),
@@ -150,10 +151,15 @@ def _number(cell: Cell) -> float | None:
     return float(cell) if is_number and cell is not None else None
 
 
-def _short(text: str) -> str:
-    if len(text) <= LONGEST:
+def _about(name: str) -> str:
+    """Write what a note is about in words."""
+    return "Pearson r" if name == "agreement.pearson_r" else name.replace("_", " ")
+
+
+def _short(text: str, longest: int = LONGEST) -> str:
+    if len(text) <= longest:
         return text
-    return text[:LONGEST].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
+    return text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
 
 
 def front_tables(results: Results) -> list[Table]:
