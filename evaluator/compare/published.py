@@ -384,6 +384,6 @@ def _table(findings: Sequence[Finding]) -> Table:
         ),
         note="A figure fits when it rounds to what is printed. Fits with arguments swapped: MMRV "
         "weighted by the gap of sim rates, where its definition (Li et al. 2024) weights by the "
-        "gap of recorded rates. Fits otherwise: the note says as what. Ambiguous: several counts round to "
-        "the rate, so it has no interval here. Row numbers as in the CSV.",
+        "gap of recorded rates. Fits otherwise: the note says as what. Ambiguous: several counts "
+        "round to the rate, so it has no interval here. Row numbers as in the CSV.",
     )

@@ -42,14 +42,15 @@ def front(results: Results) -> Front:
     rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
     notes = next((t for t in results.tables if t.id == "notes"), None)
     about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
+    missing = [text for text in results.missing if not text.startswith("figures without data")]
     return Front(
         summary=_summary(results),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
         unseen=_unseen(rows),
-        missing=[_short(text) for text in results.missing[:SHOWN_MISSING]],
-        more_missing=max(0, len(results.missing) - SHOWN_MISSING),
+        missing=[_short(text) for text in missing[:SHOWN_MISSING]],
+        more_missing=max(0, len(missing) - SHOWN_MISSING),
     )
 
 
@@ -72,13 +73,18 @@ def _bias_words(row: Row) -> str:
         return "the bias is not known"
     if low is None or high is None:
         word = "above" if bias > 0 else "below"
-        points = f"{abs(bias):.0f} points {word} the recorded rate" if round(bias) else "no gap"
+        points = f"{_points(bias)} {word} the recorded rate" if round(bias) else "no gap"
         return f"the twin shows {points}, without an interval"
     ends = f"[{low:+.0f}, {high:+.0f}]"
     found = direction(low, high)
     if found:
-        return f"the twin is {found} by {abs(bias):.0f} points {_sized(low, high)}"
+        return f"the twin is {found} by {_points(bias)} {_sized(low, high)}"
     return f"no bias is shown: {bias:+.0f} points {ends}"
+
+
+def _points(value: float) -> str:
+    size = round(abs(value))
+    return f"{size} {noun('point', size)}"
 
 
 def _sized(low: float, high: float) -> str:
@@ -112,7 +118,7 @@ def _summary(results: Results) -> str:
     if bias is not None and bias.value is not None and (bias.n or 0) > 1:
         word = "above" if bias.value > 0 else "below"
         ends = _ends(bias)
-        size = f"{abs(bias.value):.0f} points {word}" if round(bias.value) else "level with"
+        size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"
         parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:

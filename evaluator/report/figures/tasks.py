@@ -27,7 +27,7 @@ MAX_PANELS = 12
 ACROSS = 3
 SIDE_IN = (COLUMN_IN - 0.55 - 0.16 * (ACROSS - 1)) / ACROSS
 ABOVE_IN, BELOW_IN, STEP_IN = 0.2, 0.42, 0.17
-LONGEST_TITLE = 21
+LONGEST_TITLE = 18
 
 
 def tasks(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
@@ -100,7 +100,7 @@ def _panel(
         getattr(axes, f"set_{which}ticks")((0, 50, 100))
     title = words(task)
     title = title if len(title) <= LONGEST_TITLE else title[: LONGEST_TITLE - 2] + ".."
-    axes.set_title(title, fontsize=7.5, pad=2.5, loc="left")
+    axes.set_title(title, fontsize=6.5, pad=2.5, loc="left")
     axes.plot([0, 100], [0, 100], color=LIGHT["soft"], linewidth=0.8, dashes=(4, 3), zorder=1)
     points = sorted(members, key=lambda group: [rate.value or 0.0 for rate in group.pair])
     course = [tuple(100 * (rate.value or 0.0) for rate in group.pair) for group in points]
