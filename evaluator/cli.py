@@ -28,6 +28,8 @@ def evaluate(
     out: Path | None = None,
     fail_under: str | float | None = None,
     check_published: Path | None = None,
+    against: Path | None = None,
+    reviews: tuple[Path, ...] = (),
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
     goal: float | None = None,
     force: bool = False,
@@ -50,6 +52,10 @@ def evaluate(
             outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
+        against: A run or table with another twin's answers to the same recorded trials: say how
+            much better which one is, which trials flip, and which settings differ.
+        reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
+            of such files), beside those in RUN/reviews: kappa, and how PPV and r move.
         interval: Interval of success rates.
         goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
@@ -77,6 +83,7 @@ def evaluate(
     if source is not None:
         asked = _Asked(interval=interval, goal=goal, tables=tables, images=images, force=force)
         comparison, folder = _compare(sources, asked, output)
+        comparison = _with_others(comparison, sources, against, reviews, tables, output)
         if published is not None:
             comparison = _beside(comparison, published.comparison)
     elif published is not None and check_published is not None:
@@ -139,6 +146,26 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
     with SummaryCache(run.results_dir / FOLDER, fresh=asked.force, say=output.say) as cache:
         comparison = compare_run(run, **how, images=asked.images, cache=cache, output=output)
     return comparison, run.results_dir
+
+
+def _with_others(
+    comparison: "Comparison",
+    sources: Sequence[Path],
+    against: Path | None,
+    reviews: Sequence[Path],
+    tables: TableOptions,
+    output: Output,
+) -> "Comparison":
+    """Hold the results against another twin's, and against other raters' labels."""
+    from bridge.exchange.reviews import FOLDER, read_reviews
+    from evaluator.compare.raters import with_reviews
+    from evaluator.compare.several import with_against
+
+    if against is not None:
+        comparison = with_against(comparison, sources[0], against, options=tables, output=output)
+    kept = [source / FOLDER for source in sources if (source / FOLDER).is_dir()]
+    found = [review for path in (*kept, *reviews) for review in read_reviews(path, tables)]
+    return with_reviews(comparison, found) if found else comparison
 
 
 def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> "Comparison":

@@ -22,6 +22,7 @@ from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
+from evaluator.compare.sensitivity import sensitivity_table
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -170,6 +171,7 @@ def _tables(
         *found.decision_tables,
         *axis_tables(rows, word),
         *progress_table(rows, word),
+        *sensitivity_table(rows),
         *stopping_table(rows, goal),
         *(() if is_streamed(rows) else (trials_table(rows, word),)),
     )

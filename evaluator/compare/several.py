@@ -13,6 +13,7 @@ from bridge.exchange.results_intake import PUBLISHED, Left, Taken, is_large, loo
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare.against import against_tables
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.names import settle_names
 from evaluator.compare.notes import with_notes
@@ -20,6 +21,7 @@ from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.run import QUIET, ReadRun, compare_read, read_run
 from evaluator.compare.spreadsheet import rollout_note, row_from_record, unknown_sides
+from evaluator.compare.trial import Trial
 from evaluator.result import Cell, Exclusion, Table
 
 ALONE = "of several runs together; evaluate each run alone for it"
@@ -86,6 +88,50 @@ def compare_several(
         message = f"Nothing in {_named(sources)} could be read as results.\n{lines}"
         raise UsageError(message.rstrip())
     return replace(base, tables=(*base.tables, *_intake_table(gathered, base)))
+
+
+def with_against(
+    comparison: Comparison,
+    source: Path,
+    other: Path,
+    *,
+    options: TableOptions = AS_SAVED,
+    output: Output = QUIET,
+) -> Comparison:
+    """Add the paired comparison with another twin's answers to the same recorded trials.
+
+    Args:
+        comparison: What was evaluated.
+        source: Where it is from; settings of replays are read there.
+        other: A run or table with the other twin's answers.
+        options: How tables are read.
+        output: Shows progress.
+
+    Raises:
+        UsageError: When both are the same, or the other is nothing that can be read.
+        EvaluatorError: When they share no trial.
+    """
+    refuse_twice([source, other])
+    mine, theirs = (_answers(path, options, output) for path in (source, other))
+    tables = against_tables(
+        comparison.rows or mine[0],
+        theirs[0],
+        names=(source.resolve().stem, other.resolve().stem),
+        trials=(mine[1], theirs[1]),
+    )
+    return replace(comparison, tables=(*comparison.tables, *tables))
+
+
+def _answers(
+    path: Path, options: TableOptions, output: Output
+) -> tuple[Sequence[TrialRow], Sequence[Trial]]:
+    """Trials with the twin's answers, and of a run the replays behind them."""
+    if not (path / "episodes").is_dir():
+        return list(map(row_from_record, take(path, options).trials)), ()
+    run = RunFolder.open(path)
+    with SummaryCache(run.results_dir / FOLDER, say=output.say) as cache:
+        read = read_run(run, cache, output)
+    return read.rows, read.trials
 
 
 def refuse_twice(sources: Sequence[Path]) -> None:

@@ -136,11 +136,18 @@ SECTIONS: tuple[Section, ...] = (
         figures=("confusion", "costs", "reliability"),
     ),
     Section(
+        id="against",
+        title="Another twin, other raters",
+        lead="Which of two twins is right more often on the same trials, and what other labels "
+        "would change.",
+        tables=("against", "flips", "against_settings", "raters", "label_error", "review_causes"),
+    ),
+    Section(
         id="stages",
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
         numbers=(),
-        tables=("funnel", "success_curve", "failures"),
+        tables=("funnel", "success_curve", "failures", "sensitivity"),
         figures=("funnel",),
     ),
     Section(
