@@ -126,11 +126,10 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
     from bridge.errors import UsageError
     from bridge.exchange.trials_csv import trials_path
     from evaluator.cache import FOLDER, SummaryCache
-    from evaluator.compare import compare_csv, compare_run
+    from evaluator.compare import compare_run
 
     source = sources[0]
     beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
-    how = {"method": asked.interval, "goal": asked.goal}
     is_run = any((source / name).is_dir() for name in ("episodes", "derived", "scene", "notes"))
     is_results = source.is_file() or (source.is_dir() and not is_run and any(source.iterdir()))
     if len(sources) > 1 or is_results:
@@ -138,13 +137,20 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
             message = "images go with one run folder, or with --reference and no table."
             raise UsageError(message)
         if source.is_file() and len(sources) == 1:
-            return compare_csv(source, **how, options=asked.tables), beside
+            return _compare_table(source, asked), beside
         return _compare_several(sources, asked, output), beside
     run = RunFolder.open(source)
     if not trials_path(run).is_file():
         run.refuse_empty()
     with SummaryCache(run.results_dir / FOLDER, fresh=asked.force, say=output.say) as cache:
-        comparison = compare_run(run, **how, images=asked.images, cache=cache, output=output)
+        comparison = compare_run(
+            run,
+            method=asked.interval,
+            goal=asked.goal,
+            images=asked.images,
+            cache=cache,
+            output=output,
+        )
     return comparison, run.results_dir
 
 
@@ -166,6 +172,12 @@ def _with_others(
     kept = [source / FOLDER for source in sources if (source / FOLDER).is_dir()]
     found = [review for path in (*kept, *reviews) for review in read_reviews(path, tables)]
     return with_reviews(comparison, found) if found else comparison
+
+
+def _compare_table(source: Path, asked: _Asked) -> "Comparison":
+    from evaluator.compare import compare_csv
+
+    return compare_csv(source, method=asked.interval, goal=asked.goal, options=asked.tables)
 
 
 def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> "Comparison":

@@ -9,6 +9,7 @@ import difflib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +211,7 @@ def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[T
     left: list[Left] = []
     videos = [p for p in files if p.suffix == ".mp4" and SIMPLER_NAME.fullmatch(p.stem)]
     if videos:
-        _try(folder, lambda: take(folder, options), taken, left)
+        _try(folder, partial(take, folder, options), taken, left)
     for path in files:
         if path in videos:
             continue
@@ -221,7 +222,7 @@ def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[T
         elif is_large(path):
             left.append(Left(path=path, reason="too large beside others: evaluate it alone"))
         else:
-            _try(path, lambda path=path: take(path, options), taken, left)
+            _try(path, partial(take, path, options), taken, left)
     return _tell_apart(taken, folder), left
 
 

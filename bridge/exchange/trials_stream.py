@@ -87,8 +87,8 @@ def _count(table: TableText, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
             hint = "Columns other than trial_id, start_id and p_success must repeat"
             raise row.refuse(f"{MAX_PATTERNS} different rows before it", hint)
         counts[pattern] = 1
-        single = {"trial_id": "", "start_id": None, "p_success": None}
-        trials.append(replace(trial, **single, progress=None, sim_progress=None))
+        alike = replace(trial, trial_id="", start_id=None, p_success=None)
+        trials.append(replace(alike, progress=None, sim_progress=None))
     return list(zip(trials, counts.values(), strict=True))
 
 

@@ -124,12 +124,8 @@ def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str,
     p = mcnemar(pairs).p_mid if improved + worsened else None
     rates = [float(answers.mean()) for answers in right]
     lines = [_line("accuracy", names, rates, points / 100, n)]
-    lines[0] |= {
-        "low": tango.low / 100,
-        "high": tango.high / 100,
-        "method": tango.method,
-        "p": p,
-    }
+    lines[0]["low"], lines[0]["high"] = tango.low / 100, tango.high / 100
+    lines[0]["method"], lines[0]["p"] = tango.method, p
     draws = _draws(shared)
     for name, of in _statistics(shared).items():
         everything = np.arange(n)[None, :]
@@ -142,8 +138,8 @@ def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str,
             gaps = gaps[np.isfinite(gaps)]
             if len(gaps) > DRAWS // 2 and np.ptp(gaps) > 0:
                 low, high = np.quantile(gaps, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-                ends = {"low": float(low), "high": float(high), "method": "paired bootstrap"}
-                line |= ends
+                line["low"], line["high"] = float(low), float(high)
+                line["method"] = "paired bootstrap"
         lines.append(line)
     return lines
 

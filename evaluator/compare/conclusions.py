@@ -96,9 +96,10 @@ def _counted(members: Sequence[RateGroup]) -> Interval | None:
     if len(members) != 1:
         return None
     (group,) = members
-    if group.trial_table is not None and sum(group.trial_table):
-        _, only_sim, only_recorded, _ = group.trial_table
-        return tango_points(only_sim, only_recorded, sum(group.trial_table))[1]
+    if group.trial_table is not None and any(group.trial_table):
+        both, only_sim, only_recorded, neither = group.trial_table
+        n = both + only_sim + only_recorded + neither
+        return tango_points(only_sim, only_recorded, n)[1]
     real, sim = group.recorded, group.sim
     if real.k is None or not real.n or sim.k is None or not sim.n:
         return None

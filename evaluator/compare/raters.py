@@ -21,6 +21,7 @@ FEWEST = 8
 ERRORS = (0.02, 0.05, 0.1)
 """Shares of wrong labels that are tried beside the one that the raters show."""
 MIN_GROUPS = 3
+QUANTILES = (0.025, 0.5, 0.975)
 Labels = Mapping[str, bool]
 
 
@@ -113,12 +114,12 @@ def _label_tables(
         ppv, r = _ppv_and_r([answered[n] for n in both], np.array([[labels[n] for n in both]]))
         lines.append(_label_line(f"labels of {rater}", len(both), ppv, r))
     both = [name for name in raters[OPERATOR] if name in answered]
-    labels = np.array([raters[OPERATOR][name] for name in both])
+    operator = np.array([raters[OPERATOR][name] for name in both])
     disagree = [1 - int(str(x["agree"])) / int(str(x["trials"])) for x in agreement]
     shown = max(disagree) / 2  # of two raters who disagree one is wrong
     rng = np.random.default_rng(SEED)
     for share in sorted({*ERRORS, round(shown, 3)}):
-        flipped = labels[None, :] ^ (rng.random((DRAWS, len(labels))) < share)
+        flipped = operator[None, :] ^ (rng.random((DRAWS, len(operator))) < share)
         found = _ppv_and_r([answered[name] for name in both], flipped)
         words = f"{100 * share:g} % of labels wrong at random"
         words += " (half of what raters disagree on)" if share == round(shown, 3) else ""
@@ -137,11 +138,12 @@ def _label_line(
     line: dict[str, Cell] = {"labels": words, "trials": n}
     for name, values in (("PPV", ppv), ("Pearson r", r)):
         known = values[np.isfinite(values)]
-        several = len(known) > 1
-        low, middle, high = np.quantile(known, [0.025, 0.5, 0.975]) if len(known) else (None,) * 3
-        line[name] = None if middle is None else round(float(middle), 3)
-        line[f"{name} low"] = round(float(low), 3) if several else None
-        line[f"{name} high"] = round(float(high), 3) if several else None
+        line |= {name: None, f"{name} low": None, f"{name} high": None}
+        if len(known):
+            low, middle, high = (round(float(v), 3) for v in np.quantile(known, QUANTILES))
+            line[name] = middle
+            if len(known) > 1:
+                line |= {f"{name} low": low, f"{name} high": high}
     return line
 
 

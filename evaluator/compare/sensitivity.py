@@ -18,6 +18,8 @@ their intervals say nothing."""
 MIN_TRIALS = 10
 MOST_ROWS = 2000
 """Trials of the joint estimate; of more, the first are taken evenly."""
+MOST_TERMS = 12
+"""Terms of one joint estimate."""
 LEAST_SPREAD_M = 0.005
 """Starts that lie within this are the same start."""
 
@@ -197,7 +199,7 @@ def _chosen(factors: Sequence[Factor], n: int) -> tuple[list[Factor], list[Facto
     columns = [np.ones(n)]
     for factor in factors:
         tried = np.column_stack([*columns, factor.column])
-        enough = (tried.shape[1]) * TRIALS_PER_TERM <= n
+        enough = tried.shape[1] * TRIALS_PER_TERM <= n and len(kept) < MOST_TERMS
         if enough and np.linalg.matrix_rank(tried) == tried.shape[1]:
             kept.append(factor)
             columns.append(factor.column)
