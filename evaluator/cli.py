@@ -1,10 +1,13 @@
 """Commands of ``evaluator``; imports stay late so that --help is quick."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.live.config import LiveConfig
 from evaluator.memory import without_collecting
@@ -21,15 +24,16 @@ THRESHOLD_NOT_MET = 3
 
 
 def evaluate(
-    source: Path | None = None,
-    /,
-    *,
+    *sources: Path,
     out: Path | None = None,
     fail_under: str | float | None = None,
     check_published: Path | None = None,
+    against: Path | None = None,
+    reviews: tuple[Path, ...] = (),
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
     goal: float | None = None,
     force: bool = False,
+    tables: Annotated[TableOptions, Parameter(name="*")] = AS_SAVED,
     images: Annotated[ImageOptions, Parameter(name="*")] = IMAGES,
     live: Annotated[LiveConfig, Parameter(name="*")] = LIVE,
     output: Output = Output(),  # noqa: B008  # frozen, and cyclopts reads the default
@@ -39,18 +43,24 @@ def evaluate(
     Example: robot-gst evaluate runs/monday --fail-under r=0.8
 
     Args:
-        source: A run folder, a trials CSV (one row per trial), a rates CSV (task, condition, side,
-            unit, n, rate), PolaRiS eval_results.csv, LeRobot eval_info.json, or a folder of SIMPLER
-            videos. May be left out with --check-published.
+        sources: A run folder, a table of trials (one row per trial) or of rates (task, condition,
+            policy, side, unit, n, rate) in CSV or JSON, PolaRiS eval_results.csv, LeRobot
+            eval_info.json, a folder of SIMPLER videos, or a folder of any of these. Several are one
+            study. May be left out with --check-published.
         out: Folder for the results; RUN/results, or NAME_results beside a table, without it.
         fail_under: Exit with 3 when a number stays below: 0.8 for the trials in which sim and
             outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.
         check_published: A published table (a rates CSV with printed figures): recompute it from
             its rows, and exit with 3 when a figure does not follow from them.
+        against: A run or table with another twin's answers to the same recorded trials: say how
+            much better which one is, which trials flip, and which settings differ.
+        reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
+            of such files), beside those in RUN/reviews: kappa, and how PPV and r move.
         interval: Interval of success rates.
         goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
+        tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
         live: Follow a session instead of evaluating what is there.
         output: How to talk.
@@ -64,13 +74,16 @@ def evaluate(
     if goal is not None and not 0 < goal < 1:
         message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
+    source = sources[0] if sources else None
     if live.live:
-        return _follow(source, live, goal, output)
+        return _follow(sources, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
-    published = None if check_published is None else recompute(check_published)
+    published = None if check_published is None else recompute(check_published, options=tables)
     second = beside(source)
     if source is not None:
-        comparison, folder = _compare(source, interval, goal, images, force, output)
+        asked = _Asked(interval=interval, goal=goal, tables=tables, images=images, force=force)
+        comparison, folder = _compare(sources, asked, output)
+        comparison = _with_others(comparison, sources, against, reviews, tables, output)
         if published is not None:
             comparison = _beside(comparison, published.comparison)
     elif published is not None and check_published is not None:
@@ -96,49 +109,100 @@ def evaluate(
     return THRESHOLD_NOT_MET if failed else 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """What was asked of the sources."""
+
+    interval: str
+    goal: float | None
+    tables: TableOptions
+    images: ImageOptions
+    force: bool
+
+
 @without_collecting()
-def _compare(
-    source: Path,
-    interval: str,
-    goal: float | None,
-    images: ImageOptions,
-    force: bool,
-    output: Output,
-) -> "tuple[Comparison, Path]":
+def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[Comparison, Path]":
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
     from bridge.exchange.trials_csv import trials_path
     from evaluator.cache import FOLDER, SummaryCache
-    from evaluator.compare import compare_csv, compare_run
+    from evaluator.compare import compare_run
 
+    source = sources[0]
     beside = source.with_name(f"{source.stem}_results") if source.name else Path("results")
-    is_table = not source.is_dir() and source.suffix.lower() in (".csv", ".json")
-    is_run = (source / "episodes").is_dir()
-    if is_table or (source.is_dir() and not is_run and any(source.rglob("*_obj_*.mp4"))):
-        if images != IMAGES:
-            message = "images go with a run folder, or with --reference and no table."
+    is_run = any((source / name).is_dir() for name in ("episodes", "derived", "scene", "notes"))
+    is_results = source.is_file() or (source.is_dir() and not is_run and any(source.iterdir()))
+    if len(sources) > 1 or is_results:
+        if asked.images != IMAGES:
+            message = "images go with one run folder, or with --reference and no table."
             raise UsageError(message)
-        return compare_csv(source, method=interval, goal=goal), beside
+        if source.is_file() and len(sources) == 1:
+            return _compare_table(source, asked), beside
+        return _compare_several(sources, asked, output), beside
     run = RunFolder.open(source)
     if not trials_path(run).is_file():
         run.refuse_empty()
-    with SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say) as cache:
+    with SummaryCache(run.results_dir / FOLDER, fresh=asked.force, say=output.say) as cache:
         comparison = compare_run(
-            run, method=interval, goal=goal, images=images, cache=cache, output=output
+            run,
+            method=asked.interval,
+            goal=asked.goal,
+            images=asked.images,
+            cache=cache,
+            output=output,
         )
     return comparison, run.results_dir
 
 
-def _follow(source: Path | None, live: LiveConfig, goal: float | None, output: Output) -> int:
+def _with_others(
+    comparison: "Comparison",
+    sources: Sequence[Path],
+    against: Path | None,
+    reviews: Sequence[Path],
+    tables: TableOptions,
+    output: Output,
+) -> "Comparison":
+    """Hold the results against another twin's, and against other raters' labels."""
+    from bridge.exchange.reviews import FOLDER, read_reviews
+    from evaluator.compare.raters import with_reviews
+    from evaluator.compare.several import with_against
+
+    if against is not None:
+        comparison = with_against(comparison, sources[0], against, options=tables, output=output)
+    kept = [source / FOLDER for source in sources if (source / FOLDER).is_dir()]
+    found = [review for path in (*kept, *reviews) for review in read_reviews(path, tables)]
+    return with_reviews(comparison, found) if found else comparison
+
+
+def _compare_table(source: Path, asked: _Asked) -> "Comparison":
+    from evaluator.compare import compare_csv
+
+    return compare_csv(source, method=asked.interval, goal=asked.goal, options=asked.tables)
+
+
+def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> "Comparison":
+    from evaluator.compare.several import compare_several
+
+    return compare_several(
+        sources,
+        method=asked.interval,
+        goal=asked.goal,
+        options=asked.tables,
+        force=asked.force,
+        output=output,
+    )
+
+
+def _follow(sources: Sequence[Path], live: LiveConfig, goal: float | None, output: Output) -> int:
     from bridge.errors import UsageError
     from bridge.terminal import stop_signals
     from evaluator.live.follow import follow
 
-    if source is None:
-        message = "evaluate --live needs the run folder that is recorded into."
+    if len(sources) != 1:
+        message = "evaluate --live needs the one run folder that is recorded into."
         raise UsageError(message)
     with stop_signals() as stop:
-        follow(source, live, goal=goal, stop=stop, output=output)
+        follow(sources[0], live, goal=goal, stop=stop, output=output)
     return 0
 
 

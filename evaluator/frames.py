@@ -16,7 +16,7 @@ from typing import Any
 import pandas as pd
 
 from bridge.errors import PathNotFoundError
-from bridge.exchange.trials_csv import TrialRecord
+from bridge.exchange.trials_csv import TrialRecord, tags_text
 from bridge.exchange.trials_csv import read_trials as read_csv
 from evaluator.measurements import RATES, quantity_of
 from evaluator.result import Measurement, load_results
@@ -47,7 +47,7 @@ GROUP_TYPES = {
 TRIAL_TYPES = {field.name: "string" for field in fields(TrialRecord)} | {
     **dict.fromkeys(("k", "n"), "Int64"),
     **dict.fromkeys(("recorded", "sim_planned", "sim_executed", "verdict", "stand_in"), "boolean"),
-    "p_success": "Float64",
+    **dict.fromkeys(("p_success", "progress", "sim_progress"), "Float64"),
 }
 
 
@@ -92,7 +92,8 @@ def read_trials(run: Path | str) -> pd.DataFrame:
     if not path.is_file():
         hint = "Make them first: robot-gst evaluate RUN."
         raise PathNotFoundError(path=path, what="trials", hint=hint)
-    return _frame((asdict(trial) for trial in read_csv(path)), TRIAL_TYPES)
+    rows = (asdict(trial) | {"tags": tags_text(trial.tags)} for trial in read_csv(path))
+    return _frame(rows, TRIAL_TYPES)
 
 
 def measurements_frame(measurements: Iterable[Measurement]) -> pd.DataFrame:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from bridge.errors import PathNotFoundError
-from bridge.exchange.trials_csv import NO, YES, TableError, TrialRecord, read_rows
+from bridge.exchange.table_text import TableError, read_rows
+from bridge.exchange.trials_csv import TrialRecord
 
 POLARIS_COLUMNS = ("episode", "episode_length", "success", "progress")
 SIMPLER_NAME = re.compile(r"(success|failure)_obj_(.+)")
@@ -78,7 +79,7 @@ def _simpler_trial(path: Path, name: re.Match[str]) -> TrialRecord:
 def read_polaris(path: Path) -> list[TrialRecord]:
     """Read PolaRiS' ``eval_results.csv``: the task is the folder it lies in.
 
-    ``success`` there is latched (ever reached); ``progress`` is partial credit and is not read.
+    ``success`` there is latched (ever reached); ``progress`` is partial credit, 0 to 1.
 
     Raises:
         TableError: Naming the row that cannot be believed.
@@ -88,9 +89,9 @@ def read_polaris(path: Path) -> list[TrialRecord]:
         episode = row.whole("episode")
         if episode is None:
             raise row.refuse("episode is empty", "Every trial needs its number")
-        text = row.text("success").lower().removesuffix(".0")
-        if text not in YES and text not in NO:
-            raise row.refuse(f"success is {text!r}", "PolaRiS writes True or False")
+        success = row.answer("success")
+        if success is None:
+            raise row.refuse("success is empty", "PolaRiS writes True or False")
         task = path.resolve().parent.name
         trial_id = f"{task}/{episode}"
         if trial_id in trials:
@@ -99,7 +100,8 @@ def read_polaris(path: Path) -> list[TrialRecord]:
             trial_id=trial_id,
             task=task,
             start_id=str(episode),
-            sim_planned=text in YES,
+            sim_planned=success,
+            sim_progress=row.fraction("progress"),
         )
     return list(trials.values())
 

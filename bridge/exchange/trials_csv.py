@@ -1,40 +1,33 @@
 """Trials CSV in and out: one row per trial, as people keep them in a spreadsheet.
 
 Columns: trial_id, task, condition, policy, start_id, unit, k, n, recorded, sim_planned,
-sim_executed, verdict, p_success, cell, stand_in. Only trial_id and task must be there; an empty
-field means unknown and stays unknown.
+sim_executed, verdict, p_success, cell, stand_in, progress, sim_progress, tags. Only task must be
+there (rows without trial_id are numbered); an empty field means unknown and stays unknown.
 """
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import BridgeError, PathNotFoundError, UsageError
+from bridge.errors import UsageError
+from bridge.exchange.table_text import (
+    AS_SAVED,
+    SourceRow,
+    TableOptions,
+    TableText,
+    open_table,
+    require,
+    rows_of,
+)
 from bridge.whole_file import write_whole
 
 UNITS = ("trial", "object", "subtask")
-YES = ("success", "true", "yes", "1", "accepted")
-NO = ("failure", "false", "no", "0", "refused", "rejected")
-UNKNOWN = ("", "unknown", "undecided", "none")
-MOST = 10**12
-"""Counted in one field; beyond it a count is a slip, and soon no number that a float holds."""
 MOST_IN_TRIAL = 10_000
 """Objects or sub-tasks of one trial."""
-
-
-class TableError(BridgeError):
-    """A row of a table from elsewhere cannot be believed."""
-
-    def __init__(self, *, path: Path, row: int | None, found: str, hint: str) -> None:
-        """Remember the file and the row as a spreadsheet numbers it (the header is row 1)."""
-        self.path = path
-        self.row = row
-        self.found = found
-        where = str(path) if row is None else f"{path} row {row}"
-        super().__init__(f"{where}: {found}. {hint}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,162 +49,95 @@ class TrialRecord:
     p_success: float | None = None
     cell: str = ""
     stand_in: bool | None = None
+    progress: float | None = None
+    """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
+    sim_progress: float | None = None
+    """The same in the twin."""
+    tags: tuple[tuple[str, str], ...] = ()
+    """What was varied, by axis: lighting, pose, distractor, start region."""
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
+SIDES_OF_TRIAL = ("recorded", "sim_planned", "sim_executed", "verdict", "k")
+"""A table of tasks with one of these columns is one of trials, numbered where they have no id."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceRow:
-    """One line of a CSV file with its row number, for messages."""
-
-    path: Path
-    row: int
-    values: Mapping[str, str]
-
-    def text(self, name: str) -> str:
-        """Return a field without the blanks around it; empty when the column is not there."""
-        return (self.values.get(name) or "").strip()
-
-    def refuse(self, found: str, hint: str) -> TableError:
-        """Build the error that names this row.
-
-        Args:
-            found: What is wrong, such as ``unit 'trial' in task 'a'``.
-            hint: What to do about it.
-        """
-        return TableError(path=self.path, row=self.row, found=found, hint=hint)
-
-    def whole(self, name: str) -> int | None:
-        """Read a whole number from 0 to ``MOST``."""
-        number = self._number(name)
-        if number is None:
-            return None
-        if not (0 <= number <= MOST and number.is_integer()):
-            hint = f"{name} counts something: a whole number from 0 to {MOST:,}"
-            raise self.refuse(f"{name} is {self.text(name)!r}", hint)
-        return int(number)
-
-    def fraction(self, name: str) -> float | None:
-        """Read a number in 0..1."""
-        number = self._number(name)
-        if number is not None and not 0 <= number <= 1:
-            hint = f"{name} is a fraction from 0 to 1"
-            raise self.refuse(f"{name} is {self.text(name)!r}", hint)
-        return number
-
-    def _number(self, name: str) -> float | None:
-        """Return the number in a field, None when it is empty, -1 when it is not a number."""
-        text = self.text(name)
-        try:
-            return float(text) if text else None
-        except ValueError:
-            return -1.0
-
-    def answer(self, name: str) -> bool | None:
-        """Read yes, no or unknown."""
-        text = self.text(name).lower()
-        if text in UNKNOWN:
-            return None
-        if text in YES or text in NO:
-            return text in YES
-        hint = "Write success, failure or unknown (true/false and 1/0 are read too)"
-        raise self.refuse(f"{name} is {text!r}", hint)
-
-
-def read_rows(path: Path, required: Sequence[str], known: Sequence[str]) -> list[SourceRow]:
-    """Read a CSV file with a header.
+def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
+    """Open a table of trials.
 
     Args:
-        path: The file, in UTF-8.
-        required: Columns that must be there.
-        known: All columns that may be there.
+        path: The file.
+        options: Columns whose names differ from ours, and those that hold axes.
 
     Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it is no text, a column is missing, unknown or doubled, or a row is ragged.
+        TableError: When it has no task, or neither ids nor outcomes.
     """
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="table", hint="Give a CSV file.")
-    lines = list(numbered_lines(path))
-    if not lines:
-        raise TableError(path=path, row=None, found="empty", hint=f"Columns: {', '.join(known)}")
-    header = [name.strip() for name in lines[0][1]]
-    check_header(path, lines[0][0], header, required, known)
-    rows = []
-    for number, cells in lines[1:]:
-        if len(cells) != len(header):
-            raise TableError(
-                path=path,
-                row=number,
-                found=f"{len(cells)} fields where the header has {len(header)}",
-                hint="Quote fields that contain commas",
-            )
-        rows.append(SourceRow(path=path, row=number, values=dict(zip(header, cells, strict=True))))
-    if not rows:
-        raise TableError(
-            path=path, row=None, found="a header without rows", hint="Add at least one row"
-        )
-    return rows
+    table = open_table(path, COLUMNS, options)
+    if any(name in table.header for name in SIDES_OF_TRIAL):
+        return require(table, ("task",), COLUMNS)
+    return require(table, ("trial_id", "task"), COLUMNS)
 
 
-def header_of(path: Path) -> list[str]:
-    """Return the column names of a CSV file, to tell which table it is."""
-    if not path.is_file():
-        hint = "Give a run folder, or a CSV file."
-        raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
-    return next(([name.strip() for name in cells] for _, cells in numbered_lines(path)), [])
-
-
-def numbered_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the lines of a CSV file with their numbers; blank ones and comments are left out.
-
-    Raises:
-        TableError: When it is no text.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            for number, cells in enumerate(csv.reader(stream), start=1):
-                if any(cells) and not cells[0].startswith("#"):
-                    yield number, cells
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise TableError(
-            path=path, row=None, found=f"not a CSV file ({error})", hint="Save it as UTF-8 CSV"
-        ) from error
-
-
-def check_header(
-    path: Path, row: int, header: list[str], required: Sequence[str], known: Sequence[str]
-) -> None:
-    """Refuse a header that lacks a column, or has an unknown or doubled one.
-
-    Args:
-        path: The file, for the error.
-        row: Line number of the header, for the error.
-        header: Its column names.
-        required: Columns that must be there.
-        known: All columns that may be there.
-
-    Raises:
-        TableError: Naming the columns.
-    """
-    columns = f"Columns: {', '.join(known)}; needed: {', '.join(required)}"
-    absent = [name for name in required if name not in header]
-    strange = [name for name in header if name not in known]
-    doubled = sorted({name for name in header if header.count(name) > 1})
-    for names, what in ((absent, "no column"), (strange, "unknown column"), (doubled, "two of")):
-        if names:
-            listed = ", ".join(repr(name) for name in names)
-            raise TableError(path=path, row=row, found=f"{what} {listed}", hint=columns)
-
-
-def read_trials(path: Path) -> list[TrialRecord]:
+def read_trials(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
     """Read and check a trials CSV.
+
+    Args:
+        path: The file.
+        options: Columns whose names differ from ours, and those that hold axes.
 
     Raises:
         TableError: For a doubled trial id, an impossible count, or two units in one task.
     """
-    rows = read_rows(path, ("trial_id", "task"), COLUMNS)
+    return trials_of(rows_of(open_trials(path, options)))
+
+
+def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[TrialRecord]:
+    """Read trials that a JSON file lists as objects with our columns as keys.
+
+    Args:
+        path: The file, for errors.
+        items: One for each trial.
+
+    Raises:
+        TableError: As ``read_trials``; rows are counted from 1.
+    """
+    return trials_of(json_rows(path, items, COLUMNS))
+
+
+def json_rows(
+    path: Path, items: Sequence[dict[str, object]], known: Sequence[str]
+) -> list[SourceRow]:
+    """Return the objects of a JSON list as rows of a table; other keys than ours are not read.
+
+    Args:
+        path: The file, for errors.
+        items: One for each row.
+        known: The keys that are read.
+    """
+    return [
+        SourceRow(
+            path=path,
+            row=number,
+            values={name: _json_text(item[name]) for name in known if name in item},
+        )
+        for number, item in enumerate(items, start=1)
+    ]
+
+
+def _json_text(value: object) -> str:
+    if isinstance(value, dict):
+        return tags_text(value.items())
+    if value is None or isinstance(value, str):
+        return value or ""
+    return json.dumps(value)
+
+
+def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
+    """Check the rows of a table of trials, each alone and beside the others.
+
+    Raises:
+        TableError: For a doubled trial id, an impossible count, or two units in one task.
+    """
     seen: dict[str, int] = {}
     units: dict[str, tuple[str, int]] = {}
     trials = []
@@ -254,7 +180,7 @@ def read_trial(row: SourceRow) -> TrialRecord:
         TableError: For what no trial can be.
     """
     for name in ("trial_id", "task"):
-        if not row.text(name):
+        if not row.text(name) and (name == "task" or name in row.values):
             raise row.refuse(f"{name} is empty", f"Every trial needs a {name}")
     unit = row.text("unit") or "trial"
     if unit not in UNITS:
@@ -280,7 +206,7 @@ def read_trial(row: SourceRow) -> TrialRecord:
         if recorded is None and unit == "trial" and not row.text("recorded"):
             recorded = k == 1
     return TrialRecord(
-        trial_id=row.text("trial_id"),
+        trial_id=row.text("trial_id") or f"row_{row.row}",
         task=row.text("task"),
         condition=row.text("condition"),
         policy=row.text("policy"),
@@ -295,7 +221,22 @@ def read_trial(row: SourceRow) -> TrialRecord:
         p_success=row.fraction("p_success"),
         cell=row.text("cell"),
         stand_in=row.answer("stand_in"),
+        progress=row.fraction("progress"),
+        sim_progress=row.fraction("sim_progress"),
+        tags=_tags(row),
     )
+
+
+def _tags(row: SourceRow) -> tuple[tuple[str, str], ...]:
+    """Read what was varied: ``lighting=dim; pose=far``, and the columns that hold an axis each."""
+    tags = {axis: row.text(str(column)) for axis, column in row.axes.items()}
+    for part in filter(None, map(str.strip, row.text("tags").split(";"))):
+        axis, equals, value = (text.strip() for text in part.partition("="))
+        if not (equals and axis and value) or axis in tags:
+            hint = "Write axis=value, each axis once: lighting=dim; pose=far"
+            raise row.refuse(f"tags are {row.text('tags')!r}", hint)
+        tags[axis] = value
+    return tuple((axis, value) for axis, value in tags.items() if value)
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
@@ -319,10 +260,17 @@ def trials_text(trials: Iterable[TrialRecord]) -> str:
     return stream.getvalue()
 
 
+def tags_text(tags: Iterable[tuple[str, str]]) -> str:
+    """Write what was varied as the column ``tags`` holds it: ``lighting=dim; pose=far``."""
+    return "; ".join(f"{axis}={value}" for axis, value in tags)
+
+
 def _field(name: str, value: object) -> str:
     if isinstance(value, bool):
         words = ("true", "false") if name == "stand_in" else ("success", "failure")
         return words[0] if value else words[1]
+    if isinstance(value, tuple):
+        return tags_text(value)
     return "" if value is None else str(value)
 
 

@@ -10,7 +10,8 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 
-from bridge.exchange.trials_csv import UNITS, SourceRow, TableError, read_rows
+from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
+from bridge.exchange.trials_csv import UNITS
 
 COLUMNS = ("task", "condition", "policy", "side", "unit", "k", "n", "rate", "rate_percent")
 SIDES = ("sim", "real", "stand-in")
@@ -44,14 +45,27 @@ class RateRecord:
     policy: str = ""
 
 
-def read_rates(path: Path) -> list[RateRecord]:
+def read_rates(path: Path, options: TableOptions = AS_SAVED) -> list[RateRecord]:
     """Read and check a rates CSV.
+
+    Args:
+        path: The file.
+        options: Columns whose names differ from ours.
+
+    Raises:
+        TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
+    """
+    return rates_of(read_rows(path, ("task", "side"), COLUMNS, options))
+
+
+def rates_of(rows: Sequence[SourceRow]) -> list[RateRecord]:
+    """Check the rows of a table of rates, each alone and beside the others.
 
     Raises:
         TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
     """
     records: list[RateRecord] = []
-    for row in read_rows(path, ("task", "side"), COLUMNS):
+    for row in rows:
         record = read_rate(row)
         check_beside(row, record, records)
         records.append(record)
@@ -104,7 +118,7 @@ def read_rate(row: SourceRow) -> RateRecord:
     """
     if not row.text("task"):
         raise row.refuse("task is empty", "Every rate needs its task")
-    side, unit = row.text("side"), row.text("unit") or "trial"
+    side, unit = row.text("side").lower(), row.text("unit") or "trial"
     if side not in SIDES:
         raise row.refuse(f"side is {side!r}", f"Sides: {', '.join(SIDES)}")
     if unit not in UNITS:
@@ -142,7 +156,7 @@ def printed_rate(row: SourceRow) -> tuple[Fraction, Fraction] | None:
     Raises:
         TableError: For what is not a rate.
     """
-    texts = {name: row.text(name) for name in ("rate", "rate_percent")}
+    texts = {name: row.figure(name) for name in ("rate", "rate_percent")}
     given = {name: text for name, text in texts.items() if text}
     if len(given) == 2:
         raise row.refuse("both rate and rate_percent", "Give one of them")

@@ -7,65 +7,47 @@ checked once, as ``read_trials`` checks it. Ids are compared through 64-bit hash
 
 import tempfile
 from array import array
-from collections.abc import Iterator
 from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 
-from bridge.errors import PathNotFoundError
-from bridge.exchange.trials_csv import (
-    COLUMNS,
+from bridge.exchange.table_text import (
+    AS_SAVED,
     SourceRow,
     TableError,
-    TrialRecord,
-    check_header,
-    check_unit,
-    numbered_lines,
-    read_trial,
+    TableOptions,
+    TableText,
 )
+from bridge.exchange.trials_csv import TrialRecord, check_unit, open_trials, read_trial
 
 FLUSH = 2**16
 """Hashes kept in memory before they go to disk."""
 PARTS = 256
 MAX_PATTERNS = 100_000
 """Distinct rows beyond which a table is not one of tasks, conditions and policies."""
-SINGLE = ("trial_id", "start_id", "p_success")
+SINGLE = ("trial_id", "start_id", "p_success", "progress", "sim_progress")
 """Columns that belong to one trial and are not counted."""
 
 
-class _Layout:
-    """Where the columns are."""
-
-    def __init__(self, path: Path, header: list[str]) -> None:
-        """Find the columns that every row is asked for."""
-        self.path = path
-        self.header = header
-        self.id_at = header.index("trial_id")
-        self.p_at = header.index("p_success") if "p_success" in header else None
-        self.counted = itemgetter(*(i for i, n in enumerate(header) if n not in SINGLE), -1)
-
-    def row(self, number: int, cells: list[str]) -> SourceRow:
-        """Name the fields of one row."""
-        values = dict(zip(self.header, cells, strict=True))
-        return SourceRow(path=self.path, row=number, values=values)
-
-
-def count_trials(path: Path) -> list[tuple[TrialRecord, int]]:
+def count_trials(path: Path, options: TableOptions = AS_SAVED) -> list[tuple[TrialRecord, int]]:
     """Count equal rows of a trials CSV; their ids are empty.
+
+    Args:
+        path: The file.
+        options: Columns whose names differ from ours, and those that hold axes.
 
     Raises:
         PathNotFoundError: When the file is not there.
         TableError: Naming the row that cannot be believed, or that is there twice.
     """
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="table", hint="Give a CSV file.")
+    table = open_trials(path, options)
     with tempfile.TemporaryDirectory(prefix="robot-gst-ids-") as folder, _Ids(Path(folder)) as ids:
-        found = _count(path, ids)
+        found = _count(table, ids)
         suspects = ids.doubled()
     if suspects:
-        _confirm(path, suspects)
+        _confirm(table, suspects)
     if not found:
         raise TableError(
             path=path, row=None, found="a header without rows", hint="Add at least one row"
@@ -73,49 +55,49 @@ def count_trials(path: Path) -> list[tuple[TrialRecord, int]]:
     return found
 
 
-def _count(path: Path, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
+def _count(table: TableText, ids: "_Ids") -> list[tuple[TrialRecord, int]]:
     counts: dict[tuple[str, ...], int] = {}
     trials: list[TrialRecord] = []
     units: dict[str, tuple[str, int]] = {}
-    for layout, number, cells in _rows(path):
-        trial_id = cells[layout.id_at].strip()
-        if not trial_id:
-            raise layout.row(number, cells).refuse("trial_id is empty", "Every trial needs one")
-        ids.add(trial_id)
-        if layout.p_at is not None and cells[layout.p_at]:
-            layout.row(number, cells).fraction("p_success")
-        pattern = layout.counted(
-            [*cells, ""]
-        )  # one more, so that it is a tuple even for one column
+    header = table.header
+    id_at = header.index("trial_id") if "trial_id" in header else None
+    fractions = [n for n in ("p_success", "progress", "sim_progress") if n in header]
+    checked = [(name, header.index(name)) for name in fractions]
+    skipped = {*SINGLE, *table.left}
+    # One more field, the empty text at the end, so that it is a tuple even for one column.
+    counted = itemgetter(*(i for i, name in enumerate(header) if name not in skipped), -1)
+    for number, cells in table.lines():
+        if id_at is not None:
+            trial_id = cells[id_at].strip()
+            if not trial_id:
+                raise table.row(number, cells).refuse("trial_id is empty", "Every trial needs one")
+            ids.add(trial_id)
+        for name, at in checked:
+            if not _is_fraction(cells[at]):
+                table.row(number, cells).fraction(name)
+        pattern = counted([*cells, ""])
         known = counts.get(pattern)
         if known is not None:
             counts[pattern] = known + 1
             continue
-        row = layout.row(number, cells)
+        row = table.row(number, cells)
         trial = read_trial(row)
         check_unit(row, trial, units)
         if len(counts) == MAX_PATTERNS:
             hint = "Columns other than trial_id, start_id and p_success must repeat"
             raise row.refuse(f"{MAX_PATTERNS} different rows before it", hint)
         counts[pattern] = 1
-        trials.append(replace(trial, trial_id="", start_id=None, p_success=None))
+        alike = replace(trial, trial_id="", start_id=None, p_success=None)
+        trials.append(replace(alike, progress=None, sim_progress=None))
     return list(zip(trials, counts.values(), strict=True))
 
 
-def _rows(path: Path) -> Iterator[tuple[_Layout, int, list[str]]]:
-    """Yield the rows with their numbers as a spreadsheet has them; comments are left out."""
-    layout: _Layout | None = None
-    for number, cells in numbered_lines(path):
-        if layout is None:
-            header = [name.strip() for name in cells]
-            check_header(path, number, header, ("trial_id", "task"), COLUMNS)
-            layout = _Layout(path, header)
-            continue
-        if len(cells) != len(layout.header):
-            found = f"{len(cells)} fields where the header has {len(layout.header)}"
-            hint = "Quote fields that contain commas"
-            raise TableError(path=path, row=number, found=found, hint=hint)
-        yield layout, number, cells
+def _is_fraction(text: str) -> bool:
+    """Say of most fields without further ado that they hold a number from 0 to 1, or nothing."""
+    try:
+        return not text or 0 <= float(text) <= 1
+    except ValueError:
+        return False
 
 
 class _Ids:
@@ -162,11 +144,11 @@ class _Ids:
         self._waiting = array("q")
 
 
-def _confirm(path: Path, suspects: set[int]) -> None:
+def _confirm(table: TableText, suspects: set[int]) -> None:
     """Refuse the first id that is really there twice; equal hashes alone prove nothing."""
     seen: dict[str, int] = {}
-    for layout, number, cells in _rows(path):
-        row = layout.row(number, cells)
+    for number, cells in table.lines():
+        row: SourceRow = table.row(number, cells)
         trial_id = row.text("trial_id")
         if hash(trial_id) not in suspects:
             continue
@@ -175,4 +157,4 @@ def _confirm(path: Path, suspects: set[int]) -> None:
                 f"trial_id {trial_id!r} stands in row {seen[trial_id]} already",
                 "Give each trial its own id, or remove the copy",
             )
-        seen[trial_id] = row.row
+        seen[trial_id] = number

@@ -180,6 +180,9 @@ def clusters_of(groups: Sequence[RateGroup]) -> tuple[list[str], int, str]:
         return [str(i) for i in range(len(groups))], len(groups), "groups"
     if len(set(policies)) >= MIN_CLUSTERS or len(set(policies)) > len(set(tasks)):
         return policies, len(set(policies)), "policies"
+    conditions = [c.condition for c in groups]
+    if len(set(tasks)) < MIN_CLUSTERS <= len(set(conditions)):
+        return conditions, len(set(conditions)), "conditions"
     return tasks, len(set(tasks)), "tasks"
 
 

@@ -5,7 +5,9 @@ from dataclasses import dataclass, replace
 
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
+from evaluator.compare.axes import axis_tables, progress_table
 from evaluator.compare.baselines import baseline_results
+from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
@@ -20,6 +22,7 @@ from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
+from evaluator.compare.sensitivity import sensitivity_table
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -153,6 +156,7 @@ def _tables(
     """Lay out what was found; ``word`` is what the recorded side is called."""
     groups, measurements = found.groups, found.measurements
     return (
+        *conclusions_table(groups, rows),
         success_table(groups, word),
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
@@ -165,6 +169,9 @@ def _tables(
         *found.stage_tables,
         *failures_table(rows, word),
         *found.decision_tables,
+        *axis_tables(rows, word),
+        *progress_table(rows, word),
+        *sensitivity_table(rows),
         *stopping_table(rows, goal),
         *(() if is_streamed(rows) else (trials_table(rows, word),)),
     )

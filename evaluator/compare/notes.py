@@ -318,6 +318,14 @@ def _asked_otherwise(
     return None
 
 
+def made_with(file: DerivedFile) -> dict[str, Any]:
+    """Return the settings that may change a verdict, by dotted name.
+
+    There are none of a replay that another program made.
+    """
+    return dict(_leaves(_made_with(file)))
+
+
 def _made_with(file: DerivedFile) -> dict[str, Any]:
     """Settings that may change a verdict; none of a replay that another program made."""
     config = file.derived.settings.get("config")

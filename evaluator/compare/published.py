@@ -4,13 +4,13 @@ The table is a rates CSV with two more columns: a row with a ``statistic`` holds
 (``printed``) instead of a rate. docs/examples/paper_table_published.csv is one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path
 
-from bridge.exchange.trials_csv import SourceRow, TableError, read_rows
+from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
 from bridge.exchange.trials_rates import (
     COLUMNS,
     SIDES,
@@ -48,6 +48,10 @@ OF_ONE_SIDE = ("average_percent", "gain_pp", "gain_relative_percent")
 AS_PRINTED, ROUNDED, DIFFERS = "as printed", "only from rounded figures", "differs"
 IMPOSSIBLE, UNDEFINED, NOT_PRINTED = "impossible", "undefined", "not in the table"
 AMBIGUOUS = "ambiguous"
+SWAPPED = "fits with arguments swapped"
+OTHERWISE = "fits otherwise"
+FEWEST = 3
+"""Groups from which r is defined."""
 FAILED = (ROUNDED, DIFFERS, IMPOSSIBLE, UNDEFINED)
 
 
@@ -75,6 +79,7 @@ class _Claim:
     """Empty for a figure over all tasks."""
     side: str
     condition: str
+    policy: str
     value: Decimal
     half: Fraction
     """Half a unit of the last printed digit."""
@@ -93,12 +98,15 @@ class PublishedCheck:
         return tuple(finding for finding in self.findings if finding.verdict in FAILED)
 
 
-def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
+def check_published(
+    path: Path, *, method: str = "wilson", options: TableOptions = AS_SAVED
+) -> PublishedCheck:
     """Recompute every printed figure of a table.
 
     Args:
         path: The table.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        options: Columns whose names differ from ours.
 
     Raises:
         TableError: Naming the row that cannot be read at all, or that is there twice.
@@ -106,7 +114,7 @@ def check_published(path: Path, *, method: str = "wilson") -> PublishedCheck:
     records: list[RateRecord] = []
     claims: list[_Claim] = []
     findings: list[Finding] = []
-    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA)):
+    for row in read_rows(path, ("task", "side", *EXTRA), (*COLUMNS, *EXTRA), options):
         if row.text("statistic"):
             claims.append(_claim(row))
             continue
@@ -142,6 +150,7 @@ def _claim(row: SourceRow) -> _Claim:
         task=row.text("task"),
         side="sim" if side == "sim" else "recorded",
         condition=row.text("condition"),
+        policy=row.text("policy"),
         value=value,
         half=half_digit(value),
     )
@@ -189,9 +198,14 @@ def _as_printed(row: SourceRow, rate: Fraction) -> RateRecord:
 
 
 def _judge(claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> Finding:
-    parts = (claim.statistic, claim.task, claim.side, claim.condition)
+    side = claim.side if claim.statistic in OF_ONE_SIDE else ""
+    parts = (claim.statistic, claim.task, side, claim.condition, claim.policy)
     what = " ".join(part for part in parts if part)
-    groups = [group for group in groups if claim.task in ("", group.task)]
+    groups = [
+        group
+        for group in groups
+        if claim.task in ("", group.task) and claim.policy in ("", group.policy)
+    ]
     printed = str(claim.value)
     try:
         value = _value(claim.statistic, claim.side, claim.condition, groups)
@@ -210,6 +224,7 @@ def _judge(claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim])
         verdict, note = AS_PRINTED, ""
     else:
         verdict, note = DIFFERS, f"printed {printed}, the rows give {shown}"
+        verdict, note = _fits_otherwise(claim, groups, shown) or (verdict, note)
         from_rounded = _from_rounded(claim, claims)
         if from_rounded is not None and _fits(from_rounded, claim):
             verdict = ROUNDED
@@ -222,6 +237,43 @@ def _judge(claim: _Claim, groups: Sequence[RateGroup], claims: Sequence[_Claim])
         verdict=verdict,
         note=note,
     )
+
+
+def _fits_otherwise(
+    claim: _Claim, groups: Sequence[RateGroup], shown: str
+) -> tuple[str, str] | None:
+    """Try the other readings of a figure: MMRV's arguments swapped, r per task averaged."""
+    chosen = [group for group in groups if claim.condition in ("", group.condition)]
+    recorded, sim = sides(chosen)
+    try:
+        if claim.statistic == "mmrv" and _fits(mmrv(recorded=recorded, sim=sim, gap="sim"), claim):
+            note = f"the gap of sim rates is weighted; by the gap of recorded rates it is {shown}"
+            return SWAPPED, note
+        if claim.statistic == "pearson_r" and not claim.task:
+            for words, value in _pooled_otherwise(chosen):
+                if _fits(value, claim):
+                    return OTHERWISE, f"it is {words}; over all groups r = {shown}"
+    except UndefinedStatisticError:
+        pass
+    return None
+
+
+def _pooled_otherwise(groups: Sequence[RateGroup]) -> Iterator[tuple[str, float]]:
+    """The other figures that are printed as the r of a table of tasks and policies."""
+    for kind in ("task", "policy", "condition"):
+        members: dict[str, list[RateGroup]] = {}
+        for group in groups:
+            members.setdefault(getattr(group, kind), []).append(group)
+        if not 1 < len(members) < len(groups):
+            continue
+        both = [sides(each) for each in members.values()]
+        if len(both) > 2:
+            yield (
+                f"r of the means per {kind}",
+                pearson([mean_rate(a) for a, _ in both], [mean_rate(b) for _, b in both]),
+            )
+        if all(len(a) > 2 for a, _ in both):
+            yield f"the mean of r per {kind}", mean_rate([pearson(a, b) for a, b in both])
 
 
 def _fits(value: float, claim: _Claim) -> bool:
@@ -266,22 +318,49 @@ def _from_rounded(claim: _Claim, claims: Sequence[_Claim]) -> float | None:
 
 def _not_printed(groups: Sequence[RateGroup], claims: Sequence[_Claim]) -> list[Finding]:
     """The correlation that a success table of both sides invites, where it is not printed."""
-    printed = {claim.condition for claim in claims if claim.statistic == "pearson_r"}
+    asked = [claim for claim in claims if claim.statistic == "pearson_r" and not claim.policy]
+    printed = {claim.condition for claim in asked if not claim.task}
     conditions = [*dict.fromkeys(group.condition for group in groups), ""]
-    findings = []
-    for condition in conditions:
-        if condition in printed:
+    findings = _per_task(groups, {claim.task for claim in asked})
+    for condition in dict.fromkeys(conditions):
+        num = sum(condition in ("", group.condition) for group in groups)
+        if condition in printed or (condition and num < FEWEST):
             continue
         value, instead = None, ""
         try:
             value = _value("pearson_r", "", condition, groups)
         except UndefinedStatisticError as error:
             instead = f"undefined: {error.reason}"
-        num = sum(condition in ("", group.condition) for group in groups)
         findings.append(
             Finding(
                 row=None,
                 what=f"pearson_r {condition or 'all groups'} (n = {num})",
+                printed="",
+                recomputed=value,
+                verdict=NOT_PRINTED,
+                instead=instead,
+            )
+        )
+    return findings
+
+
+def _per_task(groups: Sequence[RateGroup], printed: Container[str]) -> list[Finding]:
+    """The r inside each task, beside the pooled one that is usually printed."""
+    findings = []
+    for task in dict.fromkeys(group.task for group in groups):
+        members = [group for group in groups if group.task == task]
+        if task in printed or not FEWEST <= len(members) < len(groups):
+            continue
+        value, instead = None, ""
+        try:
+            value = _value("pearson_r", "", "", members)
+        except UndefinedStatisticError as error:
+            instead = f"undefined: {error.reason}"
+        what = f"pearson_r {task} (n = {len(members)})"
+        findings.append(
+            Finding(
+                row=None,
+                what=what,
                 printed="",
                 recomputed=value,
                 verdict=NOT_PRINTED,
@@ -303,6 +382,8 @@ def _table(findings: Sequence[Finding]) -> Table:
             )
             for f in findings
         ),
-        note="A figure fits when it rounds to what is printed. Ambiguous: several counts round to "
-        "the rate, so it has no interval here. Row numbers as in the CSV.",
+        note="A figure fits when it rounds to what is printed. Fits with arguments swapped: MMRV "
+        "weighted by the gap of sim rates, where its definition (Li et al. 2024) weights by the "
+        "gap of recorded rates. Fits otherwise: the note says as what. Ambiguous: several counts "
+        "round to the rate, so it has no interval here. Row numbers as in the CSV.",
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord, read_rates
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
+from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, vouched_rate
@@ -71,6 +72,7 @@ def compare_records(
         groups=groups,
         measurements=measurements,
         tables=(
+            *conclusions_table(groups),
             success_table(groups, word, "Rates as given."),
             *layout_table(groups, measurements, word),
             *gains_table(gains, word),

@@ -92,6 +92,11 @@ class TrialRow:
     """The same of the verdict before motion."""
     baselines: tuple[tuple[str, bool], ...] = ()
     """What forecasts without a twin say of the plan sent, by name; unknown ones are left out."""
+    progress: float | None = None
+    """How far the recorded trial came, 0 to 1, where somebody scored it."""
+    sim_progress: float | None = None
+    tags: tuple[tuple[str, str], ...] = ()
+    """What was varied, by axis: lighting, pose, distractor, start region."""
     count: int = 1
     """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     began_ns: int = 0

@@ -1,7 +1,7 @@
 """Read a run folder into a ``Comparison``."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from bridge.episode.provenance import hash_file, software
@@ -26,7 +26,7 @@ from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
 from evaluator.compare.study import retry_table
-from evaluator.compare.summaries import evaluation_pool, sum_up
+from evaluator.compare.summaries import Summaries, evaluation_pool, sum_up
 from evaluator.compare.trial import Trial, lay_out
 from evaluator.metrics.image_protocol import ImageOptions
 from evaluator.result import Exclusion
@@ -63,59 +63,166 @@ def compare_run(
     Raises:
         PathNotFoundError: When the run folder is not there.
     """
-    run = RunFolder.open(run.path)
     cache = SummaryCache(None) if cache is None else cache
+    read = read_run(RunFolder.open(run.path), cache, output)
+    contents = read.contents
+    nets = open_nets(images.backbones)
+    views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
+    methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
+    bands = _bands(contents)
+    base = compare_read([read], name=read.name, method=method, goal=goal)
+    # Words of what is missing come first, then those of images and bands.
+    return replace(
+        _with_parts(base, (views, methods, bands)),
+        bands=bands.curves,
+        views=(*views.views, *methods.views),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadRun:
+    """Everything of one run that its trials say."""
+
+    run: RunFolder
+    contents: RunContents
+    trials: list[Trial]
+    rows: list[TrialRow]
+    summaries: Summaries
+    exclusions: tuple[Exclusion, ...]
+    imported: int
+    """Trials of the run's own table of trials, and rows that it doubles."""
+    void_causes: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """What the run is called."""
+        return self.run.path.resolve().name
+
+    def renamed(self, names: Mapping[str, str]) -> "ReadRun":
+        """Return the same with other ids of episodes, which another run has too.
+
+        Args:
+            names: New id by the old one.
+        """
+
+        def told_apart(items: Iterable[Any]) -> Any:
+            return tuple(
+                replace(item, episode=names[item.episode]) if item.episode in names else item
+                for item in items
+            )
+
+        parts = {name: told_apart(items) for name, items in vars(self.summaries).items()}
+        return replace(
+            self,
+            rows=list(told_apart(self.rows)),
+            summaries=Summaries(**parts),
+            exclusions=told_apart(self.exclusions),
+        )
+
+    def without(self, episodes: Container[str], reason: str) -> "ReadRun":
+        """Return the same without some trials, which are named as left out.
+
+        Args:
+            episodes: Ids.
+            reason: Why they do not count.
+        """
+        there = {row.episode for row in self.rows if row.episode in episodes}
+        parts = {
+            name: tuple(item for item in items if item.episode not in there)
+            for name, items in vars(self.summaries).items()
+        }
+        gone = [Exclusion(episode=e, scope="everything", reason=reason) for e in sorted(there)]
+        return replace(
+            self,
+            rows=[row for row in self.rows if row.episode not in there],
+            summaries=Summaries(**parts),
+            exclusions=(*self.exclusions, *gone),
+        )
+
+
+def read_run(run: RunFolder, cache: SummaryCache, output: Output = QUIET) -> ReadRun:
+    """Read the trials of a run and sum them up; what cannot be read is left out and named.
+
+    Args:
+        run: The run folder.
+        cache: What earlier evaluations read.
+        output: Shows progress.
+    """
     with evaluation_pool() as pool:
         contents = read_contents(run, cache, output, pool)
         trials, left_out = trials_of(contents)
         summaries = sum_up(trials, cache, output, pool)
     recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
     imported, doubled = imported_rows(run, recorded_ids)
-    rows = [*with_rule((trial.row for trial in trials), summaries.rules), *imported]
-    nets = open_nets(images.backbones)
-    views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
-    methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
-    bands = _bands(contents)
+    protocol = read_protocol(run.path)
+    return ReadRun(
+        run=run,
+        contents=contents,
+        trials=trials,
+        rows=[*with_rule((trial.row for trial in trials), summaries.rules), *imported],
+        summaries=summaries,
+        exclusions=(*contents.left_out, *left_out, *doubled),
+        imported=len(imported) + len(doubled),
+        void_causes=VOID_CAUSES if protocol is None else protocol.void_causes,
+    )
+
+
+def compare_read(
+    reads: Sequence[ReadRun],
+    *,
+    name: str,
+    more_rows: Sequence[TrialRow] = (),
+    method: str = "wilson",
+    goal: float | None = None,
+) -> Comparison:
+    """Measure everything that the trials of some runs say together.
+
+    Args:
+        reads: The runs; an episode has another id in each.
+        name: What they are called together.
+        more_rows: Trials of tables beside them.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: Success rate to stop or continue for.
+    """
+    rows = [row for read in reads for row in read.rows]
+    rows += more_rows
+    summaries = Summaries(
+        **{
+            part: tuple(item for read in reads for item in getattr(read.summaries, part))
+            for part in Summaries.__dataclass_fields__
+        }
+    )
+    base = compare_rows(
+        rows,
+        run=name,
+        source="run",
+        stand_in=stand_in_of(
+            [*(row.stand_in for row in more_rows), *(mark for r in reads for mark in _marks(r))]
+        ),
+        method=method,
+        goal=goal,
+        void_causes=tuple(dict.fromkeys(cause for r in reads for cause in r.void_causes)),
+    )
+    trials = [trial for read in reads for trial in read.trials]
+    derived = [file for read in reads for file in read.contents.derived]
+    recorded = [(e.facts.info, e.facts.outcome) for r in reads for e in r.contents.recorded]
+    missing = [] if rows else ["trials: the run holds no recorded trial"]
+    left_out = [item for read in reads for item in read.exclusions]
+    base = replace(
+        base,
+        tables=(*with_notes(base.tables, check_settings(trials, derived)), *retry_table(recorded)),
+        exclusions=(*left_out, *base.exclusions, *summaries.left_out),
+        missing=(*missing, *base.missing),
+        motions=summaries.motions,
+        states=summaries.states,
+        provenance=_provenance(reads),
+    )
     parts = (
         motion_results(summaries.motions),
         state_results(summaries.states),
         label_results(summaries.perceived, rows, method=method),
-        views,
-        methods,
-        bands,
     )
-    protocol = read_protocol(run.path)
-    base = compare_rows(
-        rows,
-        run=run.path.resolve().name,
-        source="run",
-        stand_in=_stand_in(contents, imported),
-        method=method,
-        goal=goal,
-        void_causes=VOID_CAUSES if protocol is None else protocol.void_causes,
-    )
-    base = replace(
-        base,
-        tables=with_notes(base.tables, check_settings(trials, contents.derived)),
-    )
-    retried = retry_table([(each.facts.info, each.facts.outcome) for each in contents.recorded])
-    base = replace(base, tables=(*base.tables, *retried))
-    missing = [] if rows else ["trials: the run holds no recorded trial"]
-    base = replace(
-        base,
-        exclusions=(*contents.left_out, *left_out, *doubled, *base.exclusions, *summaries.left_out),
-        missing=(*missing, *base.missing),
-    )
-    return replace(
-        _with_parts(base, parts),
-        motions=summaries.motions,
-        states=summaries.states,
-        bands=bands.curves,
-        views=(*views.views, *methods.views),
-        provenance=_provenance(
-            contents, hash_file(trials_path(run)) if imported or doubled else None
-        ),
-    )
+    return _with_parts(base, parts)
 
 
 def _with_parts(base: Comparison, parts: Sequence[AnyPart]) -> Comparison:
@@ -164,18 +271,27 @@ def _bands(contents: RunContents) -> BandReport:
     return replace(report, exclusions=(*left_out, *report.exclusions))
 
 
-def _stand_in(contents: RunContents, imported: Sequence[TrialRow]) -> bool | None:
-    marks: list[bool | None] = [each.facts.info.stand_in for each in contents.recorded]
-    marks += [file.info.stand_in for file in contents.derived]
-    marks += [row.stand_in for row in imported]
-    return stand_in_of(marks)
+def _marks(read: ReadRun) -> Iterator[bool | None]:
+    yield from (each.facts.info.stand_in for each in read.contents.recorded)
+    yield from (file.info.stand_in for file in read.contents.derived)
+    recorded = {each.facts.info.id for each in read.contents.recorded}
+    yield from (
+        row.stand_in for row in read.rows if row.path is None and row.episode not in recorded
+    )
 
 
-def _provenance(contents: RunContents, imported_sha256: str | None) -> dict[str, Any]:
+def _provenance(reads: Sequence[ReadRun]) -> dict[str, Any]:
+    parts = [_provenance_of(read) for read in reads]
+    common = {"software": software(), "start_limit_m": START_LIMIT_M}
+    if len(parts) == 1:
+        return common | parts[0]
+    return common | {"runs": {str(r.run.path): p for r, p in zip(reads, parts, strict=True)}}
+
+
+def _provenance_of(read: ReadRun) -> dict[str, Any]:
+    contents = read.contents
     return {
-        "software": software(),
-        "start_limit_m": START_LIMIT_M,
-        "imported_trials": imported_sha256,
+        "imported_trials": hash_file(trials_path(read.run)) if read.imported else None,
         "episodes": {each.file.name: each.file.sha256 for each in contents.recorded},
         "derived": {
             file.name: {

@@ -6,19 +6,21 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import UsageError
-from bridge.exchange.benchmark_results import (
-    POLARIS_COLUMNS,
-    read_lerobot_eval,
-    read_polaris,
-    read_simpler,
+from bridge.exchange.results_intake import (
+    PUBLISHED,
+    STREAM_ABOVE_BYTES,
+    Taken,
+    is_large,
+    take,
 )
-from bridge.exchange.trials_csv import TrialRecord, header_of, read_trials, trials_path
+from bridge.exchange.table_text import AS_SAVED, TableOptions
+from bridge.exchange.trials_csv import TrialRecord, open_trials, read_trials, trials_path
 from bridge.exchange.trials_stream import count_trials
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.names import settle_names
 from evaluator.compare.notes import with_notes
 from evaluator.compare.published import check_published
-from evaluator.compare.rates import compare_rates
+from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import trials_in, unpaired_keys
 from evaluator.result import Exclusion
@@ -42,6 +44,9 @@ def row_from_record(record: TrialRecord) -> TrialRow:
         sim_executed=record.sim_executed,
         verdict=record.verdict,
         p_success=record.p_success,
+        progress=record.progress,
+        sim_progress=record.sim_progress,
+        tags=record.tags,
     )
 
 
@@ -73,52 +78,80 @@ def imported_rows(
     return [row for row in rows if row.episode not in recorded_ids], doubled
 
 
-STREAM_ABOVE_BYTES = 32 * 2**20
-"""A larger trials CSV is read row by row and only counted: about 300,000 trials."""
-
-
-def compare_csv(path: Path, *, method: str = "wilson", goal: float | None = None) -> Comparison:
+def compare_csv(
+    path: Path,
+    *,
+    method: str = "wilson",
+    goal: float | None = None,
+    options: TableOptions = AS_SAVED,
+) -> Comparison:
     """Compare a table, or another benchmark's result file or folder; its content tells which.
 
     Read are a trials CSV, a rates CSV, a published table (rates with printed figures),
-    ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, and a folder of SIMPLER videos.
+    ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, a JSON list of trials or rates,
+    and a folder of SIMPLER videos.
 
     Args:
         path: The table, result file or folder.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: The success rate that is asked about, 0 to 1; None asks nothing.
+        options: How a table is read.
 
     Raises:
         TableError: Naming the row that contradicts itself.
         UsageError: When it is none of these.
     """
-    found = _compare(path, method, goal)
+    if not path.is_dir() and path.suffix.lower() != ".json" and is_large(path):
+        found = _compare_streamed(path, method, options)
+    else:
+        found = compare_taken(take(path, options), method=method, goal=goal, options=options)
     if goal is None or any(table.id == "stopping" and table.rows for table in found.tables):
         return found
     missing = "stop or continue: --goal needs recorded outcomes of single trials, one after another"
     return replace(found, missing=(*found.missing, missing))
 
 
-def _compare(path: Path, method: str, goal: float | None) -> Comparison:
-    if path.is_dir():
-        return _from_benchmark(path, read_simpler(path), "SIMPLER", method)
-    if path.suffix.lower() == ".json":
-        return _from_benchmark(path, read_lerobot_eval(path), "LeRobot", method)
-    header = header_of(path)
-    if "trial_id" in header:
-        return compare_trials(path, method=method, goal=goal)
-    if "statistic" in header:
-        return check_published(path, method=method).comparison
-    if "side" in header:
-        return compare_rates(path, method=method)
-    if set(POLARIS_COLUMNS) <= set(header):
-        return _from_benchmark(path, read_polaris(path), "PolaRiS", method)
-    message = (
-        f"{path} is neither a trials CSV (no column trial_id) nor a rates CSV (no column side) nor "
-        f"PolaRiS results ({', '.join(POLARIS_COLUMNS)}); its columns are: "
-        f"{', '.join(header) or 'none'}."
+def compare_taken(
+    taken: Taken,
+    *,
+    method: str = "wilson",
+    goal: float | None = None,
+    options: TableOptions = AS_SAVED,
+) -> Comparison:
+    """Compare what one file or folder holds.
+
+    Args:
+        taken: What was read of it.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+        goal: The success rate that is asked about, 0 to 1; None asks nothing.
+        options: What becomes of names that differ only by case.
+    """
+    path, said = taken.path, [taken.said]
+    if taken.kind == PUBLISHED:
+        return check_published(path, method=method, options=options).comparison
+    if taken.rates:
+        settled, merged = settle_names(taken.rates, options.names)
+        base = compare_records(settled, path, method=method)
+        return replace(base, provenance={**base.provenance, "read_as": [*said, *merged]})
+    settled_rows, merged = settle_names(map(row_from_record, taken.trials), options.names)
+    stand_in = stand_in_of(record.stand_in for record in taken.trials)
+    base = compare_rows(
+        settled_rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
     )
-    raise UsageError(message)
+    if taken.rollouts:
+        base = replace(base, tables=with_notes(base.tables, [rollout_note(taken)]))
+    left_out = [] if taken.rollouts else unknown_sides(settled_rows)
+    return _with_source(base, path, left_out, [*said, *merged])
+
+
+def rollout_note(taken: Taken) -> tuple[str, str]:
+    """Say what closed-loop rollouts of another simulator are, and what they lack."""
+    note = (
+        f"{taken.kind} results are rollouts of a policy in that simulator, entered on the sim "
+        "side: no plan was sent and nothing was replayed. Add real trials of the same starts to "
+        "compare"
+    )
+    return taken.kind, note
 
 
 def compare_trials(
@@ -127,6 +160,7 @@ def compare_trials(
     method: str = "wilson",
     goal: float | None = None,
     stream_above: int = STREAM_ABOVE_BYTES,
+    options: TableOptions = AS_SAVED,
 ) -> Comparison:
     """Compare a trials CSV as if it were a run.
 
@@ -139,21 +173,17 @@ def compare_trials(
         goal: The success rate that is asked about, 0 to 1; None asks nothing, and so does a
             streamed table.
         stream_above: Size of the file from which it is streamed [bytes].
+        options: How the table is read.
     """
     if path.stat().st_size > stream_above:
-        return _compare_streamed(path, method)
-    records = read_trials(path)
-    rows = [row_from_record(record) for record in records]
-    stand_in = stand_in_of(record.stand_in for record in records)
-    base = compare_rows(
-        rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
-    )
-    return _with_source(base, path, _unknown(rows))
+        return _compare_streamed(path, method, options)
+    return compare_taken(take(path, options), method=method, goal=goal, options=options)
 
 
-def _compare_streamed(path: Path, method: str) -> Comparison:
-    counted = count_trials(path)
-    rows = [replace(row_from_record(record), episode="", count=count) for record, count in counted]
+def _compare_streamed(path: Path, method: str, options: TableOptions) -> Comparison:
+    counted = count_trials(path, options)
+    each = [replace(row_from_record(record), episode="", count=count) for record, count in counted]
+    rows, merged = settle_names(each, options.names)
     stand_in = stand_in_of(record.stand_in for record, _ in counted)
     base = compare_rows(rows, run=path.stem, source="trials", stand_in=stand_in, method=method)
     left_out = [
@@ -164,24 +194,11 @@ def _compare_streamed(path: Path, method: str) -> Comparison:
         )
         if lacking
     ]
-    return replace(_with_source(base, path, left_out), rows=())
+    said = open_trials(path, options).understood("trials", sum(count for _, count in counted))
+    return replace(_with_source(base, path, left_out, [said, *merged]), rows=())
 
 
-def _from_benchmark(
-    path: Path, records: Sequence[TrialRecord], name: str, method: str
-) -> Comparison:
-    """Enter outcomes of closed-loop rollouts on the sim side, and say what they are."""
-    rows = [row_from_record(record) for record in records]
-    base = compare_rows(rows, run=path.stem, source="trials", stand_in=None, method=method)
-    note = (
-        f"{name} results are rollouts of a policy in that simulator, entered on the sim side: no "
-        "plan was sent and nothing was replayed. Add real trials of the same starts to compare"
-    )
-    base = replace(base, tables=with_notes(base.tables, [(name, note)]))
-    return _with_source(base, path, ())
-
-
-def _unknown(rows: Sequence[TrialRow]) -> list[Exclusion]:
+def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
     """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
     unpaired = unpaired_keys(rows)
     return [
@@ -219,10 +236,15 @@ def record_from_row(row: TrialRow) -> TrialRecord:
         p_success=row.p_success,
         cell=row.cell,
         stand_in=row.stand_in,
+        progress=row.progress,
+        sim_progress=row.sim_progress,
+        tags=row.tags,
     )
 
 
-def _with_source(base: Comparison, path: Path, left_out: Sequence[Exclusion]) -> Comparison:
+def _with_source(
+    base: Comparison, path: Path, left_out: Sequence[Exclusion], said: Sequence[str]
+) -> Comparison:
     return replace(
         base,
         exclusions=(*left_out, *base.exclusions),
@@ -230,5 +252,6 @@ def _with_source(base: Comparison, path: Path, left_out: Sequence[Exclusion]) ->
             "software": software(),
             "file": path.name,
             "sha256": hash_file(path) if path.is_file() else None,
+            "read_as": list(said),
         },
     )

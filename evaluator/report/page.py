@@ -6,7 +6,7 @@ What the page says stands in ``templates/``; here is what it says it about, in r
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import count
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from bridge.errors import MissingDependencyError
 from evaluator.report import wording
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
+from evaluator.report.front import FIGURES, front, front_tables
 from evaluator.report.pairs import Picture, ViewPair, pictures_of
 from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section, numbers_of, section_of
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
@@ -35,16 +36,6 @@ SOURCES = {
     "rates": "a table of rates",
     "images": "folders of images",
 }
-CARDS = (
-    ("agreement.sim_planned.rate", "Sim and outcome agree"),
-    ("agreement.verdict.ppv", "Succeeds when the gate accepts"),
-    ("agreement.pearson_r", "Pearson r over groups"),
-    ("agreement.bias_pp", "Bias of sim"),
-    ("gain.pp.recorded.average", "Gain with replanning"),
-    ("motion.planned.position_mean_m", "Tool, recorded to planned"),
-    ("views.all.psnr_db", "PSNR of held-out views"),
-)
-SHOWN_CARDS = 6
 DRAWN = {
     "confusion": "confusion",
     "gate_costs": "costs",
@@ -81,17 +72,21 @@ class Part:
 
 def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewPair] = ()) -> str:
     """Build the page of the results, the figures made of them, and pictures of the worst views."""
+    shown_first = [pair for name in FIGURES for pair in figures if pair[0].id == name][:1]
+    tables_first = front_tables(results)
+    later = replace(results, tables=tuple(t for t in results.tables if t not in tables_first))
+    rest = [pair for pair in figures if pair not in shown_first]
     parts = [
         part
         for section in (*SECTIONS, OTHER)
-        if (part := _part(section, results, figures, pairs)) is not None
+        if (part := _part(section, later, rest, pairs)) is not None
     ]
     trials = next((table for table in results.tables if table.id == TRIALS), None)
-    names = [(part.section.id, part.section.title) for part in parts]
+    names = [("meaning", "What it means")]
+    names += [(part.section.id, part.section.title) for part in parts]
     names += [("trials-part", "Every trial")] if trials else []
     names += [("left-out", "Left out, and missing"), ("numbers", "Every number")]
     names += [("provenance", "Where it came from")]
-    by_id = {measurement.id: measurement for measurement in results.measurements}
     excluded = Table(
         id="exclusions",
         title="What was left out",
@@ -106,7 +101,9 @@ def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewP
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
             contents=names,
-            cards=[(label, by_id[name]) for name, label in CARDS if name in by_id][:SHOWN_CARDS],
+            first=front(results),
+            front_figures=shown_first,
+            front_tables=tables_first,
             parts=parts,
             trials=trials,
             excluded=excluded,

@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bridge.exchange.trials_csv import TrialRecord
+from bridge.exchange.trials_csv import TrialRecord, tags_text
 from bridge.whole_file import part_of
 from evaluator.arrow_columns import ANSWER, NUMBER, TEXT, WHOLE, column_of
 from evaluator.result import Cell, Measurement, Table
@@ -32,6 +32,9 @@ TRIAL_TYPES = {
     "p_success": NUMBER,
     "cell": TEXT,
     "stand_in": ANSWER,
+    "progress": NUMBER,
+    "sim_progress": NUMBER,
+    "tags": TEXT,
 }
 MEASUREMENT_TYPES = {
     "id": TEXT,
@@ -61,6 +64,7 @@ def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """
     names = [field.name for field in fields(TrialRecord)]
     columns = {name: [getattr(trial, name) for trial in trials] for name in names}
+    columns["tags"] = [tags_text(tags) or None for tags in columns["tags"]]
     return _write(path, columns, TRIAL_TYPES)
 
 

@@ -23,6 +23,12 @@ class Section:
 
 SECTIONS: tuple[Section, ...] = (
     Section(
+        id="conclusions",
+        title="Task by task",
+        lead="The numbers behind the sentences of the first page.",
+        tables=("conclusions", "intake"),
+    ),
+    Section(
         id="published",
         title="The printed figures, recomputed",
         lead="A published table is taken at its rows; every printed figure that does not follow "
@@ -69,8 +75,10 @@ SECTIONS: tuple[Section, ...] = (
             "agreement_intervals",
             "decisions",
             "leave_one_task_out",
+            "axes",
+            "progress",
         ),
-        figures=("scatter",),
+        figures=("scatter", "tasks"),
     ),
     Section(
         id="replanning",
@@ -128,11 +136,18 @@ SECTIONS: tuple[Section, ...] = (
         figures=("confusion", "costs", "reliability"),
     ),
     Section(
+        id="against",
+        title="Another twin, other raters",
+        lead="Which of two twins is right more often on the same trials, and what other labels "
+        "would change.",
+        tables=("against", "flips", "against_settings", "raters", "label_error", "review_causes"),
+    ),
+    Section(
         id="stages",
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
         numbers=(),
-        tables=("funnel", "success_curve", "failures"),
+        tables=("funnel", "success_curve", "failures", "sensitivity"),
         figures=("funnel",),
     ),
     Section(

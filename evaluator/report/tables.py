@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from evaluator.compare.tables import METHOD_NAMES
 from evaluator.report.views import Shown, View, is_number, used_columns, view
 from evaluator.report.wording import cell_text
 from evaluator.result import Table
@@ -198,9 +199,11 @@ _HYPHENS = re.compile("-(?=-)")
 def as_latex(table: Table) -> str:
     r"""Write a booktabs table: numbers to the right, no empty columns, the note below.
 
-    The document needs ``\usepackage{booktabs}``; a table wider than the page also ``graphicx``,
-    which shrinks it to the width of the text, and one longer than a page ``longtable``, which is
-    set in a smaller size where it is wide. Sentences are broken over lines.
+    The document needs ``\usepackage{booktabs,threeparttable}``; a table wider than the page also
+    ``graphicx``, which shrinks it to the width of the text, and one longer than a page
+    ``longtable``, which is set in a smaller size where it is wide. One wider than a column of a
+    two-column article spans both (``table*``). Sentences are broken over lines; the caption is
+    made from the content.
     """
     shown = view(table)
     used = used_columns(shown)
@@ -209,7 +212,7 @@ def as_latex(table: Table) -> str:
     written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
     body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in shown.rows]
     columns = f"@{{}}{align}@{{}}"
-    caption = rf"\caption{{{latex(table.title)}}}"
+    caption = rf"\caption{{{latex(caption_of(table))}}}"
     label = rf"\label{{tab:{_NAME.sub('-', table.id)}}}"
     note = [rf"\par\smallskip\footnotesize {latex(table.note)}"] if table.note else []
     if len(body) > LONG_ROWS:
@@ -231,16 +234,50 @@ def as_latex(table: Table) -> str:
         *(r"\bottomrule", r"\end{tabular}"),
     ]
     if characters > WIDE_CHARACTERS:
-        tabular = [r"\resizebox{\textwidth}{!}{%", *tabular, "}"]
+        tabular = [r"\resizebox{\textwidth}{!}{%", *tabular, "}", *note]
+    elif table.note:
+        notes = [r"\begin{tablenotes}", rf"\footnotesize\item {latex(table.note)}"]
+        tabular = [*tabular, *notes, r"\end{tablenotes}"]
+        tabular = [r"\begin{threeparttable}", caption, label, *tabular, r"\end{threeparttable}"]
+        caption = label = ""
+    kind = "table*" if characters > COLUMN_CHARACTERS else "table"
     lines = [
-        *(r"\begin{table}[t]", r"\centering", caption, label, r"\small"),
+        *(rf"\begin{{{kind}}}[t]", r"\centering", caption, label, r"\small"),
         *tabular,
-        *note,
-        r"\end{table}",
+        rf"\end{{{kind}}}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(filter(None, lines)) + "\n"
 
 
+def caption_of(table: Table) -> str:
+    """Return a caption that can stand alone: the title, over what, and which intervals.
+
+    Args:
+        table: Any table of the evaluation.
+    """
+    counts = []
+    for name, many in (("task", "tasks"), ("policy", "policies"), ("condition", "conditions")):
+        if name in table.columns:
+            values = {row[table.columns.index(name)] for row in table.rows} - {"", None}
+            if len(values) > 1:
+                counts.append(f"{len(values)} {many}")
+    over = f" over {' and '.join(counts)}" if counts else ""
+    methods = [
+        str(row[place])
+        for place, name in enumerate(table.columns)
+        if name in ("interval", "method", "agree interval")
+        for row in table.rows
+        if row[place]
+    ]
+    named = [METHOD_NAMES.get(name, name) for name in dict.fromkeys(methods)]
+    brackets = f" Brackets: 95 % intervals ({', '.join(named)})." if named else ""
+    title = table.title.rstrip(".")
+    ending = "" if title.endswith("?") and not over else "."
+    return f"{title}{over}{ending}{brackets}"
+
+
+COLUMN_CHARACTERS = 44
+"""A line of text in a column of a two-column article, in the small size of tables."""
 LONG_ROWS = 45
 """A table with more rows does not fit one page and is set over several (``longtable``)."""
 

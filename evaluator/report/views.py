@@ -293,8 +293,49 @@ def _published(frame: "pd.DataFrame") -> "pd.DataFrame":
     return frame.drop(columns="instead")
 
 
+def _axes(frame: "pd.DataFrame") -> "pd.DataFrame":
+    """Put the agreement and the gap of each value of an axis into one cell each."""
+    word = next(name for name in frame.columns if name.endswith(" rate") and name[:3] != "sim")
+    gap = next(name for name in frame.columns if name.startswith("sim - "))
+
+    def agree(row: Record) -> Shown:
+        shown = percent(row["agree rate"], row["agree low"], row["agree high"], digits=0)
+        if isinstance(shown, Figures):
+            return replace(shown, count=f"{row['agree k']}/{row['agree n']}")
+        return shown
+
+    def points(row: Record) -> Shown:
+        if not _known(row[gap]):
+            return None
+        return _points(row[gap], {"low": row["gap low"], "high": row["gap high"]})
+
+    shown = frame[["axis", "value", "trials"]].assign(agree=_each(frame, agree))
+    for name in (word, "sim rate"):
+        shown[name] = [percent(value, digits=0) for value in frame[name]]
+    return shown.assign(**{gap: _each(frame, points)})
+
+
+def _progress(frame: "pd.DataFrame") -> "pd.DataFrame":
+    gap = next(name for name in frame.columns if name.startswith("sim - "))
+
+    def difference(row: Record) -> Shown:
+        if not _known(row[gap]):
+            return None
+        ends = f"{row['low']:+.2f}, {row['high']:+.2f}" if _known(row["low"]) else ""
+        return Figures(f"{row[gap]:+.3f}", ends)
+
+    shown = frame.drop(columns=["low", "high"])
+    shown[gap] = _each(frame, difference)
+    for name in shown.columns:
+        if name.endswith((" mean", " of pairs")):
+            shown[name] = [round(x, 3) if _known(x) else None for x in shown[name]]
+    return shown
+
+
 _VIEWS: dict[str, Callable[["pd.DataFrame"], "pd.DataFrame"]] = {
     "success": _success,
+    "axes": _axes,
+    "progress": _progress,
     "gains": _gains,
     "layout": _layout,
     "success_curve": _curve,

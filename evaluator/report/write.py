@@ -13,6 +13,7 @@ from evaluator.report.figures.beside import Beside
 from evaluator.report.figures.distributions import worst_pairs
 from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
 from evaluator.report.figures.selection import drawable, drawings_of
+from evaluator.report.methods import methods
 from evaluator.report.page import page
 from evaluator.report.sections import TRIALS
 from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
@@ -20,6 +21,7 @@ from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
 SHOWN = (
+    "intake",
     "published",
     "success",
     "layout",
@@ -77,7 +79,9 @@ def write_report(comparison: Comparison, folder: Path, beside: Beside | None = N
     old = _old_files(folder, results)
     path = write_results(results, folder / "results.json")
     try:
-        tables = _write(_table_files(folder / "tables", results))
+        paper = dict(zip(("methods.tex", "references.bib"), methods(results), strict=True))
+        texts = {folder / "tables" / name: text.encode() for name, text in paper.items()}
+        tables = _write(_table_files(folder / "tables", results) | texts)
         _remove_old(folder, not_drawn, old)
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
@@ -151,7 +155,7 @@ def _old_files(folder: Path, results: Results) -> list[Path]:
 
     A paper that includes a table would else go on to print the numbers of another evaluation.
     """
-    now = {table.id for table in results.tables}
+    now = {table.id for table in results.tables} | {"methods", "references"}
     try:
         named = {path.stem for path in (folder / "tables").iterdir()} - now
         if not named:
@@ -206,6 +210,9 @@ def summary_text(results: Results, written: Written) -> str:
     banner = stand_in_sentence(results)
     if banner:
         parts.append(banner)
+    understood = results.provenance.get("read_as")
+    if isinstance(understood, list) and understood:
+        parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))
     shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("bands_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from bridge.errors import UsageError
-from bridge.exchange.trials_csv import TableError
+from bridge.exchange.table_text import TableError
 from bridge.exchange.trials_rates import read_rates
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv

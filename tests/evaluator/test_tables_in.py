@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.errors import PathNotFoundError, UsageError
-from bridge.exchange.trials_csv import TableError, TrialRecord, read_trials, write_trials
+from bridge.exchange.table_text import TableError
+from bridge.exchange.trials_csv import TrialRecord, read_trials, write_trials
 from bridge.exchange.trials_rates import read_rates
 from evaluator.compare import compare_csv, compare_run
 from evaluator.compare.spreadsheet import compare_trials, record_from_row, row_from_record
@@ -89,8 +90,10 @@ def test_unknown_stays_unknown(write_table: Callable[[str], Path]) -> None:
         ("trial_id,task,k,n\na,cube,4,5\n", r"one trial counts 5 trials"),
         ("trial_id,task,p_success\na,cube,1.5\n", r"p_success is '1.5'"),
         ("trial_id,task\na,cube,more\n", r"3 fields where the header has 2"),
-        ("trial_id,tsk\na,cube\n", r"no column 'task'"),
-        ("trial_id,task,mood\na,cube,good\n", r"unknown column 'mood'"),
+        ("trial_id,tsk\na,cube\n", r"unknown column 'tsk'. Is it 'task'"),
+        ("trial_id,job\na,cube\n", r"no column 'task'.*There are: trial_id, job"),
+        ("trial_id,task,recordd\na,cube,good\n", r"unknown column 'recordd'.*recorded=recordd"),
+        ("trial_id,task,Task\na,cube,good\n", r"two of 'task'"),
         ("trial_id,task\n", r"a header without rows"),
         ("trial_id,task\n,cube\n", r"trial_id is empty"),
     ],
@@ -150,7 +153,7 @@ def test_every_real_count_printed_with_enough_digits_is_found_again(
             "task,condition,side,unit,n,rate\nd,a,sim,trial,10,0.6\nd,a,real,object,50,0.46\n",
             r"row 3: unit 'object'.*row 2 says 'trial'",
         ),
-        ("task,side,rate\ncube,real,nan\n", r"rate is 'nan'"),
+        ("task,side,rate\ncube,real,nan\n", r"neither a rate nor"),
     ],
 )
 def test_rates_that_cannot_be_are_refused(

@@ -20,6 +20,7 @@ from evaluator.report.figures.distributions import (
 from evaluator.report.figures.drawing import Drawing, NotDrawn
 from evaluator.report.figures.gate import confusion, costs, reliability
 from evaluator.report.figures.rates import funnel, gains, scatter, success
+from evaluator.report.figures.tasks import tasks
 from evaluator.result import Measurement, Table
 
 
@@ -64,6 +65,7 @@ def drawings_of(data: Drawable) -> tuple[list[Drawing], list[NotDrawn]]:
     everything: tuple[Drawing | NotDrawn, ...] = (
         success(data.groups, data.word),
         scatter(data.groups, data.word),
+        tasks(data.groups, data.word),
         gains(data.gains, data.word),
         confusion(data.tables, data.word),
         costs(data.tables),

@@ -9,7 +9,7 @@ import pytest
 import robot_gst
 from bridge.errors import PathNotFoundError
 from bridge.exchange.benchmark_results import read_lerobot_eval, read_polaris, read_simpler
-from bridge.exchange.trials_csv import TableError
+from bridge.exchange.table_text import TableError
 
 ROB = "rob_0.147_0.028_rot_0.000_-0.000_3.142_rgb_overlay_bridge_real_eval_1"
 STATISTICS = "_moved_correct_obj_True_moved_wrong_obj_False_src_on_target_True"

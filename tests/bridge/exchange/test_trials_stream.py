@@ -9,7 +9,8 @@ import pytest
 
 from bridge.errors import PathNotFoundError
 from bridge.exchange import trials_stream
-from bridge.exchange.trials_csv import TableError, read_trials
+from bridge.exchange.table_text import TableError
+from bridge.exchange.trials_csv import read_trials
 from bridge.exchange.trials_stream import count_trials
 
 ROOT = Path(__file__).parents[3]
@@ -63,7 +64,7 @@ def test_counting_is_reading_and_adding_up(tmp_path: Path) -> None:
         ("trial_id,task\na,cube\n,cube\n", r"row 3: trial_id is empty"),
         ("trial_id,mood\na,good\n", r"no column 'task'"),
         ("trial_id,task\n", r"a header without rows"),
-        ("", r"a header without rows"),
+        ("", r"empty"),
     ],
 )
 def test_what_a_short_table_is_refused_for_a_long_one_is_too(

@@ -93,7 +93,8 @@ def test_the_keyboard_reaches_what_there_is_to_do(browser: Any, report: Path) ->
             break
         reached.append(name)
     assert reached[0] == "A.skip"
-    wanted = browser.ask("document.querySelectorAll('a,summary').length")
+    shown = "[...document.querySelectorAll('a,summary')].filter((e) => e.checkVisibility()).length"
+    wanted = browser.ask(shown)
     assert sum(name.startswith(("A.", "SUMMARY.")) for name in reached) == wanted
     browser.ask("document.querySelector('summary').focus()")
     browser.press("Enter")
@@ -106,6 +107,11 @@ def test_a_printed_report_is_dark_on_white_without_its_contents(browser: Any, re
     assert browser.ask(style.format("body", "backgroundColor")) == "rgb(255, 255, 255)"
     assert browser.ask(style.format("nav", "display")) == "none"
     assert browser.ask(style.format("figure svg text", "fill")) != "rgb(232, 235, 241)"
+    heights = "[...document.querySelectorAll('details.part:not([open]) > :not(summary)')].map("
+    heights += "(e) => e.getBoundingClientRect().height)"
+    folded = browser.ask(heights)
+    assert len(folded) > 5
+    assert sum(height > 0 for height in folded) > len(folded) / 2  # print unfolds every part
 
 
 def test_a_page_that_wants_to_load_something_is_noticed(browser: Any, report: Path) -> None:

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluator.compare import compare_csv
-from evaluator.report.tables import LONG_ROWS, as_latex, latex
+from evaluator.report.methods import methods
+from evaluator.report.tables import LONG_ROWS, as_latex, caption_of, latex
 from evaluator.result import Table
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
@@ -57,7 +58,7 @@ def check(text: str, columns: int, rows: int) -> None:
         assert depth >= 0
     assert depth == 0
     opened: list[str] = []
-    for kind, name in re.findall(r"\\(begin|end)\{([a-z]+)\}", text):
+    for kind, name in re.findall(r"\\(begin|end)\{([a-z*]+)\}", text):
         if kind == "begin":
             opened.append(name)
         else:
@@ -119,8 +120,11 @@ def test_tex_sets_the_tables(tmp_path: Path) -> None:
         table([(chr(code), "1") for code in range(0xA1, 0x180)]),
         *compare_csv(PAPER).tables,
     ]
-    packages = r"\usepackage{booktabs,graphicx,longtable}"
-    body = "\n".join(as_latex(item) for item in tables)
+    results = compare_csv(PAPER).results()
+    paragraph, bib = methods(results)
+    (tmp_path / "references.bib").write_text(bib)
+    packages = r"\usepackage{booktabs,graphicx,longtable,threeparttable}"
+    body = "\n".join(as_latex(item) for item in tables) + f"\n{paragraph}"
     text = f"\\documentclass{{article}}{packages}\\begin{{document}}{body}\\end{{document}}\n"
     (tmp_path / "all.tex").write_text(text)
     options = [] if "tectonic" in TEX else ["-interaction=nonstopmode", "-halt-on-error"]
@@ -128,6 +132,26 @@ def test_tex_sets_the_tables(tmp_path: Path) -> None:
         [TEX, *options, "all.tex"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_a_wide_table_spans_both_columns_and_notes_belong_to_the_table() -> None:
+    narrow, wide = table([("a", "1")], note="said below"), table([("a" * 30, "b" * 30)], note="n")
+    made, spanning = as_latex(narrow), as_latex(wide)
+    check(made, columns=2, rows=1)
+    check(spanning, columns=2, rows=1)
+    assert made.startswith(r"\begin{table}[t]")
+    assert spanning.startswith(r"\begin{table*}[t]")
+    for text in (made, spanning):
+        notes = text.index(r"\begin{tablenotes}")
+        assert text.index(r"\end{tabular}") < notes < text.index(r"\end{threeparttable}")
+
+
+def test_a_caption_says_over_what_and_which_intervals() -> None:
+    comparison = compare_csv(PAPER)
+    (success,) = (t for t in comparison.tables if t.id == "success")
+    assert caption_of(success) == (
+        "Success over 3 tasks and 2 conditions. Brackets: 95 % intervals (Wilson)."
+    )
 
 
 def test_hyphens_stay_hyphens_and_a_minus_is_one() -> None:

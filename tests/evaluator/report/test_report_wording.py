@@ -1,9 +1,19 @@
 """How a number is written: value, count and interval in one unit, said once."""
 
+import re
+from pathlib import Path
+from typing import Any
+
 import pytest
 
+from evaluator.compare import compare_csv
+from evaluator.report.front import front, sentence
+from evaluator.report.methods import methods
+from evaluator.report.page import page
 from evaluator.report.wording import measurement_text
 from evaluator.result import Interval, Measurement
+
+PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
 
 
 def measurement(name: str, value: float, unit: str, low: float, high: float) -> Measurement:
@@ -52,3 +62,56 @@ def test_a_relative_gain_says_what_it_rests_on() -> None:
 @pytest.mark.parametrize(("value", "text"), [(1e300, "1e+300"), (1.25e8, "1.25e+08")])
 def test_numbers_nobody_reads_digit_by_digit_are_short(value: float, text: str) -> None:
     assert measurement_text(Measurement(id="x", value=value, unit="1", definition="d")) == text
+
+
+def test_the_first_page_says_what_it_means_in_few_words() -> None:
+    """On the paper's table and on the widest published one: at most 700 words before a click."""
+    published = PAPER.parents[2] / "datasets" / "published" / "worldgym_bridge.csv"
+    for path in (PAPER, published):
+        results = compare_csv(path).results()
+        first = front(results)
+        assert first.summary
+        assert first.tasks
+        assert first.unseen
+        text = re.sub(r"<nav.*?</nav>|<style.*?</style>", " ", page(results), flags=re.S)
+        while "<details" in text:
+            text = re.sub(r"<details(?:(?!<details).)*?</details>", " ", text, flags=re.S)
+        words = re.sub(r"<[^>]+>", " ", text).split()
+        assert 60 < len(words) <= 700
+
+
+def row(**values: Any) -> dict[str, Any]:
+    names = ("bias (pp)", "low", "high", "yes", "yes and right", "ranked", "best recorded")
+    return dict.fromkeys((*names, "more trials")) | values
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        (
+            {"bias (pp)": 12.2, "low": 3.4, "high": 21.6, "yes": 18, "yes and right": 16},
+            "the twin is optimistic by 12 points [3, 22]; a yes was right in 16 of 18.",
+        ),
+        (
+            {"bias (pp)": -9.0, "low": -20.0, "high": -1.2, "ranked": "no", "more trials": 14},
+            "the twin is pessimistic by 9 points [1, 20]; enough to rank: no, 14 more trials "
+            "would do.",
+        ),
+        (
+            {"bias (pp)": 2.0, "low": -5.0, "high": 9.0, "ranked": "yes", "best recorded": "A"},
+            "no bias is shown: +2 points [-5, +9]; enough to rank: yes, A is best.",
+        ),
+    ],
+)
+def test_a_task_is_summed_up_in_one_sentence(values: dict[str, Any], text: str) -> None:
+    assert sentence(row(**values)) == text
+
+
+def test_methods_cite_what_was_used_and_nothing_else() -> None:
+    text, bib = methods(compare_csv(PAPER).results())
+    cited = {key for found in re.findall(r"\\cite\{([^}]*)\}", text) for key in found.split(",")}
+    assert cited == set(re.findall(r"@article\{(\w+),", bib))
+    assert {"wilson1927", "li2024", "boschloo1970"} <= cited
+    assert "mcnemar1947" not in cited  # no starts are paired in a table of rates
+    assert "6 groups" in text
+    assert bib.count("{") == bib.count("}")

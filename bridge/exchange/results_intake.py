@@ -1,0 +1,255 @@
+"""What a file or a folder of somebody's results holds, as far as its own words tell.
+
+Known are tables of trials and of rates (CSV, or JSON lists of objects with the same names), tables
+of printed figures, ``eval_info.json`` of LeRobot, ``eval_results.csv`` of PolaRiS and folders of
+SIMPLER videos. An outcome is never guessed: a file that does not say it is left, with the reason.
+"""
+
+import difflib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bridge.errors import BridgeError, PathNotFoundError, UsageError
+from bridge.exchange.benchmark_results import (
+    POLARIS_COLUMNS,
+    SIMPLER_NAME,
+    read_lerobot_eval,
+    read_polaris,
+    read_simpler,
+)
+from bridge.exchange.table_text import (
+    AS_SAVED,
+    TableError,
+    TableOptions,
+    TableText,
+    open_table,
+    read_rows,
+    rows_of,
+)
+from bridge.exchange.trials_csv import (
+    COLUMNS,
+    SIDES_OF_TRIAL,
+    TrialRecord,
+    json_rows,
+    open_trials,
+    read_trials_json,
+    trials_of,
+)
+from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
+from bridge.exchange.trials_rates import RateRecord, rates_of
+
+PUBLISHED, SIMPLER, POLARIS, LEROBOT = "a published table", "SIMPLER", "PolaRiS", "LeRobot"
+ROLLOUTS = (SIMPLER, POLARIS, LEROBOT)
+"""Benchmarks whose files hold the sim side alone."""
+READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".mp4")
+STREAM_ABOVE_BYTES = 4 * 2**20
+"""A larger trials CSV is read row by row and only counted: about 50,000 trials, whose single rows
+take some 200 MB."""
+MOST_FILES = 20_000
+"""Files of a folder that are looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken:
+    """What one file, or one folder of videos, was taken for."""
+
+    path: Path
+    kind: str
+    said: str
+    """What was understood, in one line."""
+    trials: tuple[TrialRecord, ...] = ()
+    rates: tuple[RateRecord, ...] = ()
+
+    @property
+    def rollouts(self) -> bool:
+        """Whether it holds rollouts of a simulator alone."""
+        return self.kind in ROLLOUTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Left:
+    """A file of a folder that was not read, and why."""
+
+    path: Path
+    reason: str
+
+
+def is_large(path: Path) -> bool:
+    """Whether a table is streamed: its rows are counted and not kept."""
+    return path.is_file() and path.stat().st_size > STREAM_ABOVE_BYTES
+
+
+def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
+    """Read a file, or a folder of SIMPLER videos; its content tells what it is.
+
+    Args:
+        path: The file or folder.
+        options: How a table is read.
+
+    Raises:
+        PathNotFoundError: When it is not there.
+        TableError: Naming the row that cannot be believed.
+        UsageError: When it is nothing that can be read.
+    """
+    if path.is_dir():
+        trials = read_simpler(path)
+        return _rollouts(path, SIMPLER, trials, f"{len(trials)} videos named by their outcome")
+    if path.suffix.lower() == ".json":
+        return _take_json(path)
+    # A slip in a name is told by the reader of the table, once it is known which one it is.
+    known = (*COLUMNS, *RATE_COLUMNS, "statistic", "printed", "success")
+    _refuse_unknown(options, known)
+    table = open_table(path, known, options, near=False)
+    header = table.header
+    if "statistic" in header:
+        return Taken(path=path, kind=PUBLISHED, said=f"{path.name}: rates with printed figures")
+    if "side" in header:
+        rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
+        return _taken_rates(path, rates_of(rows), options)
+    if set(POLARIS_COLUMNS) <= set(header):
+        trials = read_polaris(path)
+        return _rollouts(path, POLARIS, trials, f"{len(trials)} rollouts of its folder's task")
+    if "trial_id" in header or ("task" in header and set(SIDES_OF_TRIAL) & set(header)):
+        opened = open_trials(path, options)
+        trials = trials_of(rows_of(opened))
+        said = opened.understood("trials", len(trials))
+        return Taken(path=path, kind="trials", said=said, trials=tuple(trials))
+    raise UsageError(_unknown_table(table))
+
+
+def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
+    """Refuse a mapping onto a column that no table has."""
+    for name in options.mapped:
+        if name not in known:
+            names = ", ".join(dict.fromkeys(("outcome", *known)))
+            likely = difflib.get_close_matches(name, ("outcome", *known), n=1)
+            hint = f" Did you mean {likely[0]}?" if likely else ""
+            message = f"--map {name}=...: no such column.{hint} There are: {names}."
+            raise UsageError(message)
+
+
+def _unknown_table(table: TableText) -> str:
+    if set(POLARIS_COLUMNS[:2]) <= set(table.header):
+        return (
+            f"{table.path} are PolaRiS results without outcomes: columns "
+            f"{', '.join(POLARIS_COLUMNS[2:])} are not there, and no outcome is guessed."
+        )
+    return (
+        f"{table.path} is neither a trials CSV (no column trial_id, nor task with recorded or "
+        "sim_planned) nor a rates CSV (no column side) nor PolaRiS results "
+        f"({', '.join(POLARIS_COLUMNS)}); its columns are: {', '.join(table.header) or 'none'}. "
+        'Say which is which: --map "task=...,recorded=...,sim_planned=..."'
+    )
+
+
+def _taken_rates(path: Path, records: Sequence[RateRecord], options: TableOptions) -> Taken:
+    table = open_table(path, RATE_COLUMNS, options)
+    said = table.understood("rates", len(records))
+    return Taken(path=path, kind="rates", said=said, rates=tuple(records))
+
+
+def _rollouts(path: Path, kind: str, trials: Sequence[TrialRecord], what: str) -> Taken:
+    return Taken(path=path, kind=kind, said=f"{path.name}: {kind}, {what}", trials=tuple(trials))
+
+
+def _take_json(path: Path) -> Taken:
+    """Read ``eval_info.json`` of LeRobot, or a list of trials or rates."""
+    if not path.is_file():
+        hint = "Give a file of results."
+        raise PathNotFoundError(path=path, what="results file", hint=hint)
+    items = _listed(path)
+    if items is None:
+        trials = read_lerobot_eval(path)
+        return _rollouts(path, LEROBOT, trials, f"{len(trials)} episodes")
+    if all("side" in item and "task" in item for item in items):
+        records = rates_of(json_rows(path, items, RATE_COLUMNS))
+        said = f"{path.name}: rates, {len(records)} objects"
+        return Taken(path=path, kind="rates", said=said, rates=tuple(records))
+    if all("task" in item and set(SIDES_OF_TRIAL) & set(item) for item in items):
+        trials = read_trials_json(path, items)
+        said = f"{path.name}: trials, {len(trials)} objects"
+        return Taken(path=path, kind="trials", said=said, trials=tuple(trials))
+    message = (
+        f"{path} lists objects that are neither trials (task with recorded or sim_planned) nor "
+        "rates (task, side, rate)."
+    )
+    raise UsageError(message)
+
+
+def _listed(path: Path) -> list[dict[str, Any]] | None:
+    """Return the objects that a JSON file lists, alone or as trials or rates; None otherwise."""
+    try:
+        record = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        found = f"no JSON ({error})"
+        hint = "Give an eval_info.json of LeRobot, or a list of trials or rates"
+        raise TableError(path=path, row=None, found=found, hint=hint) from error
+    if isinstance(record, dict):
+        record = next((record[n] for n in ("trials", "rates") if n in record), None)
+    is_list = isinstance(record, list) and record
+    return record if is_list and all(isinstance(item, dict) for item in record) else None
+
+
+def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[Taken], list[Left]]:
+    """Find what can be read in a folder of results, and say what was left and why.
+
+    Args:
+        folder: With any files, at any depth.
+        options: How tables are read.
+
+    Raises:
+        PathNotFoundError: When it is no folder.
+    """
+    if not folder.is_dir():
+        raise PathNotFoundError(path=folder, what="folder of results", hint="Give a folder.")
+    files = sorted(path for path in folder.rglob("*") if path.is_file())[:MOST_FILES]
+    taken: list[Taken] = []
+    left: list[Left] = []
+    videos = [p for p in files if p.suffix == ".mp4" and SIMPLER_NAME.fullmatch(p.stem)]
+    if videos:
+        _try(folder, partial(take, folder, options), taken, left)
+    for path in files:
+        if path in videos:
+            continue
+        if path.suffix.lower() not in READ_ENDINGS:
+            left.append(Left(path=path, reason="no table, JSON or named video"))
+        elif path.suffix.lower() == ".mp4":
+            left.append(Left(path=path, reason="a video whose name tells no outcome"))
+        elif is_large(path):
+            left.append(Left(path=path, reason="too large beside others: evaluate it alone"))
+        else:
+            _try(path, partial(take, path, options), taken, left)
+    return _tell_apart(taken, folder), left
+
+
+def _try(path: Path, read: Callable[[], Taken], taken: list[Taken], left: list[Left]) -> None:
+    try:
+        taken.append(read())
+    except (BridgeError, UsageError) as error:
+        reason = str(error).replace(f"{path} ", "").replace(f"{path}: ", "")
+        left.append(Left(path=path, reason=reason))
+
+
+def _tell_apart(taken: Sequence[Taken], folder: Path) -> list[Taken]:
+    """Give the tasks of rollouts the folder's words where a file does not know them."""
+    several = len([each for each in taken if each.kind == LEROBOT]) > 1
+    if not several:
+        return list(taken)
+    return [
+        replace(each, trials=tuple(_in_folder(trial, each.path, folder) for trial in each.trials))
+        if each.kind == LEROBOT
+        else each
+        for each in taken
+    ]
+
+
+def _in_folder(trial: TrialRecord, path: Path, folder: Path) -> TrialRecord:
+    """Name a LeRobot rollout by the folder its file lies in, which is one evaluation's output."""
+    where = path.parent.relative_to(folder).as_posix()
+    if where == ".":
+        return trial
+    return replace(trial, policy=where, trial_id=f"{where}/{trial.trial_id}")

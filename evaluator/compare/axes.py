@@ -1,0 +1,163 @@
+"""Agreement along what was varied (lighting, pose, distractor, start region), and of progress."""
+
+from collections.abc import Callable, Sequence
+
+from evaluator.compare.measure import (
+    RATE_COLUMNS,
+    ends,
+    interval_or_reason,
+    rate_row,
+    vouched_rate,
+)
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.success import group_rows, trials_in
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics.agreement import kendall, pearson
+from evaluator.statistics.bootstrap import student_interval
+from evaluator.statistics.differences import newcombe_difference, tango_points
+
+MOST_VALUES = 40
+"""Values of one axis that a table lists; an axis with more is a number, not a setting."""
+
+
+def axis_tables(
+    rows: Sequence[TrialRow], word: str, *, method: str = "wilson"
+) -> tuple[Table, ...]:
+    """Lay out, for every value of every axis, how sim and outcome agree; none without tags.
+
+    Args:
+        rows: Trials with their tags.
+        word: What the recorded side is called: stand-in, real or recorded.
+        method: Interval of rates: wilson, clopper-pearson or jeffreys.
+    """
+    found: dict[str, dict[str, list[TrialRow]]] = {}
+    for row in rows:
+        for axis, value in row.tags:
+            found.setdefault(axis, {}).setdefault(value, []).append(row)
+    lines = [
+        (axis, value, *_axis_line(members, method))
+        for axis, values in found.items()
+        if len(values) <= MOST_VALUES
+        for value, members in values.items()
+    ]
+    if not lines:
+        return ()
+    columns = (
+        *("axis", "value", "trials", *(f"agree {name}" for name in RATE_COLUMNS)),
+        *(f"{word} rate", "sim rate", f"sim - {word} (pp)", "gap low", "gap high", "gap interval"),
+    )
+    note = (
+        "Agreement is over trials where both sides are known. The gap is of pairs (Tango) where "
+        "there are any, else of each side's own trials (Newcombe). One axis at a time: what "
+        "varies together is not told apart here."
+    )
+    return (
+        Table(
+            id="axes",
+            title="Agreement along each axis",
+            columns=columns,
+            rows=tuple(lines),
+            note=note,
+        ),
+    )
+
+
+def _axis_line(rows: Sequence[TrialRow], method: str) -> tuple[Cell, ...]:
+    both = [row for row in rows if row.recorded is not None and row.sim_planned is not None]
+    agree, n = trials_in(row for row in both if row.recorded == row.sim_planned), trials_in(both)
+    interval, why = vouched_rate(agree, n, method) if n else (None, "no trial has both sides")
+    rate = Measurement(
+        id="agree",
+        unit="1",
+        definition="sim and outcome agree",
+        value=agree / n if n else None,
+        interval=interval,
+        k=agree,
+        n=n,
+        reason_if_undefined=None if n else why,
+    )
+    real, sim = _counts(rows, "recorded", both), _counts(rows, "sim_planned", both)
+    if not (real[1] and sim[1]):
+        gap: tuple[Cell, ...] = (None, None, None, None)
+    elif both:
+        improved = trials_in(row for row in both if row.sim_planned and not row.recorded)
+        worsened = trials_in(row for row in both if row.recorded and not row.sim_planned)
+        points, tango = tango_points(improved, worsened, n)
+        gap = (points, tango.low, tango.high, tango.method)
+    else:
+        newcombe = newcombe_difference(*real, *sim)
+        points = 100 * (sim[0] / sim[1] - real[0] / real[1])
+        gap = (points, *ends(newcombe, 100.0), newcombe.method)
+    rates = [None if not n_side else k_side / n_side for k_side, n_side in (real, sim)]
+    return (trials_in(rows), *rate_row(rate), *rates, *gap)
+
+
+def _counts(rows: Sequence[TrialRow], side: str, both: Sequence[TrialRow]) -> tuple[int, int]:
+    """Successes and trials of one side, over trials where both are known if there are any."""
+    known = [row for row in both or rows if getattr(row, side) is not None]
+    return trials_in(row for row in known if getattr(row, side)), trials_in(known)
+
+
+def progress_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
+    """Lay out progress scores of both sides per group; none where nobody scored any.
+
+    Args:
+        rows: Trials, with scores from 0 to 1 where there are any.
+        word: What the recorded side is called: stand-in, real or recorded.
+    """
+    scored = [r for r in rows if r.progress is not None or r.sim_progress is not None]
+    lines = [(*key, *_progress_line(members)) for key, members in group_rows(scored).items()]
+    if len(lines) > 1:
+        lines.append(("all", "", "", *_progress_line(scored)))
+    if not lines:
+        return ()
+    columns = (
+        *("task", "condition", "policy", f"{word} scored", f"{word} mean", "sim scored"),
+        *("sim mean", "pairs", f"sim - {word}", "low", "high", "r of pairs", "tau-b of pairs"),
+        "why no interval",
+    )
+    note = (
+        "Progress from 0 to 1 as somebody scored it. Differences and correlations are over trials "
+        "that have both scores; the interval is Student's t of their differences. Tau-b uses the "
+        "order of the scores alone."
+    )
+    return (
+        Table(
+            id="progress", title="Progress scores", columns=columns, rows=tuple(lines), note=note
+        ),
+    )
+
+
+def _progress_line(rows: Sequence[TrialRow]) -> tuple[Cell, ...]:
+    real = [row.progress for row in rows if row.progress is not None]
+    sim = [row.sim_progress for row in rows if row.sim_progress is not None]
+    pairs = [
+        (row.progress, row.sim_progress)
+        for row in rows
+        if row.progress is not None and row.sim_progress is not None
+    ]
+    gaps = [theirs - ours for ours, theirs in pairs]
+    interval: Interval | None = None
+    reason: str | None = "no trial has both scores"
+    if gaps:
+        interval, reason = interval_or_reason(student_interval, gaps)
+    return (
+        *(len(real), _mean(real), len(sim), _mean(sim), len(pairs), _mean(gaps), *ends(interval)),
+        *(_correlation(pearson, pairs), _correlation(kendall, pairs)),
+        reason,
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _correlation(
+    statistic: Callable[[Sequence[float], Sequence[float]], float],
+    pairs: Sequence[tuple[float, float]],
+) -> float | None:
+    try:
+        return statistic([a for a, _ in pairs], [b for _, b in pairs])
+    except UndefinedStatisticError:
+        return None

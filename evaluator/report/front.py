@@ -1,0 +1,175 @@
+"""The first two pages: what an evaluation means, in a sentence per task, before any table."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from evaluator.compare.conclusions import direction
+from evaluator.report.wording import noun
+from evaluator.result import Cell, Measurement, Results, Table
+
+SHOWN_TASKS = 8
+"""Tasks with a sentence; the table holds the others."""
+SHOWN_MISSING = 6
+LONGEST = 150
+"""Characters of one reason; the whole stands further down."""
+LONGEST_NOTE = 260
+FIGURES = ("tasks", "scatter", "success")
+"""The picture beside the sentences: the first that was drawn."""
+Row = Mapping[str, Cell]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Front:
+    """What a reader sees first."""
+
+    summary: str
+    """One sentence over all tasks."""
+    tasks: Sequence[tuple[str, str]]
+    """Task and sentence."""
+    more_tasks: int
+    notes: Sequence[tuple[str, str]]
+    """What must be known before a number is used."""
+    unseen: str
+    """What so few trials could not have shown."""
+    missing: Sequence[str]
+    more_missing: int
+
+
+def front(results: Results) -> Front:
+    """Write the first page of some results."""
+    table = next((t for t in results.tables if t.id == "conclusions"), None)
+    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    notes = next((t for t in results.tables if t.id == "notes"), None)
+    about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
+    missing = [text for text in results.missing if not text.startswith("figures without data")]
+    return Front(
+        summary=_summary(results),
+        tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
+        more_tasks=max(0, len(rows) - SHOWN_TASKS),
+        notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
+        unseen=_unseen(rows),
+        missing=[_short(text) for text in missing[:SHOWN_MISSING]],
+        more_missing=max(0, len(missing) - SHOWN_MISSING),
+    )
+
+
+def sentence(row: Row) -> str:
+    """Write what one task's numbers mean.
+
+    Args:
+        row: A row of the table of conclusions.
+    """
+    parts = [_bias_words(row)]
+    yes, right = row["yes"], row["yes and right"]
+    if isinstance(yes, int) and isinstance(right, int):
+        parts.append(f"a yes was right in {right} of {yes}")
+    return "; ".join(filter(None, [*parts, _ranking_words(row)])) + "."
+
+
+def _bias_words(row: Row) -> str:
+    bias, low, high = (_number(row[name]) for name in ("bias (pp)", "low", "high"))
+    if bias is None:
+        return "the bias is not known"
+    if low is None or high is None:
+        word = "above" if bias > 0 else "below"
+        points = f"{_points(bias)} {word} the recorded rate" if round(bias) else "no gap"
+        return f"the twin shows {points}, without an interval"
+    ends = f"[{low:+.0f}, {high:+.0f}]"
+    found = direction(low, high)
+    if found:
+        return f"the twin is {found} by {_points(bias)} {_sized(low, high)}"
+    return f"no bias is shown: {bias:+.0f} points {ends}"
+
+
+def _points(value: float) -> str:
+    size = round(abs(value))
+    return f"{size} {noun('point', size)}"
+
+
+def _sized(low: float, high: float) -> str:
+    small, large = sorted((abs(low), abs(high)))
+    return f"[{small:.0f}, {large:.0f}]"
+
+
+def _ranking_words(row: Row) -> str:
+    ranked, best, more = row["ranked"], row["best recorded"], row["more trials"]
+    if ranked is None:
+        return ""
+    if ranked == "yes":
+        return f"enough to rank: yes, {best} is best"
+    if ranked == "tie":
+        return "enough to rank: no, the best two are level"
+    if ranked == "no n":
+        return f"{best} looks best; without counts nothing says how surely"
+    trials = "far more trials would be needed"
+    if isinstance(more, int):
+        trials = f"{more} more {noun('trial', more)} would do"
+    return f"enough to rank: no, {trials}"
+
+
+def _summary(results: Results) -> str:
+    by_id = {m.id: m for m in results.measurements}
+    parts = []
+    rate = by_id.get("agreement.sim_planned.rate")
+    if rate is not None and rate.k is not None and rate.n:
+        parts.append(f"Sim and outcome agree in {rate.k} of {rate.n} trials.")
+    bias = by_id.get("agreement.bias_pp")
+    if bias is not None and bias.value is not None and (bias.n or 0) > 1:
+        word = "above" if bias.value > 0 else "below"
+        ends = _ends(bias)
+        size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"
+        parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
+    r = by_id.get("agreement.pearson_r")
+    if r is not None and r.value is not None:
+        parts.append(f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}.")
+    return " ".join(parts)
+
+
+def _ends(measurement: Measurement, digits: str = "+.0f") -> str:
+    interval = measurement.interval
+    if interval is None:
+        return ", without an interval"
+    return f" [{interval.low:{digits}}, {interval.high:{digits}}]"
+
+
+def _unseen(rows: Sequence[Row]) -> str:
+    """Say the smallest differences that could have been called real, over all tasks."""
+    words = []
+    for name, what in (
+        ("smallest difference (pp)", "between two candidates"),
+        ("smallest bias (pp)", "between the twin and the recorded rate"),
+    ):
+        sizes = [size for row in rows if (size := _number(row[name])) is not None]
+        if sizes and (name.endswith("bias (pp)") or any(row["ranked"] for row in rows)):
+            low, high = math.ceil(min(sizes)), math.ceil(max(sizes))
+            span = f"{low}" if low == high else f"{low} to {high}"
+            words.append(f"{what} of less than {span} points")
+    none = sum(_number(row["smallest bias (pp)"]) is None for row in rows)
+    if not words:
+        return "Without counts of trials nobody can say what would have been seen." if rows else ""
+    rest = f" In {none} of {len(rows)} tasks nothing could have been seen." if none else ""
+    return f"A difference {', or '.join(words)} would most likely have gone unseen.{rest}"
+
+
+def _number(cell: Cell) -> float | None:
+    is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
+    return float(cell) if is_number and cell is not None else None
+
+
+def _about(name: str) -> str:
+    """Write what a note is about in words."""
+    return "Pearson r" if name == "agreement.pearson_r" else name.replace("_", " ")
+
+
+def _short(text: str, longest: int = LONGEST) -> str:
+    if len(text) <= longest:
+        return text
+    return text[:longest].rsplit(" ", 1)[0].rstrip(",;:") + " ..."
+
+
+def front_tables(results: Results) -> list[Table]:
+    """Return the table of the first page: rates beside each other, none where it is long."""
+    found = [t for t in results.tables if t.id in ("layout", "success") and t.rows]
+    layout = [table for table in found if table.id == "layout"]
+    return (layout or found)[:1]

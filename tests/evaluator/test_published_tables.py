@@ -1,0 +1,98 @@
+"""The published tables in ``datasets/published``: all are read, and agree with NumPy."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluator.compare.published import OTHERWISE, SWAPPED, check_published
+from evaluator.compare.rows import RateGroup
+
+FOLDER = Path(__file__).resolve().parents[2] / "datasets" / "published"
+TABLES = sorted(FOLDER.glob("*.csv"))
+
+
+checked = lru_cache(maxsize=None)(check_published)
+
+
+def rates(groups: tuple[RateGroup, ...]) -> tuple[np.ndarray, np.ndarray]:
+    both = [(g.recorded_rate, g.sim_rate) for g in groups if g.recorded_rate is not None]
+    pairs = np.array([[float(a), float(b)] for a, b in both if b is not None])
+    return pairs[:, 0], pairs[:, 1]
+
+
+def max_violation(weights: np.ndarray, real: np.ndarray, sim: np.ndarray) -> float:
+    """MMRV as Li et al. (2024), equation 1, by loops over pairs."""
+    gaps = [
+        max(
+            abs(weights[i] - weights[j]) * ((sim[i] > sim[j]) != (real[i] > real[j]))
+            for j in range(len(real))
+        )
+        for i in range(len(real))
+    ]
+    return float(np.mean(gaps))
+
+
+def test_there_are_at_least_ten_and_each_names_its_source() -> None:
+    assert len(TABLES) >= 10
+    for path in TABLES:
+        head = [line for line in path.read_text().splitlines() if line.startswith("#")]
+        assert any("arXiv:" in line for line in head), path
+        assert any(line.startswith("# Source: ") for line in head), path
+
+
+@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
+def test_a_published_table_gives_the_numbers_of_numpy_and_an_interval(path: Path) -> None:
+    comparison = checked(path).comparison
+    real, sim = rates(comparison.groups)
+    assert len(real) >= 4
+    results = comparison.results()
+    r = results.get("agreement.pearson_r")
+    assert r.value == pytest.approx(np.corrcoef(real, sim)[0, 1], abs=1e-9)
+    assert r.interval is not None, r.reason_without_interval
+    assert -1 <= r.interval.low < r.interval.high <= 1
+    assert (r.interval.low, r.interval.high) != (-1, 1)
+    slope, intercept = np.polyfit(sim, real, 1)
+    for name, value in (
+        ("bias_pp", 100 * np.mean(sim - real)),
+        ("mae_pp", 100 * np.mean(np.abs(sim - real))),
+        ("rmse_pp", 100 * np.sqrt(np.mean((sim - real) ** 2))),
+        ("largest_gap_pp", 100 * np.max(np.abs(sim - real))),
+        ("calibration_slope", slope),
+        ("calibration_intercept_pp", 100 * intercept),
+        ("mmrv_recorded_gap", max_violation(real, real, sim)),
+        ("mmrv_sim_gap", max_violation(sim, real, sim)),
+    ):
+        assert results.get(f"agreement.{name}").value == pytest.approx(value, abs=1e-9), name
+
+
+def test_figures_that_fit_with_swapped_arguments_are_named() -> None:
+    """The three MMRV that real2sim-eval prints weight the gap of sim rates; its r are pooled."""
+    findings = checked(FOLDER / "real2sim_eval_200.csv").findings
+    by_what = {finding.what: finding.verdict for finding in findings}
+    for task in ("toy_packing", "rope_routing", "t_block_pushing"):
+        assert by_what[f"mmrv {task}"] == SWAPPED
+        assert by_what[f"pearson_r {task}"] == "as printed"
+
+
+def test_a_mean_of_r_per_task_is_told_from_r_over_all_groups(
+    write_table: Callable[[str], Path],
+) -> None:
+    lines = ["task,policy,side,rate,statistic,printed"]
+    inside = {"a": (0.9, 0.8, 0.6), "b": (0.2, 0.3, 0.1)}
+    for task, found in inside.items():
+        for policy, real, sim in zip("xyz", (0.5, 0.6, 0.8), found, strict=True):
+            lines += [f"{task},{policy},real,{real},,", f"{task},{policy},sim,{sim},,"]
+    per_task = [np.corrcoef((0.5, 0.6, 0.8), found)[0, 1] for found in inside.values()]
+    lines.append(f",,,,pearson_r,{np.mean(per_task):.3f}")
+    lines.append(f"a,,,,pearson_r,{per_task[0]:.3f}")
+    lines.append(",x,sim,,average_percent,55.0")
+    findings = check_published(write_table("\n".join(lines) + "\n")).findings
+    verdicts = {finding.what: finding.verdict for finding in findings if finding.printed}
+    assert verdicts == {
+        "pearson_r": OTHERWISE,
+        "pearson_r a": "as printed",
+        "average_percent sim x": "as printed",
+    }

@@ -1,0 +1,248 @@
+"""Tables as people save them, several sources in one study, and folders of results."""
+
+import json
+import shutil
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.errors import UsageError
+from bridge.exchange.results_intake import look_through, take
+from bridge.exchange.table_text import TableError, TableOptions, read_rows
+from bridge.exchange.trials_csv import COLUMNS, read_trials
+from bridge.exchange.trials_rates import read_rates
+from evaluator.cli import evaluate
+from evaluator.compare import compare_csv
+from evaluator.compare.several import compare_several
+from evaluator.errors import AlikeNamesError
+
+PLAIN = "trial_id,task,policy,recorded,sim_planned,p_success\na,cup,A,success,failure,0.85\n"
+MAPPED = TableOptions(map="outcome=Result,task=Scenario")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sep=;\r\nTrial ID;Task ;policy;Recorded;Sim planned;p success;Operator\r\n"
+        "a;cup;A;pass;fail;0,85;Jo\r\n",
+        "\ufefftrial-id\ttask\tpolicy\trecorded\tsim_planned\tp_success\na\tcup\tA\tY\tn\t0.85\n",
+        'TRIAL_ID,Task,POLICY,Recorded,SIM_PLANNED,P_success\na,cup,A,1.0,0.0,"0,85"\n',
+        "trial_id;task;policy;recorded;sim_planned;p_success\na;cup;A;1,0;0;0,85;;\n",
+    ],
+)
+def test_a_table_is_read_alike_however_it_was_saved(
+    write_table: Callable[[str], Path], text: str
+) -> None:
+    plain = read_trials(write_table(PLAIN))
+    path = write_table("")
+    path.write_bytes(text.encode())
+    assert read_trials(path) == plain
+
+
+def test_what_was_understood_is_said(write_table: Callable[[str], Path]) -> None:
+    path = write_table("Task;Recorded;Result;Day\ncup;pass;x;Monday\n")
+    said = take(path).said
+    assert "trials, 1 row" in said
+    assert "semicolons" in said
+    assert "'Result', 'Day'" in said
+    path = write_table("Scenario;Result;sim_planned\ncup;pass;\n")
+    assert "'Result' read as recorded" in take(path, MAPPED).said
+    path = write_table("task,sim_planned,Result\ncup,yes,pass\n")
+    assert read_trials(path)[0].recorded is None  # nobody said that it is the outcome
+    assert '--map "outcome=Result"' in take(path).said
+
+
+@pytest.mark.parametrize("unknown", ["", "NA", "n/a", "NaN", "-", "?", "none"])
+def test_what_nobody_knows_stays_unknown(write_table: Callable[[str], Path], unknown: str) -> None:
+    path = write_table(f"trial_id,task,recorded,k,n,p_success\na,cup,{unknown},,,{unknown}\n")
+    (trial,) = read_trials(path)
+    assert (trial.recorded, trial.p_success) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trial_id;task;k\na;cup;1,234\n", r"k is '1,234'.*decimal comma"),
+        ("trial_id,task\na,cu\0p\n", "a NUL"),
+        ("trial_id,task,Task\na,b,c\n", "two of 'task'"),
+    ],
+)
+def test_what_may_mean_two_things_is_refused(
+    write_table: Callable[[str], Path], text: str, message: str
+) -> None:
+    with pytest.raises(TableError, match=message):
+        read_trials(write_table(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("outcome", "not COLUMN=THEIRS"), ("outcme=Result", "recorded"), ("task=a,task=b", "task=b")],
+)
+def test_a_mapping_that_means_nothing_is_wrong_use(
+    write_table: Callable[[str], Path], text: str, message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        take(write_table(PLAIN), TableOptions(map=text))
+
+
+cells = (
+    st.text('abcXYZ é";,\t', min_size=1, max_size=8)
+    .map(str.strip)
+    .filter(lambda text: text and not text.startswith("#"))
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(cells, min_size=1, max_size=5), st.sampled_from([",", ";", "\t"]))
+def test_no_delimiter_changes_a_name(
+    tmp_path_factory: pytest.TempPathFactory, tasks: list[str], delimiter: str
+) -> None:
+    path = tmp_path_factory.mktemp("saved") / "table.csv"
+    quoted = ['"' + task.replace('"', '""') + '"' for task in tasks]
+    lines = [delimiter.join(("trial_id", "task", "recorded"))]
+    lines += [delimiter.join((str(i), task, "yes")) for i, task in enumerate(quoted)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert [row.text("task") for row in read_rows(path, ("task",), COLUMNS)] == tasks
+
+
+def test_rates_take_semicolons_and_decimal_commas(write_table: Callable[[str], Path]) -> None:
+    path = write_table("Task;Policy;Side;N;Rate %\ncup;A;Sim;3;66,7\ncup;A;Real;;50\n")
+    assert [(r.side, r.rate) for r in read_rates(path)] == [
+        ("sim", Fraction(2, 3)),
+        ("real", Fraction(1, 2)),
+    ]
+
+
+ALIKE = "trial_id,task,recorded,sim_planned\na,Cup,yes,yes\nb,cup,no,yes\nc,Cube,no,no\n"
+
+
+def test_names_that_differ_by_case_are_asked_about(write_table: Callable[[str], Path]) -> None:
+    path = write_table(ALIKE)
+    with pytest.raises(AlikeNamesError, match=r"'Cup' \(a\) and 'cup' \(b\).*--names merge"):
+        compare_csv(path)
+    merged = compare_csv(path, options=TableOptions(names="merge"))
+    assert [(g.task, g.recorded.n) for g in merged.groups] == [("Cube", 1), ("Cup", 2)]
+    assert "task 'cup' counted as 'Cup'" in merged.provenance["read_as"]
+    apart = compare_csv(path, options=TableOptions(names="apart"))
+    assert [g.task for g in apart.groups] == ["Cube", "Cup", "cup"]
+
+
+def test_twenty_real_and_two_hundred_simulated_trials_each_keep_their_n(tmp_path: Path) -> None:
+    """The usual published design: other trials on each side, rates of each side's own n."""
+    real, sim = ["trial_id,task,policy,recorded"], ["trial_id,task,policy,sim_planned"]
+    counts = {"A": (15, 160), "B": (9, 110), "C": (4, 40), "D": (12, 120)}
+    for policy, (k_real, k_sim) in counts.items():
+        real += [f"{policy}{i},cup,{policy},{int(i < k_real)}" for i in range(20)]
+        sim += [f"{policy}{i},cup,{policy},{int(i < k_sim)}" for i in range(200)]
+    (tmp_path / "real.csv").write_text("\n".join(real) + "\n")
+    (tmp_path / "sim.csv").write_text("\n".join(sim) + "\n")
+    together = compare_several([tmp_path / "real.csv", tmp_path / "sim.csv"])
+    groups = {g.policy: (g.recorded.k, g.recorded.n, g.sim.k, g.sim.n) for g in together.groups}
+    assert groups == {name: (a, 20, b, 200) for name, (a, b) in counts.items()}
+    r = together.results().get("agreement.pearson_r")
+    assert r.value is not None
+    assert r.interval is not None
+    assert -1 < r.interval.low < r.value < r.interval.high < 1
+    assert not together.exclusions
+
+
+def test_policies_are_columns_of_trials_and_of_rates(write_table: Callable[[str], Path]) -> None:
+    """Four tasks times three policies, from a spreadsheet: twelve groups, one interval for r."""
+    lines = ["task;policy;side;k;n"]
+    for t, task in enumerate("abcd"):
+        for p, policy in enumerate("XYZ"):
+            lines.append(f"{task};{policy};real;{2 + 3 * p + t};20")
+            lines.append(f"{task};{policy};sim;{3 + 3 * p + t};20")
+    comparison = compare_csv(write_table("\n".join(lines) + "\n"))
+    assert len({(g.task, g.policy) for g in comparison.groups}) == 12
+    r = comparison.results().get("agreement.pearson_r")
+    assert r.n == 12
+    assert r.interval is not None
+    assert r.interval.high - r.interval.low < 2
+
+
+def test_runs_and_tables_are_one_study_and_keep_their_own_ids(
+    six_trials: Any, tmp_path: Path
+) -> None:
+    run = six_trials.run.path
+    table = tmp_path / "more.csv"
+    names = [row.episode for row in compare_several([run]).rows]
+    table.write_text(
+        "trial_id,task,recorded,sim_planned,stand_in\n"
+        f"{names[0]},elsewhere,yes,no,yes\nnew,elsewhere,no,no,yes\n"
+    )
+    together = compare_several([run, table])
+    assert {row.episode for row in together.rows} == {*names, f"more/{names[0]}", "new"}
+    assert together.results().get("agreement.sim_planned.rate").n == len(
+        [r for r in together.rows if r.recorded is not None and r.sim_planned is not None]
+    )
+    with pytest.raises(UsageError, match="given twice"):
+        compare_several([run, run])
+
+
+def test_a_copied_run_counts_no_trial_twice(six_trials: Any, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(six_trials.run.path, copy)
+    alone, both = (
+        compare_several([six_trials.run.path]),
+        compare_several([six_trials.run.path, copy]),
+    )
+    assert [g.recorded.n for g in alone.groups] == [g.recorded.n for g in both.groups]
+    copies = [e for e in both.exclusions if "the same file" in e.reason]
+    assert len(copies) == len(alone.rows)
+
+
+def test_a_folder_of_results_is_read_and_what_is_left_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "results"
+    for policy, successes in (("act", [True, False]), ("dp", [True, True])):
+        (folder / policy).mkdir(parents=True)
+        task = {"task_group": "g", "task_id": 0, "metrics": {"successes": successes}}
+        (folder / policy / "eval_info.json").write_text(json.dumps({"per_task": [task]}))
+    (folder / "polaris").mkdir()
+    # As its scripts/eval.py wrote it before it scored anything (github.com/arhanjain/polaris).
+    (folder / "polaris" / "eval_results.csv").write_text("episode,episode_length\n0,100\n")
+    (folder / "real.json").write_text(json.dumps([{"task": "g/0", "policy": "act", "recorded": 1}]))
+    (folder / "rates.csv").write_text("task,side,rate\nx,real,0.5\n")
+    (folder / "notes.md").write_text("monday")
+    assert evaluate(folder, out=tmp_path / "out") == 0
+    err = capsys.readouterr().err
+    assert "no outcome is guessed" in err
+    taken, left = look_through(folder)
+    assert {each.kind for each in taken} == {"LeRobot", "trials", "rates"}
+    assert {one.path.name for one in left} == {"eval_results.csv", "notes.md"}
+    comparison = compare_several([folder])
+    sides = {(g.task, g.policy): (g.recorded.n, g.sim.n) for g in comparison.groups}
+    assert sides == {("g/0", "act"): (1, 2), ("g/0", "dp"): (0, 2)}
+    (intake,) = (table for table in comparison.tables if table.id == "intake")
+    assert len(intake.rows) == 6
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "a.txt").write_text("hello\n")
+    with pytest.raises(UsageError, match="could be read as results"):
+        compare_several([tmp_path / "empty"])
+
+
+def test_agreement_along_axes_and_of_progress(write_table: Callable[[str], Path]) -> None:
+    lines = ["trial_id;task;recorded;sim_planned;progress;sim_progress;tags;Start region"]
+    for i in range(8):
+        light, real, sim = ("dim", i % 2, 1) if i < 4 else ("bright", 1, 1)
+        lines.append(f"{i};cup;{real};{sim};0,{i};0,{i + 1};lighting={light};R{i % 2}")
+    path = write_table("\n".join(lines) + "\n")
+    comparison = compare_csv(path, options=TableOptions(axes="Start region"))
+    (axes,) = (table for table in comparison.tables if table.id == "axes")
+    assert {row[0] for row in axes.rows} == {"lighting", "start_region"}
+    by_value = {row[1]: dict(zip(axes.columns, row, strict=True)) for row in axes.rows}
+    assert (by_value["dim"]["agree k"], by_value["dim"]["agree n"]) == (2, 4)
+    assert by_value["dim"]["sim - recorded (pp)"] == pytest.approx(50)
+    assert by_value["bright"]["sim - recorded (pp)"] == 0
+    assert set(by_value) == {"dim", "bright", "R0", "R1"}
+    (progress,) = (table for table in comparison.tables if table.id == "progress")
+    line = dict(zip(progress.columns, progress.rows[0], strict=True))
+    assert line["sim - recorded"] == pytest.approx(0.1)
+    assert line["r of pairs"] == pytest.approx(1)
