@@ -77,8 +77,9 @@ class ShownPlan:
         if plan.steered_by is not None:
             words.append(f"steered by {plan.steered_by.clause}")
         judged = "not judged" if verdict is None else verdict_word(verdict.accepted)
-        if verdict is not None and verdict.first_failing is not None:
-            judged += f" by {verdict.first_failing}.{verdict.factors()[verdict.first_failing].cause}"
+        name = None if verdict is None else verdict.first_failing
+        if verdict is not None and name is not None:
+            judged += f" by {name}.{verdict.factors()[name].cause}"
         return ", ".join([*words, judged])
 
 
