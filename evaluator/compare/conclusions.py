@@ -20,7 +20,7 @@ from evaluator.statistics.power import detectable_rate, trials_needed
 
 MOST_TASKS = 200
 """Tasks that get a line of their own; more are a sample, and the model speaks of it."""
-UNREACHABLE = 100_000
+UNREACHABLE = 5000
 """Trials beyond which nobody asks."""
 
 
