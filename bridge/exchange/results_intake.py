@@ -59,7 +59,7 @@ class Taken:
 
     path: Path
     kind: str
-    said: str
+    summary: str
     """What was understood, in one line."""
     trials: tuple[TrialRecord, ...] = ()
     rates: tuple[RateRecord, ...] = ()
@@ -106,7 +106,7 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     table = open_table(path, known, options, near=False)
     header = table.header
     if "statistic" in header:
-        return Taken(path=path, kind=PUBLISHED, said=f"{path.name}: rates with printed figures")
+        return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
     if "side" in header:
         rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
         return _taken_rates(path, rates_of(rows), options)
@@ -116,8 +116,8 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     if "trial_id" in header or ("task" in header and set(SIDES_OF_TRIAL) & set(header)):
         opened = open_trials(path, options)
         trials = trials_of(rows_of(opened))
-        said = opened.understood("trials", len(trials))
-        return Taken(path=path, kind="trials", said=said, trials=tuple(trials))
+        understood = opened.understood("trials", len(trials))
+        return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
     raise UsageError(_unknown_table(table))
 
 
@@ -148,12 +148,12 @@ def _unknown_table(table: TableText) -> str:
 
 def _taken_rates(path: Path, records: Sequence[RateRecord], options: TableOptions) -> Taken:
     table = open_table(path, RATE_COLUMNS, options)
-    said = table.understood("rates", len(records))
-    return Taken(path=path, kind="rates", said=said, rates=tuple(records))
+    understood = table.understood("rates", len(records))
+    return Taken(path=path, kind="rates", summary=understood, rates=tuple(records))
 
 
 def _rollouts(path: Path, kind: str, trials: Sequence[TrialRecord], what: str) -> Taken:
-    return Taken(path=path, kind=kind, said=f"{path.name}: {kind}, {what}", trials=tuple(trials))
+    return Taken(path=path, kind=kind, summary=f"{path.name}: {kind}, {what}", trials=tuple(trials))
 
 
 def _take_json(path: Path) -> Taken:
@@ -167,12 +167,12 @@ def _take_json(path: Path) -> Taken:
         return _rollouts(path, LEROBOT, trials, f"{len(trials)} episodes")
     if all("side" in item and "task" in item for item in items):
         records = rates_of(json_rows(path, items, RATE_COLUMNS))
-        said = f"{path.name}: rates, {len(records)} objects"
-        return Taken(path=path, kind="rates", said=said, rates=tuple(records))
+        understood = f"{path.name}: rates, {len(records)} objects"
+        return Taken(path=path, kind="rates", summary=understood, rates=tuple(records))
     if all("task" in item and set(SIDES_OF_TRIAL) & set(item) for item in items):
         trials = read_trials_json(path, items)
-        said = f"{path.name}: trials, {len(trials)} objects"
-        return Taken(path=path, kind="trials", said=said, trials=tuple(trials))
+        understood = f"{path.name}: trials, {len(trials)} objects"
+        return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
     message = (
         f"{path} lists objects that are neither trials (task with recorded or sim_planned) nor "
         "rates (task, side, rate)."
@@ -202,7 +202,7 @@ def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[T
         options: How tables are read.
 
     Raises:
-        PathNotFoundError: When it is no folder.
+        PathNotFoundError: When it is not a folder.
     """
     if not folder.is_dir():
         raise PathNotFoundError(path=folder, what="folder of results", hint="Give a folder.")

@@ -35,7 +35,7 @@ class SharedTrials:
         """Whether each trial succeeded."""
         return np.array([bool(row.recorded) for row, _ in self.rows])
 
-    def said(self, side: int) -> Bool[np.ndarray, " trials"]:
+    def answers(self, side: int) -> Bool[np.ndarray, " trials"]:
         """What one twin said: 0 for this one, 1 for the other."""
         return np.array([bool(pair[side].sim_planned) for pair in self.rows])
 
@@ -115,14 +115,14 @@ def against_tables(
 
 
 def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str, Cell]]:
-    recorded, said = shared.recorded, (shared.said(0), shared.said(1))
-    right = [said[side] == recorded for side in (0, 1)]
+    recorded, answers = shared.recorded, (shared.answers(0), shared.answers(1))
+    right = [answers[side] == recorded for side in (0, 1)]
     n = len(recorded)
     improved, worsened = int((right[0] & ~right[1]).sum()), int((right[1] & ~right[0]).sum())
     points, tango = tango_points(improved, worsened, n)
     pairs = list(zip(right[1].tolist(), right[0].tolist(), strict=True))
     p = mcnemar(pairs).p_mid if improved + worsened else None
-    rates = [float(answers.mean()) for answers in right]
+    rates = [float(mark.mean()) for mark in right]
     lines = [_line("accuracy", names, rates, points / 100, n)]
     lines[0]["low"], lines[0]["high"] = tango.low / 100, tango.high / 100
     lines[0]["method"], lines[0]["p"] = tango.method, p
@@ -170,20 +170,20 @@ Statistic = Callable[[Int64[np.ndarray, "draws trials"], int], Numbers]
 def _statistics(shared: SharedTrials) -> Mapping[str, Statistic]:
     """PPV, Brier score and r over groups, of drawn trials and one of the twins."""
     recorded = shared.recorded.astype(float)
-    said = [shared.said(side).astype(float) for side in (0, 1)]
+    answers = [shared.answers(side).astype(float) for side in (0, 1)]
     chances = [[pair[side].p_success for pair in shared.rows] for side in (0, 1)]
     keys = [(row.task, row.condition, row.policy) for row, _ in shared.rows]
     places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
     group = np.array([places[key] for key in keys])
 
     def ppv(drawn: Int64[np.ndarray, "draws trials"], side: int) -> Numbers:
-        yes, good = said[side][drawn], recorded[drawn]
+        yes, good = answers[side][drawn], recorded[drawn]
         with np.errstate(invalid="ignore"):
             return np.asarray((yes * good).sum(axis=1) / yes.sum(axis=1))
 
     def r(drawn: Int64[np.ndarray, "draws trials"], side: int) -> Numbers:
         means = []
-        for values in (recorded, said[side]):
+        for values in (recorded, answers[side]):
             sums = [(values[drawn] * (group[drawn] == g)).sum(axis=1) for g in range(len(places))]
             counts = [(group[drawn] == g).sum(axis=1) for g in range(len(places))]
             means.append(np.array(sums) / np.array(counts))

@@ -20,7 +20,7 @@ from evaluator.statistics.power import detectable_rate, trials_needed
 
 MOST_TASKS = 200
 """Tasks that get a line of their own; more are a sample, and the model speaks of it."""
-UNREACHABLE = 100_000
+UNREACHABLE = 5000
 """Trials beyond which nobody asks."""
 
 
@@ -55,7 +55,7 @@ def conclusions_table(
 def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> dict[str, Cell]:
     members = [group for group in usable if group.task == task]
     bias, interval = _bias(task, members, usable)
-    said_yes = [r for r in rows if r.task == task and r.sim_planned and r.recorded is not None]
+    accepted = [r for r in rows if r.task == task and r.sim_planned and r.recorded is not None]
     best, ranked, more = _ranking(members)
     n = [group.recorded.n for group in members if group.recorded.n]
     sim_n = [group.sim.n for group in members if group.sim.n]
@@ -65,8 +65,8 @@ def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> d
         "bias (pp)": bias,
         **dict(zip(("low", "high"), ends(interval), strict=True)),
         "interval": None if interval is None else interval.method,
-        "yes": trials_in(said_yes) or None,
-        "yes and right": trials_in(r for r in said_yes if r.recorded) if said_yes else None,
+        "yes": trials_in(accepted) or None,
+        "yes and right": trials_in(r for r in accepted if r.recorded) if accepted else None,
         "candidates": len(members),
         "best recorded": best,
         "ranked": ranked,

@@ -27,7 +27,7 @@ def settle_names(items: Iterable[Named], choice: str) -> tuple[list[Named], list
     found = list(items)
     if choice == "apart":
         return found, []
-    said = []
+    merged = []
     for kind in KINDS:
         spellings: dict[str, dict[str, str]] = {}
         for number, item in enumerate(found, start=1):
@@ -39,7 +39,7 @@ def settle_names(items: Iterable[Named], choice: str) -> tuple[list[Named], list
             raise AlikeNamesError.of(kind, [*alike.values()])
         for names in alike.values():
             first, *others = names
-            said.append(f"{kind} {', '.join(map(repr, others))} counted as {first!r}")
+            merged.append(f"{kind} {', '.join(map(repr, others))} counted as {first!r}")
         first_of = {name: next(iter(names)) for names in alike.values() for name in names}
         if first_of:
             found = [
@@ -48,7 +48,7 @@ def settle_names(items: Iterable[Named], choice: str) -> tuple[list[Named], list
                 else item
                 for item in found
             ]
-    return found, said
+    return found, merged
 
 
 def _folded(name: str) -> str:

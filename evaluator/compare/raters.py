@@ -151,17 +151,19 @@ def _ppv_and_r(
     rows: Sequence[TrialRow], labels: Bool[np.ndarray, "draws trials"]
 ) -> tuple[Float64[np.ndarray, " draws"], Float64[np.ndarray, " draws"]]:
     """PPV and r over groups for each set of labels; NaN where undefined."""
-    said = np.array([bool(row.sim_planned) for row in rows])
+    accepted = np.array([bool(row.sim_planned) for row in rows])
     keys = [(row.task, row.condition, row.policy) for row in rows]
     with np.errstate(invalid="ignore", divide="ignore"):
         ppv = (
-            (labels & said).sum(axis=1) / said.sum() if said.any() else np.full(len(labels), np.nan)
+            (labels & accepted).sum(axis=1) / accepted.sum()
+            if accepted.any()
+            else np.full(len(labels), np.nan)
         )
         groups = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
         if len(groups) < MIN_GROUPS:
             return np.asarray(ppv, dtype=float), np.full(len(labels), np.nan)
         x = np.array([labels[:, group].mean(axis=1) for group in groups])
-        y = np.array([said[group].mean() for group in groups])[:, None]
+        y = np.array([accepted[group].mean() for group in groups])[:, None]
         x, y = x - x.mean(axis=0), y - y.mean(axis=0)
         r = (x * y).sum(axis=0) / np.sqrt((x * x).sum(axis=0) * (y * y).sum(axis=0))
     return np.asarray(ppv, dtype=float), np.asarray(r, dtype=float)

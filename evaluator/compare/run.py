@@ -105,18 +105,18 @@ class ReadRun:
             names: New id by the old one.
         """
 
-        def told_apart(items: Iterable[Any]) -> Any:
+        def with_new_ids(items: Iterable[Any]) -> Any:
             return tuple(
                 replace(item, episode=names[item.episode]) if item.episode in names else item
                 for item in items
             )
 
-        parts = {name: told_apart(items) for name, items in vars(self.summaries).items()}
+        parts = {name: with_new_ids(items) for name, items in vars(self.summaries).items()}
         return replace(
             self,
-            rows=list(told_apart(self.rows)),
+            rows=list(with_new_ids(self.rows)),
             summaries=Summaries(**parts),
-            exclusions=told_apart(self.exclusions),
+            exclusions=with_new_ids(self.exclusions),
         )
 
     def without(self, episodes: Container[str], reason: str) -> "ReadRun":

@@ -168,7 +168,7 @@ def _gather(
             run = RunFolder.open(source)
             cache = SummaryCache(run.results_dir / FOLDER, fresh=force, say=output.say)
             read = read_run(run, caches.enter_context(cache), output)
-            gathered.reads.append(_told_apart(read, gathered.reads))
+            gathered.reads.append(_with_own_ids(read, gathered.reads))
         elif source.is_dir():
             taken, left = look_through(source, options)
             gathered.taken += taken
@@ -180,7 +180,7 @@ def _gather(
             gathered.taken.append(take(source, options))
     kept = _without_copies(gathered)
     for each in kept.taken:
-        output.say(f"Read {each.said}.")
+        output.say(f"Read {each.summary}.")
     for one in kept.left:
         output.say(f"Left {one.path}: {one.reason}")
     return kept
@@ -207,7 +207,7 @@ def _without_copies(gathered: _Gathered) -> _Gathered:
     return _Gathered(reads=gathered.reads, taken=kept, left=left)
 
 
-def _told_apart(read: ReadRun, earlier: Iterable[ReadRun]) -> ReadRun:
+def _with_own_ids(read: ReadRun, earlier: Iterable[ReadRun]) -> ReadRun:
     """Rename episodes that an earlier run has too; copies of the same file count there alone."""
     hashes = {e.facts.info.id: e.file.sha256 for e in read.contents.recorded}
     for other in earlier:
@@ -286,7 +286,7 @@ def _from(
     provenance = {
         **(base.provenance or {"software": software()}),
         "files": files,
-        "read_as": [*(each.said for each in gathered.taken), *merged],
+        "read_as": [*(each.summary for each in gathered.taken), *merged],
     }
     return replace(base, provenance=provenance, exclusions=(*left_out, *base.exclusions))
 

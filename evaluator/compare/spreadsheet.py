@@ -126,13 +126,13 @@ def compare_taken(
         goal: The success rate that is asked about, 0 to 1; None asks nothing.
         options: What becomes of names that differ only by case.
     """
-    path, said = taken.path, [taken.said]
+    path, read_as = taken.path, [taken.summary]
     if taken.kind == PUBLISHED:
         return check_published(path, method=method, options=options).comparison
     if taken.rates:
         settled, merged = settle_names(taken.rates, options.names)
         base = compare_records(settled, path, method=method)
-        return replace(base, provenance={**base.provenance, "read_as": [*said, *merged]})
+        return replace(base, provenance={**base.provenance, "read_as": [*read_as, *merged]})
     settled_rows, merged = settle_names(map(row_from_record, taken.trials), options.names)
     stand_in = stand_in_of(record.stand_in for record in taken.trials)
     base = compare_rows(
@@ -141,7 +141,7 @@ def compare_taken(
     if taken.rollouts:
         base = replace(base, tables=with_notes(base.tables, [rollout_note(taken)]))
     left_out = [] if taken.rollouts else unknown_sides(settled_rows)
-    return _with_source(base, path, left_out, [*said, *merged])
+    return _with_source(base, path, left_out, [*read_as, *merged])
 
 
 def rollout_note(taken: Taken) -> tuple[str, str]:
@@ -194,8 +194,8 @@ def _compare_streamed(path: Path, method: str, options: TableOptions) -> Compari
         )
         if lacking
     ]
-    said = open_trials(path, options).understood("trials", sum(count for _, count in counted))
-    return replace(_with_source(base, path, left_out, [said, *merged]), rows=())
+    summary = open_trials(path, options).understood("trials", sum(count for _, count in counted))
+    return replace(_with_source(base, path, left_out, [summary, *merged]), rows=())
 
 
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
@@ -243,7 +243,7 @@ def record_from_row(row: TrialRow) -> TrialRecord:
 
 
 def _with_source(
-    base: Comparison, path: Path, left_out: Sequence[Exclusion], said: Sequence[str]
+    base: Comparison, path: Path, left_out: Sequence[Exclusion], read_as: Sequence[str]
 ) -> Comparison:
     return replace(
         base,
@@ -252,6 +252,6 @@ def _with_source(
             "software": software(),
             "file": path.name,
             "sha256": hash_file(path) if path.is_file() else None,
-            "read_as": list(said),
+            "read_as": list(read_as),
         },
     )

@@ -1,4 +1,4 @@
-"""The first two pages: what an evaluation means, in a sentence per task, before any table."""
+"""The first two pages: what an evaluation means, in one line per task, before any table."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from evaluator.report.wording import noun
 from evaluator.result import Cell, Measurement, Results, Table
 
 SHOWN_TASKS = 8
-"""Tasks with a sentence; the table holds the others."""
+"""Tasks with a line; the table holds the others."""
 SHOWN_MISSING = 6
 LONGEST = 150
 """Characters of one reason; the whole stands further down."""
@@ -24,7 +24,7 @@ class Front:
     """What a reader sees first."""
 
     summary: str
-    """One sentence over all tasks."""
+    """Over all tasks."""
     tasks: Sequence[tuple[str, str]]
     """Task and sentence."""
     more_tasks: int
@@ -122,7 +122,13 @@ def _summary(results: Results) -> str:
         parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:
-        parts.append(f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}.")
+        inside = r.interval is None or r.interval.low <= r.value <= r.interval.high
+        parts.append(
+            f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
+            if inside
+            else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
+            f" in{_ends(r, '.2f')}."
+        )
     return " ".join(parts)
 
 

@@ -46,15 +46,15 @@ def test_a_table_is_read_alike_however_it_was_saved(
 
 def test_what_was_understood_is_said(write_table: Callable[[str], Path]) -> None:
     path = write_table("Task;Recorded;Result;Day\ncup;pass;x;Monday\n")
-    said = take(path).said
+    said = take(path).summary
     assert "trials, 1 row" in said
     assert "semicolons" in said
     assert "'Result', 'Day'" in said
     path = write_table("Scenario;Result;sim_planned\ncup;pass;\n")
-    assert "'Result' read as recorded" in take(path, MAPPED).said
+    assert "'Result' read as recorded" in take(path, MAPPED).summary
     path = write_table("task,sim_planned,Result\ncup,yes,pass\n")
     assert read_trials(path)[0].recorded is None  # nobody said that it is the outcome
-    assert '--map "outcome=Result"' in take(path).said
+    assert '--map "outcome=Result"' in take(path).summary
 
 
 @pytest.mark.parametrize("unknown", ["", "NA", "n/a", "NaN", "-", "?", "none"])

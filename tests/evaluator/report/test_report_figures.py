@@ -8,10 +8,12 @@ import lean_checks
 import pytest
 
 from evaluator.compare import Comparison, compare_csv
+from evaluator.compare.success import WITH
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing, NotDrawn, Rendered
 from evaluator.report.figures.rates import scatter, success
 from evaluator.report.figures.render import render
 from evaluator.report.figures.selection import drawable, drawings_of
+from evaluator.report.figures.tasks import tasks
 from evaluator.report.sections import SECTIONS
 from evaluator.report.write import write_report
 
@@ -114,3 +116,13 @@ def test_a_figure_that_has_lost_its_data_is_removed(tmp_path: Path) -> None:
     assert not stale.exists()
     assert mine.exists()
     assert any("funnel (no trial has labelled stages)" in text for text in written.content.missing)
+
+
+def test_each_task_has_a_panel_where_something_can_be_chosen_inside() -> None:
+    groups = compare_csv(PAPER).groups
+    drawn = tasks(groups, "real")
+    assert isinstance(drawn, Drawing)
+    assert [row[0] for row in drawn.table.rows] == [group.task for group in groups]
+    alone = tasks([group for group in groups if group.condition == WITH], "real")
+    assert isinstance(alone, NotDrawn)
+    assert "two tasks" in alone.reason
