@@ -11,16 +11,14 @@ from scipy.special import expit
 from evaluator.compare.spreadsheet import compare_csv
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.differences import mean_of_intervals, newcombe_difference
+from evaluator.statistics.group_likelihood import GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.hierarchical import (
     AgreementModel,
-    GroupCounts,
-    Likelihood,
-    Nodes,
-    Spread,
     estimate,
-    log_prior,
+    from_normal,
     population,
     ranking,
+    to_normal,
 )
 
 Counts = Sequence[tuple[str, int, int, int, int]]
@@ -128,11 +126,18 @@ def test_pairs_that_agree_make_the_bias_sharper() -> None:
     assert sharp.mean == pytest.approx(rough.mean, abs=0.03)
 
 
-def test_the_prior_allows_spreads_above_zero_and_true_correlations() -> None:
-    phi = np.array([[0, 0, 1, 1, 0.5], [0, 0, 2, 1, 1.5], [0, 0, -0.1, 1, 0], [0, 0, 1, 1, 1.6]])
-    found = log_prior(phi)
-    assert found[0] - found[1] == pytest.approx((4 - 1) / (2 * 2.5**2))
-    assert np.isneginf(found[2:]).all()
+def test_normal_numbers_stand_for_parameters_with_their_prior() -> None:
+    z = np.tile(np.array([-6.0, -1.0, 0.3, 2.0, 6.0])[:, None], 8)
+    phi = from_normal(z)
+    share = stats.norm.cdf(z)
+    assert stats.norm(scale=2.5).cdf(phi[:, :2]) == pytest.approx(share[:, :2])
+    for at in (2, 5):
+        sizes = phi[:, at : at + 2]
+        assert (sizes >= 0).all()
+        assert stats.halfnorm(scale=2.5).sf(sizes) == pytest.approx(1 - share[:, :2], rel=1e-6)
+        assert phi[:, at + 2] / np.pi + 0.5 == pytest.approx(share[:, 0])
+    assert to_normal(phi[1]) == pytest.approx(z[1])
+    assert to_normal(phi[3]) == pytest.approx(z[3])
 
 
 def test_the_population_has_the_correlation_that_draws_have() -> None:
