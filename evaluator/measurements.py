@@ -329,6 +329,41 @@ STUDY_NOT_EXECUTED = _new(
     None,
     "share of starts on which the arm {arm} executed nothing: {words}",
 )
+PROTOCOL_DEPARTURES = _new(
+    "protocol.departures",
+    "count",
+    "lower",
+    None,
+    "departures of what was done from the protocol that was locked before the first trial",
+)
+PROTOCOL_DIFFERENCE = _new(
+    "protocol.primary.difference_pp",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "the primary question of the protocol, over starts tried in both arms: {about}",
+)
+PROTOCOL_DIFFERENCE_P = _new(
+    "protocol.primary.difference_p",
+    "1",
+    "none",
+    differences.mcnemar,
+    "two-sided McNemar test with mid-p of the primary question, at {alpha:g}: {about}",
+)
+PROTOCOL_AGREEMENT = _new(
+    "protocol.primary.agreement",
+    "1",
+    "higher",
+    intervals.wilson,
+    "the primary question of the protocol, agreed / decided trials: {about}",
+)
+PROTOCOL_AGREEMENT_P = _new(
+    "protocol.primary.agreement_p",
+    "1",
+    "none",
+    None,
+    "two-sided score test of the primary question, at {alpha:g}, 1 below the limit: {about}",
+)
 START_DISTANCE = {
     kind: _new(
         f"paired.start_distance_{kind}_m",

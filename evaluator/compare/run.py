@@ -22,6 +22,7 @@ from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
+from evaluator.compare.protocol_check import as_designed, protocol_results
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
@@ -70,7 +71,9 @@ def compare_run(
         summaries = sum_up(trials, cache, output, pool)
     recorded_ids = {recorded.facts.info.id for recorded in contents.recorded}
     imported, doubled = imported_rows(run, recorded_ids)
-    rows = [*with_rule((trial.row for trial in trials), summaries.rules), *imported]
+    protocol = read_protocol(run.path)
+    all_rows = [*with_rule((trial.row for trial in trials), summaries.rules), *imported]
+    rows = as_designed(all_rows, protocol)
     nets = open_nets(images.backbones)
     views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
@@ -82,8 +85,14 @@ def compare_run(
         views,
         methods,
         bands,
+        protocol_results(
+            rows,
+            protocol,
+            method=method,
+            left_out=left_out,
+            task_hashes=_task_hashes(contents),
+        ),
     )
-    protocol = read_protocol(run.path)
     base = compare_rows(
         rows,
         run=run.path.resolve().name,
@@ -146,6 +155,15 @@ def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
         trials.append(trial)
         left_out += trial.exclusions
     return trials, left_out
+
+
+def _task_hashes(contents: RunContents) -> dict[str, frozenset[str]]:
+    found: dict[str, set[str]] = {}
+    for each in contents.recorded:
+        info = each.facts.info
+        if info.kind == "trial" and info.task_sha256:
+            found.setdefault(info.task, set()).add(info.task_sha256)
+    return {task: frozenset(hashes) for task, hashes in found.items()}
 
 
 def _bands(contents: RunContents) -> BandReport:

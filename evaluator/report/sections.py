@@ -30,6 +30,16 @@ SECTIONS: tuple[Section, ...] = (
         tables=("published",),
     ),
     Section(
+        id="protocol",
+        title="The study against its protocol",
+        lead="What was fixed before the first trial, what it found, and every departure from it.",
+        numbers=(
+            ("protocol.departures", "Departures from the protocol"),
+            ("protocol.primary.*", ""),
+        ),
+        tables=("protocol_questions", "protocol_departures"),
+    ),
+    Section(
         id="success",
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "

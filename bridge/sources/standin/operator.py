@@ -32,12 +32,12 @@ from bridge.sources.standin.settings import (
     CONDITION_OF,
     CONDITIONS,
     INTERRUPTED,
-    SEEDS_PER_SESSION,
     SessionConfig,
 )
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
+from bridge.task.protocol import SEEDS_PER_SESSION, arms_in_order
 from bridge.task.task_file import Task, TaskFile
 from bridge.terminal import Output
 
@@ -193,7 +193,6 @@ def _pieces(plan: Plan) -> list[tuple[int, int]]:
 RESET_STREAM = 404
 RESETS = {WITHOUT: 0, WITH: 1, "without": 0, "with": 1, "control": 3}
 RESET_OF_A_SCAN = 2
-ORDER_STREAM = 606
 PROBE_STREAM = 505
 PROBE_TRIES = 100
 """The object is put elsewhere until there is space for the probe."""
@@ -288,9 +287,7 @@ class Operator:
         config = self._config
         if not config.study_arms:
             return [Treatment(condition=condition) for condition in config.conditions]
-        rng = np.random.default_rng([ORDER_STREAM, config.study_seed, start_seed])
-        order = rng.permutation(len(config.study_arms))
-        arms = [config.study_arms[index] for index in order]
+        arms = arms_in_order(config.study_arms, config.study_seed, start_seed)
         return [Treatment(condition=CONDITION_OF[arm], study_arm=arm) for arm in arms]
 
     def _wanted(self) -> list[tuple[int, Treatment]]:
