@@ -134,7 +134,7 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
     for arm in study.arms:
         if arm not in STUDY_ARMS:
             raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
-    first, *others = dict.fromkeys(study.policies)
+    first, *others = list(dict.fromkeys(study.policies))
     policies = (
         PolicyArms(policy=first, arms=tuple(dict.fromkeys(study.arms))),
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
