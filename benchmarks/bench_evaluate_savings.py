@@ -72,11 +72,11 @@ def forecasts(state: Callable[[np.ndarray], np.ndarray], n: int, rng: np.random.
         happened = rng.random(n) < true
         expected = true * (1 - stated) ** 2 + (1 - true) * stated**2
         found = brier_interval(stated.tolist(), happened.tolist())
-        holds[0] += found.low <= float(expected.mean()) <= found.high
+        holds[0] += int(found.low <= float(expected.mean()) <= found.high)
         places = np.minimum((stated * 10).astype(int), 9)
         error = sum(abs((stated - true)[places == b].sum()) for b in np.unique(places)) / n
         kept = calibration_error_interval(stated.tolist(), happened.tolist())
-        holds[1] += kept.low - 1e-9 <= error <= kept.high + 1e-9
+        holds[1] += int(kept.low - 1e-9 <= error <= kept.high + 1e-9)
     return {"brier": holds[0] / DRAWS, "ece": holds[1] / DRAWS}
 
 

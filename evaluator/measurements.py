@@ -18,6 +18,7 @@ from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS, score_image
 from evaluator.statistics import (
     agreement,
+    calibration,
     differences,
     funnel,
     gate,
@@ -697,7 +698,21 @@ ECE = _new(
     "1",
     "lower",
     gate.expected_calibration_error,
-    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials; {_WHOSE}",
+    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials, which the interval takes out; {_WHOSE}",
+)
+BRIER_PERFECT = _new(
+    "reliability.brier_perfect",
+    "1",
+    "none",
+    calibration.perfect_forecaster,
+    "Brier score of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
+)
+ECE_PERFECT = _new(
+    "reliability.ece_perfect",
+    "1",
+    "none",
+    calibration.perfect_forecaster,
+    "expected calibration error of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 LABEL_AGREED = _new(
     "label.localised.rate",
@@ -739,7 +754,7 @@ TRIALS_SAVED = _new(
     "count",
     "higher",
     prediction_powered.trials_saved,
-    "further trials Wilson's interval would need; {many}",
+    "further robot trials that the same interval would need without the twin; 0 unless success is shown to be more frequent after a yes than after a no (one-sided p of 0.025); {many}",
 )
 RANDOM_STARTS_P = _new(
     _PROXY.format(name="random_starts_p"),

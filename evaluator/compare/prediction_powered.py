@@ -206,8 +206,7 @@ class _Assisted:
 
     def saved(self) -> float:
         self._check()
-        estimate = post_stratified(self.counts, self.alone_k, self.alone_n)
-        return float(trials_saved(estimate, self.counts.n))
+        return float(trials_saved(self.counts, self.alone_k, self.alone_n))
 
     def _check(self) -> None:
         """Refuse an estimate where the tried starts are unlike the others."""

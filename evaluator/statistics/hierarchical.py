@@ -37,8 +37,8 @@ FREEDOM = 10
 """Of Student's t, as which the nodes lie."""
 FEW = 80.0
 """Nodes that have to count while they are being moved."""
-NUM_DRAWS = 2_000
-DRAWN_NUMBERS = 120_000_000
+NUM_DRAWS = 4_000
+DRAWN_NUMBERS = 200_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,8 +274,9 @@ class AgreementModel:
         cells = like.table.shape[1]
         count = int(np.clip(DRAWN_NUMBERS / (cells * len(self.groups)), 400, NUM_DRAWS))
         rng = np.random.default_rng([self._seed, 99])
-        places = np.searchsorted(np.cumsum(self.weights), (np.arange(count) + 0.5) / count)
-        nodes = Nodes.of(self.phi[np.minimum(places, len(self.phi) - 1)])
+        order = np.argsort(self.phi[:, 1] - self.phi[:, 0])  # every bias has its share of draws
+        places = np.searchsorted(np.cumsum(self.weights[order]), (np.arange(count) + 0.5) / count)
+        nodes = Nodes.of(self.phi[order[np.minimum(places, len(order) - 1)]])
         recorded, sim = (np.empty((count, len(self.groups))) for _ in range(2))
         for members in like.members:
             shares, centres = like.of_task(nodes, members)
