@@ -27,6 +27,7 @@ from evaluator.statistics import (
     power,
     prediction_powered,
     sequential,
+    strata,
 )
 
 Better = Literal["higher", "lower", "none"]
@@ -242,6 +243,20 @@ BOSCHLOO_POOLED = _new(
     differences.boschloo,
     "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
 )
+MANTEL_HAENSZEL = _new(
+    "unpaired.mantel_haenszel_pp.{side}",
+    "pp",
+    "higher",
+    strata.mantel_haenszel,
+    "gain with replanning over {count} tasks, starts not paired, each task compared within itself (Mantel-Haenszel weights; {side})",
+)
+MANTEL_HAENSZEL_P = _new(
+    "unpaired.mantel_haenszel_p.{side}",
+    "1",
+    "none",
+    strata.mantel_haenszel,
+    "two-sided Cochran-Mantel-Haenszel test of that gain, no continuity correction ({side})",
+)
 TRIALS_NEEDED = _new(
     "power.trials_needed.{side}.{task}.{policy}",
     "count",
@@ -329,6 +344,20 @@ STUDY_NOT_EXECUTED = _new(
     "lower",
     None,
     "share of starts on which the arm {arm} executed nothing: {words}",
+)
+DRIFT = _new(
+    "session.drift_pp",
+    "pp",
+    "none",
+    strata.drift,
+    "change of recorded success from the first to the last trial of the session, slope over the order of trials within task, policy and condition",
+)
+DRIFT_P = _new(
+    "session.drift_p",
+    "1",
+    "none",
+    strata.drift,
+    "two-sided p of that trend (Mantel's extension test)",
 )
 PROTOCOL_DEPARTURES = _new(
     "protocol.departures",

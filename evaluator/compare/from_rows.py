@@ -20,6 +20,7 @@ from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
+from evaluator.compare.session_order import session_order
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -109,6 +110,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
+    drifted, order_tables = session_order(rows)
     chosen, decision_tables = decisions(groups)
     modelled, model_tables = model_results(usable_groups(groups))
     study, study_tables, void = study_results(rows, void_causes, method=method)
@@ -125,6 +127,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *paired_gain(pairs),
         *start_distances(pairs),
         *never_sent(rows),
+        *drifted,
         *beside,
         *scorecard,
         *kept,
@@ -143,7 +146,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         study_tables=study_tables,
         gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
-        decision_tables=(*model_tables, *decision_tables),
+        decision_tables=(*model_tables, *decision_tables, *order_tables),
     )
 
 

@@ -19,6 +19,8 @@ from evaluator.measurements import (
     GAIN_POINTS_AVERAGE,
     GAIN_RELATIVE,
     GAIN_RELATIVE_AVERAGE,
+    MANTEL_HAENSZEL,
+    MANTEL_HAENSZEL_P,
     MCNEMAR,
     PAIRED_GAIN,
     PAIRED_POWER,
@@ -44,6 +46,7 @@ from evaluator.statistics.power import (
     power_unpaired,
     trials_needed,
 )
+from evaluator.statistics.strata import mantel_haenszel
 
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
@@ -282,6 +285,7 @@ def gain_tests(groups: Sequence[RateGroup]) -> list[Measurement]:
             measurements += _tests(change)
         if len(mine) > 1:
             measurements.append(_pooled_test(mine, side))
+            measurements += _over_strata(mine, side)
     return measurements
 
 
@@ -416,6 +420,35 @@ def _pooled_test(mine: Sequence[Change], side: str) -> Measurement:
         counted="task",
         reason_without_interval="a p-value",
     )
+
+
+def _over_strata(mine: Sequence[Change], side: str) -> list[Measurement]:
+    tables = [change.counts for change in mine if change.counts is not None]
+    make = partial(
+        measured,
+        n=len(mine),
+        counted="task",
+        episodes=[name for c in mine for name in (*c.before.episodes, *c.after.episodes)],
+    )
+
+    def compute(name: str) -> float:
+        if len(tables) < len(mine):
+            reason = "the number of trials of a task is not known"
+            raise UndefinedStatisticError(statistic="Mantel-Haenszel test", reason=reason)
+        return float(getattr(mantel_haenszel(tables), name))
+
+    return [
+        make(
+            MANTEL_HAENSZEL.of(side=side, count=len(mine)),
+            lambda: 100 * compute("difference"),
+            reason_without_interval="its p-value is beside it; the model's mean gain has one",
+        ),
+        make(
+            MANTEL_HAENSZEL_P.of(side=side),
+            lambda: compute("p"),
+            reason_without_interval="a p-value",
+        ),
+    ]
 
 
 def _mean(measurements: Sequence[Measurement]) -> float:

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from bridge.episode.metadata import treatment_of
 from bridge.task.protocol import FILE_NAME, Endpoint, Protocol
 from evaluator.compare.measure import Part, ends, measured, vouched_rate
-from evaluator.compare.rows import TrialRow, is_streamed
+from evaluator.compare.rows import TrialRow, in_order, is_streamed
 from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.errors import UndefinedStatisticError
@@ -174,8 +174,7 @@ def _of_order(rows: Sequence[TrialRow], protocol: Protocol) -> Iterable[_Departu
         (trial.task, trial.start_id, trial.policy, trial.arm): trial.number
         for trial in protocol.order()
     }
-    known = all(row.began_ns for row in rows)
-    made = sorted(rows, key=lambda row: row.began_ns) if known else rows
+    made = in_order(rows)
     keys = [(row.task, row.start_id or "", row.policy, row.study_arm) for row in made]
     numbers = [planned[key] for key in keys if key in planned]
     moved = len(numbers) - _longest_rising(numbers)

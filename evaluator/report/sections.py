@@ -44,8 +44,12 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "notes"),
-        figures=("success",),
+        numbers=(
+            ("session.drift_pp", "Change of success over the session"),
+            ("session.drift_p", "Change over the session, p"),
+        ),
+        tables=("success", "layout", "notes", "session_order"),
+        figures=("success", "order"),
     ),
     Section(
         id="agreement",
