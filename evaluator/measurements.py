@@ -285,6 +285,20 @@ PAIRED_GAIN = _new(
     differences.tango_difference,
     "gain with replanning in percentage points over paired starts: {words}",
 )
+PAIRED_PROGRESS = _new(
+    "paired.progress_pp",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "share of paired starts that came further with replanning less that of those that came less far, by objects or sub-tasks done: {words}",
+)
+PAIRED_PROGRESS_P = _new(
+    "paired.progress_p_mid",
+    "1",
+    "none",
+    differences.sign_test,
+    "two-sided sign test with mid-p of the same: {words}",
+)
 PAIRED_POWER = _new(
     "power.paired.{side}",
     "1",

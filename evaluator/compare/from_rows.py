@@ -11,6 +11,7 @@ from evaluator.compare.gains import (
     gain_tests,
     pair_starts,
     paired_gain,
+    paired_progress,
     replanning_gains,
     start_distances,
 )
@@ -125,6 +126,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *again,
         *study,
         *paired_gain(pairs),
+        *paired_progress(pairs),
         *start_distances(pairs),
         *never_sent(rows),
         *drifted,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -24,6 +25,8 @@ from evaluator.measurements import (
     MCNEMAR,
     PAIRED_GAIN,
     PAIRED_POWER,
+    PAIRED_PROGRESS,
+    PAIRED_PROGRESS_P,
     POWER_UNPAIRED,
     START_DISTANCE,
     TRIALS_NEEDED,
@@ -35,6 +38,7 @@ from evaluator.statistics.differences import (
     mcnemar,
     mean_of_intervals,
     newcombe_difference,
+    sign_test,
     tango_points,
 )
 from evaluator.statistics.intervals import relative_gain
@@ -179,6 +183,53 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
                 )
             )
     return measurements
+
+
+def paired_progress(pairs: Sequence[StartPair]) -> list[Measurement]:
+    """Compare how far both trials of a start came, where trials count objects or sub-tasks.
+
+    Only which one came further counts, not by how much: two of three sub-tasks are no share of a
+    distance.
+
+    Args:
+        pairs: The same starts without and with replanning; nothing where none has progress.
+    """
+    known = []
+    for pair in pairs:
+        before, after = progress(pair.before), progress(pair.after)
+        if before is not None and after is not None and pair.before.unit == pair.after.unit:
+            known.append((pair, before, after))
+    if not known:
+        return []
+    improved = sum(after > before for _, before, after in known)
+    worsened = sum(after < before for _, before, after in known)
+    words = f"further in {improved}, less far in {worsened} of {len(known)} paired starts"
+    make = partial(
+        measured,
+        n=len(known),
+        counted="pair",
+        episodes=[r.episode for pair, _, _ in known for r in (pair.before, pair.after)],
+    )
+
+    def p_mid() -> float:
+        if not improved + worsened:
+            reason = f"both trials of all {len(known)} starts came equally far"
+            raise UndefinedStatisticError(statistic="sign test", reason=reason)
+        return sign_test(improved, worsened)[1]
+
+    return [
+        make(
+            PAIRED_PROGRESS.of(words=words), partial(tango_points, improved, worsened, len(known))
+        ),
+        make(PAIRED_PROGRESS_P.of(words=words), p_mid, reason_without_interval="a p-value"),
+    ]
+
+
+def progress(row: TrialRow) -> Fraction | None:
+    """Return which part of a trial's objects or sub-tasks succeeded, None where trials count."""
+    if row.unit == "trial" or row.k is None or not row.n:
+        return None
+    return Fraction(row.k, row.n)
 
 
 def _paired_points(

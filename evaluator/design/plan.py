@@ -155,8 +155,8 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
         return protocol
     if study.coin is None:
         raise UsageError("the arm control needs --coin, the chance of yes to each plan.")
-    names = [task.task for task in protocol.tasks]
-    return with_coins(protocol, dict.fromkeys(names, study.coin), "given by --coin")
+    coins = {task.task: study.coin for task in protocol.tasks}
+    return with_coins(protocol, coins, "given by --coin")
 
 
 def _task(name: str, study: StudyOptions) -> StudyTask:

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from statsmodels.stats.contingency_tables import StratifiedTable, Table
 
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.session_order import session_order
 from evaluator.errors import UndefinedStatisticError
+from evaluator.report.figures.drawing import Drawing, NotDrawn
+from evaluator.report.figures.order import session_order as drawing_of_order
 from evaluator.statistics.strata import drift, mantel_haenszel
 
 TABLES = [(3, 10, 6, 10), (8, 12, 11, 14), (1, 9, 4, 8)]
@@ -59,3 +63,52 @@ def test_no_drift_is_found_as_often_as_the_level_says() -> None:
     assert np.mean(np.array(p) <= 0.05) == pytest.approx(0.05, abs=0.03)
     with pytest.raises(UndefinedStatisticError, match="ended differently"):
         drift([True] * 8, ["a"] * 8)
+
+
+def session(outcomes: list[bool], began_ns: list[int] | None = None) -> list[TrialRow]:
+    return [
+        TrialRow(
+            episode=f"trial_{place}",
+            task="stack",
+            condition="with_replanning" if place % 2 else "without_replanning",
+            policy="act",
+            start_id=str(place // 2),
+            cell="lab",
+            stand_in=False,
+            recorded=outcome,
+            began_ns=0 if began_ns is None else began_ns[place],
+        )
+        for place, outcome in enumerate(outcomes)
+    ]
+
+
+def test_a_session_is_laid_out_by_when_its_trials_were_recorded() -> None:
+    worn = [True] * 12 + [False] * 12
+    measurements, (table,) = session_order(session(worn))
+    found = {each.id: each.value for each in measurements}
+    assert found["session.drift_p"] is not None
+    assert found["session.drift_p"] < 0.001
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    assert sum(row["n"] for row in rows) == 24  # type: ignore[misc]
+    assert sum(row["k"] for row in rows) == 12  # type: ignore[misc]
+    assert rows[0]["rate"] == 1.0
+    assert rows[-1]["rate"] == 0.0
+    backwards, _ = session_order(session(worn, began_ns=list(range(24, 0, -1))))
+    assert backwards[0].value == pytest.approx(-(measurements[0].value or 0))
+
+
+def test_few_trials_have_no_order_and_equal_ones_no_drift() -> None:
+    assert session_order(session([True] * 7)) == ([], ())
+    measurements, tables = session_order(session([True] * 10))
+    assert measurements[0].value is None
+    assert measurements[0].reason_if_undefined
+    assert "ended differently" in measurements[0].reason_if_undefined
+    assert tables
+
+
+def test_the_figure_shows_every_part_and_says_why_it_is_missing() -> None:
+    _, tables = session_order(session([True, False] * 12))
+    drawn = drawing_of_order(tables)
+    assert isinstance(drawn, Drawing)
+    assert "trials 1 to" in drawn.alt
+    assert isinstance(drawing_of_order(()), NotDrawn)

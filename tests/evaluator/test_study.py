@@ -6,6 +6,7 @@ import pytest
 
 from bridge.episode.metadata import treatment_of
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.gains import pair_starts, paired_progress
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.study import study_results, study_starts
 from evaluator.result import Measurement
@@ -138,3 +139,22 @@ def test_without_a_control_only_the_other_arm_is_compared() -> None:
     found = by_id(two)
     assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(6, 1)[1]
     assert not [name for name in found if "control" in name]
+
+
+def test_progress_counts_which_trial_of_a_start_came_further_and_not_how_far() -> None:
+    done = [(1, 3), (0, 2), (2, 2), (3, 1), (0, 1), (1, 2)]  # of 3 sub-tasks, without and with
+    rows = [
+        row(start, arm, k == 3, unit="subtask", k=k, n=3)
+        for start, ks in enumerate(done)
+        for arm, k in zip(("without", "with"), ks, strict=True)
+    ]
+    pairs, left_out = pair_starts(rows)
+    assert not left_out
+    share, test = paired_progress(pairs)
+    expected = tango_difference(4, 1, 6)
+    assert share.value == pytest.approx(100 * 3 / 6)
+    assert share.interval is None or share.interval.low == pytest.approx(100 * expected.low)
+    assert test.value == sign_test(4, 1)[1]
+    further = [replace(each, k=3) if each.k == 2 else each for each in rows]
+    assert paired_progress(pair_starts(further)[0])[1].value == test.value
+    assert paired_progress(pair_starts(FIRST)[0]) == []

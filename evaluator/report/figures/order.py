@@ -40,7 +40,8 @@ def session_order(tables: Sequence[Table]) -> Drawing | NotDrawn:
         grid(axes)
         for number, condition in enumerate(conditions):
             mine = [row for row in rows if row[2] == condition]
-            middle = [(float(str(row[0])) + float(str(row[1]))) / 2 for row in mine]
+            aside = 0.4 * (number - (len(conditions) - 1) / 2)  # intervals do not cover each other
+            middle = [(float(str(row[0])) + float(str(row[1]))) / 2 + aside for row in mine]
             rate = [100 * float(str(row[5])) for row in mine]
             colour = LIGHT[COLOURS[number % len(COLOURS)]]
             for x, row in zip(middle, mine, strict=True):
