@@ -8,14 +8,20 @@ table that ``markdown`` writes: ``python -m evaluator.measurements docs/metrics.
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image, state, trajectory
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS, score_image
+from evaluator.quantity import REGISTRY as REGISTRY
+from evaluator.quantity import Better
+from evaluator.quantity import Defined as Defined
+from evaluator.quantity import Quantity as Quantity
+from evaluator.quantity import new_quantity as _new
+from evaluator.quantity import quantity_of as quantity_of
+from evaluator.quantity import slug as slug
 from evaluator.statistics import (
     agreement,
     calibration,
@@ -30,92 +36,7 @@ from evaluator.statistics import (
     strata,
 )
 
-Better = Literal["higher", "lower", "none"]
-"""Which way a value is better; ``none`` where it describes and does not judge."""
-
 # ruff: noqa: E501  # one line for each definition
-
-
-def slug(text: str) -> str:
-    """Return text usable as one part of a measurement id.
-
-    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
-    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
-    """
-    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
-    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
-
-
-def _code(letter: str) -> str:
-    return f"+{ord(letter):04x}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Defined:
-    """What one measurement is: the part of it that its quantity decides."""
-
-    id: str
-    unit: str
-    definition: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Quantity:
-    """One kind of measurement."""
-
-    id: str
-    """With the names of its variable parts in braces."""
-    unit: str
-    definition: str
-    """With words of the single measurement in braces."""
-    better: Better
-    computed_by: Callable[..., Any] | None
-    """None for plain counts."""
-
-    def of(self, **words: object) -> Defined:
-        """Name one measurement.
-
-        Args:
-            words: The parts of its id, which are made fit for ids, and of its definition.
-        """
-        parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
-        return Defined(
-            id=self.id.format(**parts),
-            unit=self.unit,
-            definition=self.definition.format(**words),
-        )
-
-    @cached_property
-    def pattern(self) -> re.Pattern[str]:
-        """Matches the ids of this quantity, with their parts as groups."""
-        parts = re.split(r"\{(\w+)\}", self.id)
-        ends = [re.escape(text) for text in parts[::2]]
-        names = [rf"(?P<{name}>[A-Za-z0-9_+-]+)" for name in parts[1::2]]
-        return re.compile("".join(a + b for a, b in zip(ends, [*names, ""], strict=True)))
-
-
-REGISTRY: list[Quantity] = []
-"""In the order of docs/metrics.md."""
-
-
-def quantity_of(measurement_id: str) -> Quantity | None:
-    """Return the quantity an id belongs to, the one with the fewest variable parts."""
-    found = [q for q in REGISTRY if q.pattern.fullmatch(measurement_id)]
-    return min(found, key=lambda q: q.id.count("{"), default=None)
-
-
-def _new(
-    id: str,  # the word everywhere
-    unit: str,
-    better: Better,
-    computed_by: Callable[..., Any] | None,
-    definition: str,
-) -> Quantity:
-    quantity = Quantity(
-        id=id, unit=unit, definition=definition, better=better, computed_by=computed_by
-    )
-    REGISTRY.append(quantity)
-    return quantity
 
 
 # Success rates.
@@ -316,98 +237,6 @@ MCNEMAR = {
     )
     for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
 }
-STUDY_GAIN = _new(
-    "study.gain_pp.{against}.{task}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "success in the study arm with less that in the arm {against} over the same starts, in percentage points, "
-    "whatever was not executed counted as a failure: {words}",
-)
-STUDY_GAIN_POOLED = _new(
-    "study.gain_pp.{against}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "the same over the starts of {count} tasks: {words}",
-)
-STUDY_P = _new(
-    "study.mcnemar_p_mid.{against}.{policy}",
-    "1",
-    "none",
-    differences.mcnemar,
-    "two-sided McNemar test of the arm with against {against}, mid-p, over the starts of {count} tasks that differ: {words}",
-)
-STUDY_GAIN_EXECUTED = _new(
-    "study.executed_gain_pp.{against}.{task}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "per protocol: the gain over the starts that were executed in both arms alone: {words}",
-)
-STUDY_P_EXECUTED = _new(
-    "study.executed_mcnemar_p_mid.{against}.{policy}",
-    "1",
-    "none",
-    differences.mcnemar,
-    "per protocol: the same test over the starts of {count} tasks that were executed in both arms: {words}",
-)
-STUDY_NOT_EXECUTED = _new(
-    "study.not_executed.{arm}.{task}.{policy}",
-    "1",
-    "lower",
-    None,
-    "share of starts on which the arm {arm} executed nothing: {words}",
-)
-DRIFT = _new(
-    "session.drift_pp",
-    "pp",
-    "none",
-    strata.drift,
-    "change of recorded success from the first to the last trial of the session, slope over the order of trials within task, policy and condition",
-)
-DRIFT_P = _new(
-    "session.drift_p",
-    "1",
-    "none",
-    strata.drift,
-    "two-sided p of that trend (Mantel's extension test)",
-)
-PROTOCOL_DEPARTURES = _new(
-    "protocol.departures",
-    "count",
-    "lower",
-    None,
-    "departures of what was done from the protocol that was locked before the first trial",
-)
-PROTOCOL_DIFFERENCE = _new(
-    "protocol.primary.difference_pp",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "the primary question of the protocol, over starts tried in both arms: {about}",
-)
-PROTOCOL_DIFFERENCE_P = _new(
-    "protocol.primary.difference_p",
-    "1",
-    "none",
-    differences.mcnemar,
-    "two-sided McNemar test with mid-p of the primary question, at {alpha:g}: {about}",
-)
-PROTOCOL_AGREEMENT = _new(
-    "protocol.primary.agreement",
-    "1",
-    "higher",
-    intervals.wilson,
-    "the primary question of the protocol, agreed / decided trials: {about}",
-)
-PROTOCOL_AGREEMENT_P = _new(
-    "protocol.primary.agreement_p",
-    "1",
-    "none",
-    None,
-    "two-sided score test of the primary question, at {alpha:g}, 1 below the limit: {about}",
-)
 START_DISTANCE = {
     kind: _new(
         f"paired.start_distance_{kind}_m",

@@ -14,16 +14,16 @@ from evaluator.compare.rows import TrialRow, in_order, is_streamed
 from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import (
+from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.statistics.differences import sign_test, tango_points
+from evaluator.statistics.planning import holm
+from evaluator.study_measurements import (
     PROTOCOL_AGREEMENT,
     PROTOCOL_AGREEMENT_P,
     PROTOCOL_DEPARTURES,
     PROTOCOL_DIFFERENCE,
     PROTOCOL_DIFFERENCE_P,
 )
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.differences import sign_test, tango_points
-from evaluator.statistics.planning import holm
 
 ARM_OF_CONDITION = {condition: arm for arm, condition in CONDITION_OF_ARM.items()}
 NO_HASH = "0" * 64

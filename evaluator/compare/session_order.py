@@ -9,9 +9,9 @@ from evaluator.compare.measure import ends, measured, vouched_rate
 from evaluator.compare.rows import TrialRow, in_order, is_streamed
 from evaluator.compare.success import names_of
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import DRIFT, DRIFT_P
 from evaluator.result import Cell, Measurement, Table
 from evaluator.statistics.strata import Drift, drift
+from evaluator.study_measurements import DRIFT, DRIFT_P
 
 FEWEST = 8
 """Trials from which on their order is looked at."""

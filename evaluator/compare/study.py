@@ -13,17 +13,17 @@ from functools import partial
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow, is_streamed
-from evaluator.measurements import (
+from evaluator.measurements import Defined
+from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.statistics.differences import mcnemar, tango_points
+from evaluator.study_measurements import (
     STUDY_GAIN,
     STUDY_GAIN_EXECUTED,
     STUDY_GAIN_POOLED,
     STUDY_NOT_EXECUTED,
     STUDY_P,
     STUDY_P_EXECUTED,
-    Defined,
 )
-from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.statistics.differences import mcnemar, tango_points
 
 WITH = "with"
 AGAINST = ("without", "control")

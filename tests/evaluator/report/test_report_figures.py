@@ -32,14 +32,15 @@ def test_a_run_with_everything_has_every_figure_and_each_has_its_place(
 ) -> None:
     placed = [name for section in SECTIONS for name in section.figures]
     assert sorted(item.drawing.id for item in rendered) == sorted(placed)
-    assert len(placed) == len(set(placed)) == 11
+    assert len(placed) == len(set(placed)) == 12
 
 
 def test_what_has_no_data_is_named_with_its_reason() -> None:
     drawn, not_drawn = drawings_of(drawable(compare_csv(PAPER)))
     assert {item.id for item in drawn} == {"scatter", "success", "gains"}
     assert {item.id for item in not_drawn} == {
-        *("confusion", "costs", "reliability", "funnel", "motions", "bands", "states", "views")
+        *("confusion", "costs", "reliability", "funnel", "motions", "bands", "states", "views"),
+        "order",
     }
     assert all(item.reason for item in not_drawn)
 
