@@ -43,6 +43,12 @@ COMMANDS: tuple[Command, ...] = (
         "Try policies without and with replanning on the same starts.",
         "runs/study --trials 20",
     ),
+    (
+        "design",
+        "evaluator.cli:design",
+        "Size a study before its first trial, and lock its protocol.",
+        "runs/study --rate 0.5 --gain 0.3 --width 0.4",
+    ),
     ("record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday"),
     (
         "ctl",

@@ -22,7 +22,7 @@ from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, draw_errors, perceive
-from bridge.sources.standin.settings import SEEDS_PER_SESSION
+from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
 

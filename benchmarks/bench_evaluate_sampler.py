@@ -14,7 +14,8 @@ import numpy as np
 from measure import ROOT, Target, report_targets
 from scipy.special import expit
 
-from evaluator.statistics.hierarchical import AgreementModel, GroupCounts
+from evaluator.statistics.group_likelihood import GroupCounts
+from evaluator.statistics.hierarchical import AgreementModel
 
 FULL_SWEEPS = 12_000
 SWEEPS = int(os.environ.get("SAMPLER_SWEEPS", FULL_SWEEPS))

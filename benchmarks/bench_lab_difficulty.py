@@ -27,9 +27,9 @@ from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hi
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
-from bridge.sources.standin.settings import SEEDS_PER_SESSION
 from bridge.sources.standin.streams import Streams
 from bridge.task.plan import Plan
+from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import Task, load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
 

@@ -159,7 +159,7 @@ def void_trials(run: Path) -> list[Path]:
 
 def rows_of(session: LabSession) -> list[dict[str, Any]]:
     """One row per trial: what was said before, what the rule says, what happened."""
-    from bridge.sources.standin.settings import SEEDS_PER_SESSION
+    from bridge.task.protocol import SEEDS_PER_SESSION
     from bridge.task.task_file import load_task
 
     task, first = load_task(session.task), session.seed * SEEDS_PER_SESSION

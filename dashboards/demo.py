@@ -25,8 +25,9 @@ from bridge.episode.metadata import WITHOUT, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
-from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED, SEEDS_PER_SESSION
+from bridge.sources.standin.settings import CONDITIONS, INTERRUPTED
 from bridge.task.find import chosen_task_file
+from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.terminal import Output, how_to_activate
 from dashboards.config import BUILT_IN_POLICY, DemoConfig
 from dashboards.errors import DashboardError

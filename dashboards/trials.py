@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge.data_files import datasets_folder
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.mcap.part_file import lock_dead
@@ -27,10 +25,17 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError, UsageError
 from bridge.process_pool import cores
-from bridge.sources.standin.settings import CONDITION_OF, SEEDS_PER_SESSION
+from bridge.sources.standin.settings import CONDITION_OF
 from bridge.task.find import chosen_task_file
 from bridge.task.plan import STUDY_ARMS
-from bridge.task.protocol import PolicyArms, Protocol, StudyTask, keep_protocol, with_coins
+from bridge.task.protocol import (
+    SEEDS_PER_SESSION,
+    PolicyArms,
+    Protocol,
+    StudyTask,
+    keep_protocol,
+    with_coins,
+)
 from bridge.terminal import Output
 from dashboards.config import BUILT_IN_POLICY, TrialsConfig
 from dashboards.demo import (
@@ -48,7 +53,6 @@ from dashboards.demo import (
 )
 
 EVERY_TASK = "all"
-ORDER_STREAM = 808
 POLL_S = 0.2
 
 
@@ -206,8 +210,12 @@ def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
                         coin=task.coin if "control" in policy.arms else None,
                     )
                 )
-    order = np.random.default_rng([ORDER_STREAM, protocol.study_seed]).permutation(len(jobs))
-    return [jobs[index] for index in order]
+    by_key = {job.key: job for job in jobs}
+    return [
+        by_key[task.task, policy.policy, task.start_seed(start)]
+        for task, start in protocol.starts()
+        for policy in protocol.policies_at(task, start)
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

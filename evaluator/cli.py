@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
+from evaluator.design.config import StudyOptions, Wanted
 from evaluator.live.config import LiveConfig
 from evaluator.memory import without_collecting
 from evaluator.metrics.image_protocol import ImageOptions
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from evaluator.thresholds import Missed
 
 LIVE = LiveConfig()
+STUDY, WANTED = StudyOptions(), Wanted()
 IMAGES = ImageOptions()
 THRESHOLD_NOT_MET = 3
 
@@ -118,6 +120,32 @@ class _Asked:
     tables: TableOptions
     images: ImageOptions
     force: bool
+
+
+def design(
+    run: Path,
+    /,
+    *,
+    study: Annotated[StudyOptions, Parameter(name="*")] = STUDY,
+    wanted: Annotated[Wanted, Parameter(name="*")] = WANTED,
+    output: Output = Output(),  # noqa: B008  # frozen, and cyclopts reads the default
+) -> None:
+    """Size a study before its first trial, and lock its protocol: protocol.json, order.csv.
+
+    Example: robot-gst design runs/study --rate 0.5 --gain 0.3 --width 0.4
+
+    Args:
+        run: Folder of the study; made where it is not there.
+        study: What is tried.
+        wanted: What is expected, and what is to be shown.
+        output: How to talk.
+    """
+    from evaluator.design.plan import design as make
+    from evaluator.design.plan import design_record, design_text, lock
+
+    made = make(study, wanted)
+    written = lock(run, made)
+    output.result(design_record(made, written), design_text(made, written, run, study))
 
 
 @without_collecting()

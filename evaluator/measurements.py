@@ -8,16 +8,23 @@ table that ``markdown`` writes: ``python -m evaluator.measurements docs/metrics.
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image, state, trajectory
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS, score_image
+from evaluator.quantity import REGISTRY as REGISTRY
+from evaluator.quantity import Better
+from evaluator.quantity import Defined as Defined
+from evaluator.quantity import Quantity as Quantity
+from evaluator.quantity import new_quantity as _new
+from evaluator.quantity import quantity_of as quantity_of
+from evaluator.quantity import slug as slug
 from evaluator.statistics import (
     agreement,
+    calibration,
     differences,
     funnel,
     gate,
@@ -26,94 +33,10 @@ from evaluator.statistics import (
     power,
     prediction_powered,
     sequential,
+    strata,
 )
 
-Better = Literal["higher", "lower", "none"]
-"""Which way a value is better; ``none`` where it describes and does not judge."""
-
 # ruff: noqa: E501  # one line for each definition
-
-
-def slug(text: str) -> str:
-    """Return text usable as one part of a measurement id.
-
-    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
-    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
-    """
-    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
-    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
-
-
-def _code(letter: str) -> str:
-    return f"+{ord(letter):04x}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Defined:
-    """What one measurement is: the part of it that its quantity decides."""
-
-    id: str
-    unit: str
-    definition: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Quantity:
-    """One kind of measurement."""
-
-    id: str
-    """With the names of its variable parts in braces."""
-    unit: str
-    definition: str
-    """With words of the single measurement in braces."""
-    better: Better
-    computed_by: Callable[..., Any] | None
-    """None for plain counts."""
-
-    def of(self, **words: object) -> Defined:
-        """Name one measurement.
-
-        Args:
-            words: The parts of its id, which are made fit for ids, and of its definition.
-        """
-        parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
-        return Defined(
-            id=self.id.format(**parts),
-            unit=self.unit,
-            definition=self.definition.format(**words),
-        )
-
-    @cached_property
-    def pattern(self) -> re.Pattern[str]:
-        """Matches the ids of this quantity, with their parts as groups."""
-        parts = re.split(r"\{(\w+)\}", self.id)
-        ends = [re.escape(text) for text in parts[::2]]
-        names = [rf"(?P<{name}>[A-Za-z0-9_+-]+)" for name in parts[1::2]]
-        return re.compile("".join(a + b for a, b in zip(ends, [*names, ""], strict=True)))
-
-
-REGISTRY: list[Quantity] = []
-"""In the order of docs/metrics.md."""
-
-
-def quantity_of(measurement_id: str) -> Quantity | None:
-    """Return the quantity an id belongs to, the one with the fewest variable parts."""
-    found = [q for q in REGISTRY if q.pattern.fullmatch(measurement_id)]
-    return min(found, key=lambda q: q.id.count("{"), default=None)
-
-
-def _new(
-    id: str,  # the word everywhere
-    unit: str,
-    better: Better,
-    computed_by: Callable[..., Any] | None,
-    definition: str,
-) -> Quantity:
-    quantity = Quantity(
-        id=id, unit=unit, definition=definition, better=better, computed_by=computed_by
-    )
-    REGISTRY.append(quantity)
-    return quantity
 
 
 # Success rates.
@@ -241,6 +164,20 @@ BOSCHLOO_POOLED = _new(
     differences.boschloo,
     "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
 )
+MANTEL_HAENSZEL = _new(
+    "unpaired.mantel_haenszel_pp.{side}",
+    "pp",
+    "higher",
+    strata.mantel_haenszel,
+    "gain with replanning over {count} tasks, starts not paired, each task compared within itself (Mantel-Haenszel weights; {side})",
+)
+MANTEL_HAENSZEL_P = _new(
+    "unpaired.mantel_haenszel_p.{side}",
+    "1",
+    "none",
+    strata.mantel_haenszel,
+    "two-sided Cochran-Mantel-Haenszel test of that gain, no continuity correction ({side})",
+)
 TRIALS_NEEDED = _new(
     "power.trials_needed.{side}.{task}.{policy}",
     "count",
@@ -269,6 +206,20 @@ PAIRED_GAIN = _new(
     differences.tango_difference,
     "gain with replanning in percentage points over paired starts: {words}",
 )
+PAIRED_PROGRESS = _new(
+    "paired.progress_pp",
+    "pp",
+    "higher",
+    differences.tango_difference,
+    "share of paired starts that came further with replanning less that of those that came less far, by objects or sub-tasks done: {words}",
+)
+PAIRED_PROGRESS_P = _new(
+    "paired.progress_p_mid",
+    "1",
+    "none",
+    differences.sign_test,
+    "two-sided sign test with mid-p of the same: {words}",
+)
 PAIRED_POWER = _new(
     "power.paired.{side}",
     "1",
@@ -286,49 +237,6 @@ MCNEMAR = {
     )
     for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
 }
-STUDY_GAIN = _new(
-    "study.gain_pp.{against}.{task}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "success in the study arm with less that in the arm {against} over the same starts, in percentage points, "
-    "whatever was not executed counted as a failure: {words}",
-)
-STUDY_GAIN_POOLED = _new(
-    "study.gain_pp.{against}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "the same over the starts of {count} tasks: {words}",
-)
-STUDY_P = _new(
-    "study.mcnemar_p_mid.{against}.{policy}",
-    "1",
-    "none",
-    differences.mcnemar,
-    "two-sided McNemar test of the arm with against {against}, mid-p, over the starts of {count} tasks that differ: {words}",
-)
-STUDY_GAIN_EXECUTED = _new(
-    "study.executed_gain_pp.{against}.{task}.{policy}",
-    "pp",
-    "higher",
-    differences.tango_difference,
-    "per protocol: the gain over the starts that were executed in both arms alone: {words}",
-)
-STUDY_P_EXECUTED = _new(
-    "study.executed_mcnemar_p_mid.{against}.{policy}",
-    "1",
-    "none",
-    differences.mcnemar,
-    "per protocol: the same test over the starts of {count} tasks that were executed in both arms: {words}",
-)
-STUDY_NOT_EXECUTED = _new(
-    "study.not_executed.{arm}.{task}.{policy}",
-    "1",
-    "lower",
-    None,
-    "share of starts on which the arm {arm} executed nothing: {words}",
-)
 START_DISTANCE = {
     kind: _new(
         f"paired.start_distance_{kind}_m",
@@ -662,7 +570,21 @@ ECE = _new(
     "1",
     "lower",
     gate.expected_calibration_error,
-    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials; {_WHOSE}",
+    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials, which the interval takes out; {_WHOSE}",
+)
+BRIER_PERFECT = _new(
+    "reliability.brier_perfect",
+    "1",
+    "none",
+    calibration.perfect_forecaster,
+    "Brier score of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
+)
+ECE_PERFECT = _new(
+    "reliability.ece_perfect",
+    "1",
+    "none",
+    calibration.perfect_forecaster,
+    "expected calibration error of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 LABEL_AGREED = _new(
     "label.localised.rate",
@@ -704,7 +626,7 @@ TRIALS_SAVED = _new(
     "count",
     "higher",
     prediction_powered.trials_saved,
-    "further trials Wilson's interval would need; {many}",
+    "further robot trials that the same interval would need without the twin; 0 unless success is shown to be more frequent after a yes than after a no (one-sided p of 0.025); {many}",
 )
 RANDOM_STARTS_P = _new(
     _PROXY.format(name="random_starts_p"),

@@ -4,18 +4,25 @@ Whoever reads the results can see that arms, rounds, coins, starts and the rule 
 not chosen afterwards.
 """
 
+import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bridge.errors import UsageError
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
+Item = TypeVar("Item")
+
 SCHEMA_VERSION = 1
 FILE_NAME = "protocol.json"
 """In the run folder."""
+SEEDS_PER_SESSION = 1000
+"""Session 7 starts at start seed 7000; sessions never share a start."""
+STARTS_STREAM, ARMS_STREAM = 808, 606
 VOID_CAUSES = ("interrupted",)
 """What makes a trial void, and its start in all arms, unless a protocol says otherwise."""
 
@@ -40,6 +47,49 @@ class StudyTask:
     coin: float | None = None
     """In the arm control, the chance of yes to each plan."""
 
+    def start_seed(self, start: int) -> int:
+        """Return the seed of a start, counted from 0."""
+        return self.session_seed * SEEDS_PER_SESSION + start
+
+    def start_id(self, start: int) -> str:
+        """Return the name under which the trials of a start are recorded."""
+        return f"{self.task}/{self.start_seed(start)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Endpoint:
+    """A question that the study answers, and what answers it."""
+
+    kind: str
+    """difference: success of one arm less that of another over the same starts, McNemar's mid-p.
+    agreement: the share of trials in which twin and outcome agree, its interval above ``limit``."""
+    policy: str
+    arm: str
+    against_policy: str = ""
+    against_arm: str = ""
+    limit: float = 0.0
+    """A difference is tested against none; an agreement has to lie above this share."""
+
+    @property
+    def words(self) -> str:
+        """The question in words."""
+        mine = f"{self.policy} ({self.arm})"
+        if self.kind == "agreement":
+            return f"twin and outcome agree in more than {100 * self.limit:g} %, {mine}"
+        return f"success of {mine} less that of {self.against_policy} ({self.against_arm})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedTrial:
+    """One trial of the order in which a study is to be carried out."""
+
+    number: int
+    """From 1."""
+    task: str
+    start_id: str
+    policy: str
+    arm: str
+
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
@@ -59,12 +109,66 @@ class Protocol:
     """Whether each failed execution is followed by one new start of the same trial."""
     void_causes: tuple[str, ...] = VOID_CAUSES
     """How outcomes begin that make a start void in all arms; all others are failures."""
+    primary: Endpoint | None = None
+    """The one question the study is judged by; None where it was not designed."""
+    secondary: tuple[Endpoint, ...] = ()
+    interval: str = "wilson"
+    """Interval of rates."""
+    alpha: float = 0.05
+    """Chance of a false alarm, shared by all questions after Holm."""
+    codes: Mapping[str, str] = field(default_factory=dict)
+    """Blinded arms: a code for each "policy, arm"; empty where nobody is blinded."""
+    reasons: tuple[str, ...] = ()
+    """How the numbers of starts came about, in words."""
+    sha256: str = field(default="", compare=False)
+    """Of all else in the file it was read from; empty in files older than the hash."""
+    edited: bool = field(default=False, compare=False)
+    """Whether the file was changed after it was written: the hash does not fit."""
 
     def to_json(self) -> bytes:
-        """Serialise, refusing what the schema refuses."""
-        record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(self)}))
+        """Serialise with the hash of the content, refusing what the schema refuses."""
+        written = asdict(self)
+        del written["edited"], written["sha256"]
+        record = json.loads(json.dumps({"schema_version": SCHEMA_VERSION, **written}))
+        record["sha256"] = _hash(record)
         check_record(record, name="protocol")
         return (json.dumps(record, indent=1) + "\n").encode()
+
+    def starts(self) -> list[tuple[StudyTask, int]]:
+        """Return every start of every task, interleaved in a seeded order."""
+        all_ = [(task, start) for task in self.tasks for start in range(task.starts)]
+        return _shuffled(all_, STARTS_STREAM, self.study_seed)
+
+    def policies_at(self, task: StudyTask, start: int) -> list[PolicyArms]:
+        """Return the policies in the order in which they try one start.
+
+        Args:
+            task: One of ``tasks``.
+            start: Counted from 0.
+        """
+        seeds = self.study_seed, task.start_seed(start)
+        return _shuffled(self.policies, STARTS_STREAM, *seeds)
+
+    def order(self) -> list[PlannedTrial]:
+        """Return all trials as they are to be made: each start in all arms, one after another."""
+        found: list[PlannedTrial] = []
+        for task, start in self.starts():
+            for policy in self.policies_at(task, start):
+                for arm in arms_in_order(policy.arms, self.study_seed, task.start_seed(start)):
+                    found.append(
+                        PlannedTrial(
+                            number=len(found) + 1,
+                            task=task.task,
+                            start_id=task.start_id(start),
+                            policy=policy.policy,
+                            arm=arm,
+                        )
+                    )
+        return found
+
+    def code_of(self, policy: str, arm: str) -> str:
+        """Return what an operator calls an arm; empty where nobody is blinded."""
+        return self.codes.get(f"{policy}, {arm}", "")
 
     @staticmethod
     def from_json(data: bytes) -> "Protocol":
@@ -76,13 +180,56 @@ class Protocol:
             PolicyArms(policy=item["policy"], arms=tuple(item["arms"]))
             for item in record["policies"]
         )
-        if "void_causes" in record:
-            known["void_causes"] = tuple(record["void_causes"])
+        for name in ("void_causes", "reasons"):
+            if name in record:
+                known[name] = tuple(record[name])
+        if record.get("primary") is not None:
+            known["primary"] = Endpoint(**_known(Endpoint, record["primary"]))
+        others = record.get("secondary", ())
+        known["secondary"] = tuple(Endpoint(**_known(Endpoint, item)) for item in others)
+        known["edited"] = record.get("sha256", "") not in ("", _hash(record))
         return Protocol(**known)
 
 
-def _known(of_type: type[StudyTask], record: dict[str, Any]) -> dict[str, Any]:
+def arms_in_order(arms: Sequence[str], study_seed: int, start_seed: int) -> list[str]:
+    """Return the arms in the order in which they are tried on one start.
+
+    Args:
+        arms: Of one policy.
+        study_seed: Of the study.
+        start_seed: Of the start.
+    """
+    return _shuffled(arms, ARMS_STREAM, study_seed, start_seed)
+
+
+def blinding_codes(policies: Sequence[PolicyArms], study_seed: int) -> dict[str, str]:
+    """Return a code for each "policy, arm", in an order that the seed draws.
+
+    Args:
+        policies: With their arms.
+        study_seed: Of the study.
+    """
+    names = [f"{policy.policy}, {arm}" for policy in policies for arm in policy.arms]
+    drawn = _shuffled(names, STARTS_STREAM, study_seed, len(names))
+    return {name: f"arm_{place:02d}" for place, name in enumerate(drawn, start=1)}
+
+
+def _shuffled(items: Sequence[Item], *seed: int) -> list[Item]:
+    import numpy as np  # noqa: PLC0415  # commands read their options without it
+
+    order = np.random.default_rng(list(seed)).permutation(len(items))
+    return [items[index] for index in order]
+
+
+def _known(of_type: type[StudyTask] | type[Endpoint], record: dict[str, Any]) -> dict[str, Any]:
     return {name: record[name] for name in of_type.__dataclass_fields__ if name in record}
+
+
+def _hash(record: Mapping[str, Any]) -> str:
+    """Hash everything in a record but its hash, however the file is laid out."""
+    others = {name: value for name, value in record.items() if name != "sha256"}
+    text = json.dumps(others, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_protocol(run_path: Path) -> Protocol | None:
@@ -95,8 +242,16 @@ def read_protocol(run_path: Path) -> Protocol | None:
     return Protocol.from_json(path.read_bytes()) if path.is_file() else None
 
 
+CARRIED_OUT = (
+    *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
+)
+"""What whoever carries a study out decides, too; the rest is the design's alone."""
+
+
 def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> None:
     """Write a protocol before the first trial, or check that it is the one that was written.
+
+    A design that is there stays as it is, where what carries it out fits it.
 
     Args:
         run_path: The run folder.
@@ -104,26 +259,32 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
         has_trials: Whether the run holds trials already.
 
     Raises:
-        UsageError: When another protocol is there, or trials are and none is.
+        UsageError: When another protocol is there, or trials are and none is, or the file was
+            edited.
     """
-    there = read_protocol(run_path)
-    if there == protocol:
+    path, there = run_path / FILE_NAME, read_protocol(run_path)
+    if there is None and has_trials:
+        message = f"{run_path} holds trials and no {FILE_NAME}: use a new folder for a study."
+        raise UsageError(message)
+    if there is None:
+        write_whole(path, protocol.to_json())
         return
-    if there is not None:
-        names = [
-            name
-            for name in Protocol.__dataclass_fields__
-            if getattr(there, name) != getattr(protocol, name)
-        ]
+    if there.edited:
+        message = f"{path} was edited after it was written: put the written text back."
+        raise UsageError(message)
+    compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
+    hidden = ("sha256", "edited")
+    names = [
+        name
+        for name in compared
+        if name not in hidden and getattr(there, name) != getattr(protocol, name)
+    ]
+    if names:
         message = (
-            f"{run_path / FILE_NAME} was written before the first trial and says something else "
+            f"{path} was written before the first trial and says something else "
             f"about: {', '.join(names)}. Give the same options again, or another folder."
         )
         raise UsageError(message)
-    if has_trials:
-        message = f"{run_path} holds trials and no {FILE_NAME}: use a new folder for a study."
-        raise UsageError(message)
-    write_whole(run_path / FILE_NAME, protocol.to_json())
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:

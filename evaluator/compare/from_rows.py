@@ -13,6 +13,7 @@ from evaluator.compare.gains import (
     gain_tests,
     pair_starts,
     paired_gain,
+    paired_progress,
     replanning_gains,
     start_distances,
 )
@@ -23,6 +24,7 @@ from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
 from evaluator.compare.sensitivity import sensitivity_table
+from evaluator.compare.session_order import session_order
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -112,6 +114,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     kept, kept_tables = reliability(rows)
     again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
+    drifted, order_tables = session_order(rows)
     chosen, decision_tables = decisions(groups)
     modelled, model_tables = model_results(usable_groups(groups))
     study, study_tables, void = study_results(rows, void_causes, method=method)
@@ -126,8 +129,10 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *again,
         *study,
         *paired_gain(pairs),
+        *paired_progress(pairs),
         *start_distances(pairs),
         *never_sent(rows),
+        *drifted,
         *beside,
         *scorecard,
         *kept,
@@ -146,7 +151,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         study_tables=study_tables,
         gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
         stage_tables=stage_tables,
-        decision_tables=(*model_tables, *decision_tables),
+        decision_tables=(*model_tables, *decision_tables, *order_tables),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -19,9 +20,13 @@ from evaluator.measurements import (
     GAIN_POINTS_AVERAGE,
     GAIN_RELATIVE,
     GAIN_RELATIVE_AVERAGE,
+    MANTEL_HAENSZEL,
+    MANTEL_HAENSZEL_P,
     MCNEMAR,
     PAIRED_GAIN,
     PAIRED_POWER,
+    PAIRED_PROGRESS,
+    PAIRED_PROGRESS_P,
     POWER_UNPAIRED,
     START_DISTANCE,
     TRIALS_NEEDED,
@@ -33,6 +38,7 @@ from evaluator.statistics.differences import (
     mcnemar,
     mean_of_intervals,
     newcombe_difference,
+    sign_test,
     tango_points,
 )
 from evaluator.statistics.intervals import relative_gain
@@ -44,6 +50,7 @@ from evaluator.statistics.power import (
     power_unpaired,
     trials_needed,
 )
+from evaluator.statistics.strata import mantel_haenszel
 
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
@@ -178,6 +185,53 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
     return measurements
 
 
+def paired_progress(pairs: Sequence[StartPair]) -> list[Measurement]:
+    """Compare how far both trials of a start came, where trials count objects or sub-tasks.
+
+    Only which one came further counts, not by how much: two of three sub-tasks are no share of a
+    distance.
+
+    Args:
+        pairs: The same starts without and with replanning; nothing where none has progress.
+    """
+    known = []
+    for pair in pairs:
+        before, after = progress(pair.before), progress(pair.after)
+        if before is not None and after is not None and pair.before.unit == pair.after.unit:
+            known.append((pair, before, after))
+    if not known:
+        return []
+    improved = sum(after > before for _, before, after in known)
+    worsened = sum(after < before for _, before, after in known)
+    words = f"further in {improved}, less far in {worsened} of {len(known)} paired starts"
+    make = partial(
+        measured,
+        n=len(known),
+        counted="pair",
+        episodes=[r.episode for pair, _, _ in known for r in (pair.before, pair.after)],
+    )
+
+    def p_mid() -> float:
+        if not improved + worsened:
+            reason = f"both trials of all {len(known)} starts came equally far"
+            raise UndefinedStatisticError(statistic="sign test", reason=reason)
+        return sign_test(improved, worsened)[1]
+
+    return [
+        make(
+            PAIRED_PROGRESS.of(words=words), partial(tango_points, improved, worsened, len(known))
+        ),
+        make(PAIRED_PROGRESS_P.of(words=words), p_mid, reason_without_interval="a p-value"),
+    ]
+
+
+def progress(row: TrialRow) -> Fraction | None:
+    """Return which part of a trial's objects or sub-tasks succeeded, None where trials count."""
+    if row.unit == "trial" or row.k is None or not row.n:
+        return None
+    return Fraction(row.k, row.n)
+
+
 def _paired_points(
     side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
 ) -> Measurement:
@@ -282,6 +336,7 @@ def gain_tests(groups: Sequence[RateGroup]) -> list[Measurement]:
             measurements += _tests(change)
         if len(mine) > 1:
             measurements.append(_pooled_test(mine, side))
+            measurements += _over_strata(mine, side)
     return measurements
 
 
@@ -416,6 +471,35 @@ def _pooled_test(mine: Sequence[Change], side: str) -> Measurement:
         counted="task",
         reason_without_interval="a p-value",
     )
+
+
+def _over_strata(mine: Sequence[Change], side: str) -> list[Measurement]:
+    tables = [change.counts for change in mine if change.counts is not None]
+    make = partial(
+        measured,
+        n=len(mine),
+        counted="task",
+        episodes=[name for c in mine for name in (*c.before.episodes, *c.after.episodes)],
+    )
+
+    def compute(name: str) -> float:
+        if len(tables) < len(mine):
+            reason = "the number of trials of a task is not known"
+            raise UndefinedStatisticError(statistic="Mantel-Haenszel test", reason=reason)
+        return float(getattr(mantel_haenszel(tables), name))
+
+    return [
+        make(
+            MANTEL_HAENSZEL.of(side=side, count=len(mine)),
+            lambda: 100 * compute("difference"),
+            reason_without_interval="its p-value is beside it; the model's mean gain has one",
+        ),
+        make(
+            MANTEL_HAENSZEL_P.of(side=side),
+            lambda: compute("p"),
+            reason_without_interval="a p-value",
+        ),
+    ]
 
 
 def _mean(measurements: Sequence[Measurement]) -> float:

@@ -13,17 +13,25 @@ from evaluator.measurements import (
     BREAK_EVEN_PRICE,
     BRIER,
     BRIER_OF_BASE_RATE,
+    BRIER_PERFECT,
     CLAUSE_REFUSED,
     CLAUSE_RIGHT,
     ECE,
+    ECE_PERFECT,
     FACTOR_NPV,
     KAPPA,
     NPV,
     PHI,
     PPV,
 )
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Cell, Interval, Measurement, Table
 from evaluator.run_reader.episodes import FACTORS, Clauses
+from evaluator.statistics.calibration import (
+    Perfect,
+    brier_interval,
+    calibration_error_interval,
+    perfect_forecaster,
+)
 from evaluator.statistics.gate import (
     Confusion,
     break_even,
@@ -35,6 +43,7 @@ from evaluator.statistics.gate import (
     phi,
     reliability_bins,
 )
+from evaluator.statistics.intervals import LEVEL
 
 PLANNED, GATE = "planned in twin", "verdict before motion, not obeyed"
 REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
@@ -353,16 +362,28 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
         return [], ()
     probabilities, happened = [p for _, p, _ in seen], [outcome for _, _, outcome in seen]
     make = partial(
-        measured,
-        n=len(seen),
-        counted="trial",
-        episodes=[episode for episode, _, _ in seen],
-        reason_without_interval="the bins and their counts are in the reliability table",
+        measured, n=len(seen), counted="trial", episodes=[episode for episode, _, _ in seen]
     )
+    ideal = perfect_forecaster(probabilities)
     measurements = [
-        make(BRIER.of(), lambda: brier(probabilities, happened)),
-        make(BRIER_OF_BASE_RATE.of(), lambda: brier_of_base_rate(happened)),
-        make(ECE.of(), lambda: expected_calibration_error(probabilities, happened)),
+        make(
+            BRIER.of(),
+            lambda: (brier(probabilities, happened), brier_interval(probabilities, happened)),
+        ),
+        make(BRIER_PERFECT.of(), lambda: _shown(ideal[0])),
+        make(
+            BRIER_OF_BASE_RATE.of(),
+            lambda: brier_of_base_rate(happened),
+            reason_without_interval="the outcomes' own rate; what it would be on others is unknown",
+        ),
+        make(
+            ECE.of(),
+            lambda: (
+                expected_calibration_error(probabilities, happened),
+                calibration_error_interval(probabilities, happened),
+            ),
+        ),
+        make(ECE_PERFECT.of(), lambda: _shown(ideal[1])),
     ]
     bins = reliability_bins(probabilities, happened)
     table = Table(
@@ -373,3 +394,8 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
         note="Bins of equal width; empty ones are left out.",
     )
     return measurements, (table,)
+
+
+def _shown(perfect: Perfect) -> tuple[float, Interval]:
+    range_ = Interval(low=perfect.low, high=perfect.high, level=LEVEL, method="perfect-forecaster")
+    return perfect.mean, range_

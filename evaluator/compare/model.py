@@ -27,10 +27,10 @@ from evaluator.measurements import (
     Defined,
 )
 from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics.group_likelihood import GroupCounts
 from evaluator.statistics.hierarchical import (
     AgreementModel,
     Estimate,
-    GroupCounts,
     chosen_is_best,
     estimate,
     ranking,

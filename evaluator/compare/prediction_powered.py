@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from evaluator.compare.gains import StartPair
 from evaluator.compare.gate import confusion_of
 from evaluator.compare.measure import measured
-from evaluator.compare.rows import TrialRow
+from evaluator.compare.rows import TrialRow, in_order
 from evaluator.compare.success import Key, group_rows, names_of, of_group, trials_in
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
@@ -206,8 +206,7 @@ class _Assisted:
 
     def saved(self) -> float:
         self._check()
-        estimate = post_stratified(self.counts, self.alone_k, self.alone_n)
-        return float(trials_saved(estimate, self.counts.n))
+        return float(trials_saved(self.counts, self.alone_k, self.alone_n))
 
     def _check(self) -> None:
         """Refuse an estimate where the tried starts are unlike the others."""
@@ -268,18 +267,12 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
     """
     measurements = []
     for key, members in group_rows(rows).items():
-        known = _in_order([row for row in members if row.recorded is not None])
+        known = in_order([row for row in members if row.recorded is not None])
         if known and all(row.count == 1 for row in known):
             measurements.append(_sequence(key, known))
     if pairs:
         measurements += [_evidence(pairs), _gain_sequence(_pairs_in_order(pairs))]
     return measurements
-
-
-def _in_order(rows: Sequence[TrialRow]) -> list[TrialRow]:
-    """Sort trials as they were recorded: names need not tell, trial_10 comes before trial_2."""
-    known = all(row.began_ns for row in rows)
-    return sorted(rows, key=lambda row: row.began_ns) if known else list(rows)
 
 
 def _pairs_in_order(pairs: Sequence[StartPair]) -> list[StartPair]:
@@ -315,7 +308,7 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
         return ()
     lines: list[tuple[Cell, ...]] = []
     for (task, condition, policy), members in group_rows(rows).items():
-        known = _in_order([row for row in members if row.recorded is not None])
+        known = in_order([row for row in members if row.recorded is not None])
         if not known or any(row.count > 1 for row in known):
             continue
         try:

@@ -1,6 +1,6 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -123,6 +123,12 @@ class TrialRow:
 def is_streamed(rows: Iterable[TrialRow]) -> bool:
     """Whether rows come from a streamed table: one for equal trials, which are not told apart."""
     return any(not row.episode for row in rows)
+
+
+def in_order(rows: Sequence[TrialRow]) -> list[TrialRow]:
+    """Sort trials as they were recorded: names need not tell, trial_10 comes before trial_2."""
+    known = all(row.began_ns for row in rows)
+    return sorted(rows, key=lambda row: row.began_ns) if known else list(rows)
 
 
 @dataclass(frozen=True, kw_only=True)

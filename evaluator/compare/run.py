@@ -8,7 +8,7 @@ from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import trials_path
-from bridge.task.protocol import VOID_CAUSES, read_protocol
+from bridge.task.protocol import VOID_CAUSES, Protocol, read_protocol
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.bands import BandReport, compare_bands
@@ -22,6 +22,7 @@ from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
+from evaluator.compare.protocol_check import as_designed, protocol_results
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
 from evaluator.compare.states import state_results
@@ -89,9 +90,16 @@ class ReadRun:
     rows: list[TrialRow]
     summaries: Summaries
     exclusions: tuple[Exclusion, ...]
+    unread: tuple[Exclusion, ...]
+    """Those of the exclusions that are trials which could not be read."""
     imported: int
     """Trials of the run's own table of trials, and rows that it doubles."""
-    void_causes: tuple[str, ...]
+    protocol: Protocol | None
+
+    @property
+    def void_causes(self) -> tuple[str, ...]:
+        """Causes that make a trial void, by the run's protocol."""
+        return VOID_CAUSES if self.protocol is None else self.protocol.void_causes
 
     @property
     def name(self) -> str:
@@ -159,11 +167,14 @@ def read_run(run: RunFolder, cache: SummaryCache, output: Output = QUIET) -> Rea
         run=run,
         contents=contents,
         trials=trials,
-        rows=[*with_rule((trial.row for trial in trials), summaries.rules), *imported],
+        rows=as_designed(
+            [*with_rule((trial.row for trial in trials), summaries.rules), *imported], protocol
+        ),
         summaries=summaries,
         exclusions=(*contents.left_out, *left_out, *doubled),
+        unread=tuple(left_out),
         imported=len(imported) + len(doubled),
-        void_causes=VOID_CAUSES if protocol is None else protocol.void_causes,
+        protocol=protocol,
     )
 
 
@@ -221,8 +232,19 @@ def compare_read(
         motion_results(summaries.motions),
         state_results(summaries.states),
         label_results(summaries.perceived, rows, method=method),
+        *(_of_protocol(read, method) for read in reads if len(reads) == 1),
     )
     return _with_parts(base, parts)
+
+
+def _of_protocol(read: ReadRun, method: str) -> Part:
+    return protocol_results(
+        read.rows,
+        read.protocol,
+        method=method,
+        left_out=read.unread,
+        task_hashes=_task_hashes(read.contents),
+    )
 
 
 def _with_parts(base: Comparison, parts: Sequence[AnyPart]) -> Comparison:
@@ -256,6 +278,15 @@ def trials_of(contents: RunContents) -> tuple[list[Trial], list[Exclusion]]:
         trials.append(trial)
         left_out += trial.exclusions
     return trials, left_out
+
+
+def _task_hashes(contents: RunContents) -> dict[str, frozenset[str]]:
+    found: dict[str, set[str]] = {}
+    for each in contents.recorded:
+        info = each.facts.info
+        if info.kind == "trial" and info.task_sha256:
+            found.setdefault(info.task, set()).add(info.task_sha256)
+    return {task: frozenset(hashes) for task, hashes in found.items()}
 
 
 def _bands(contents: RunContents) -> BandReport:

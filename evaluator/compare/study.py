@@ -14,17 +14,17 @@ from bridge.episode.metadata import RETRY, EpisodeInfo, Outcome, treatment_of
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.measure import ends, measured, proportion
 from evaluator.compare.rows import TrialRow, is_streamed
-from evaluator.measurements import (
+from evaluator.measurements import Defined
+from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.statistics.differences import mcnemar, tango_points
+from evaluator.study_measurements import (
     STUDY_GAIN,
     STUDY_GAIN_EXECUTED,
     STUDY_GAIN_POOLED,
     STUDY_NOT_EXECUTED,
     STUDY_P,
     STUDY_P_EXECUTED,
-    Defined,
 )
-from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.statistics.differences import mcnemar, tango_points
 
 WITH = "with"
 AGAINST = ("without", "control")
@@ -45,8 +45,9 @@ class StudyStart:
         return self.trials[arm].recorded is True
 
     def executed(self, *arms: str) -> bool:
-        """Whether something was executed in all of these arms."""
-        return all(self.trials[arm].plan_id is not None for arm in arms)
+        """Whether something was executed in all of these arms; a table knows outcomes, no plans."""
+        trials = [self.trials[arm] for arm in arms]
+        return all(each.plan_id is not None or each.recorded is not None for each in trials)
 
 
 def study_starts(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import partial
 
+from bridge.episode.metadata import CONTROL
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
 from evaluator.compare.measure import measured, proportion
@@ -24,6 +25,8 @@ from evaluator.measurements import (
 from evaluator.result import Cell, Measurement, Table
 from evaluator.statistics.agreement import counted_groups, mean_rate
 
+CONDITION_OF_ARM = {"without": WITHOUT, "with": WITH, "control": CONTROL}
+"""What the trials of a study arm are grouped by."""
 Key = tuple[str, str, str]
 """Task, condition, policy."""
 Answer = Callable[[TrialRow], bool | None]

@@ -36,12 +36,26 @@ SECTIONS: tuple[Section, ...] = (
         tables=("published",),
     ),
     Section(
+        id="protocol",
+        title="The study against its protocol",
+        lead="What was fixed before the first trial, what it found, and every departure from it.",
+        numbers=(
+            ("protocol.departures", "Departures from the protocol"),
+            ("protocol.primary.*", ""),
+        ),
+        tables=("protocol_questions", "protocol_departures"),
+    ),
+    Section(
         id="success",
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        tables=("success", "layout", "notes"),
-        figures=("success",),
+        numbers=(
+            ("session.drift_pp", "Change of success over the session"),
+            ("session.drift_p", "Change over the session, p"),
+        ),
+        tables=("success", "layout", "notes", "session_order"),
+        figures=("success", "order"),
     ),
     Section(
         id="agreement",

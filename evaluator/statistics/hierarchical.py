@@ -5,10 +5,11 @@ common mean; groups of one task share a part of it. Counts are binomial, and whe
 through their start, both outcomes of a pair go together by a common odds ratio. So the noise of few
 trials is taken out of correlations, and rates of small groups are drawn towards the others.
 
-Everything is quadrature: over the log-odds of a group on a grid, over a task's mean by adaptive
-Gauss-Hermite nodes (Liu and Pierce 1994), over the parameters by importance weights on Sobol nodes.
-Equal counts give equal numbers. Parameters are the means mu (normal, sd 2.5), the spreads sigma
-(half-normal, 2.5) and correlations rho, whose arcsine is uniform.
+Everything is quadrature: ``group_likelihood.py`` has the groups; over the parameters go importance
+weights on Sobol nodes. Equal counts give equal numbers. Parameters are the means mu (normal, sd
+2.5), the spreads sigma (half-normal, 2.5) and correlations rho, whose arcsine is uniform. Nodes are
+placed in coordinates in which each has a standard normal prior: there no edge cuts the posterior
+off, as 0 does for a spread and 1 for a correlation.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,11 +18,12 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy.special import expit, ndtri
+from scipy.special import expit, ndtr, ndtri
 from scipy.stats import chi2, qmc
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
+from evaluator.statistics.group_likelihood import BATCH, GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.intervals import LEVEL
 
 WHAT = "model of agreement"
@@ -29,45 +31,14 @@ METHOD = "hierarchical"
 MIN_GROUPS = 3
 PRIOR_MEAN_SD = 2.5
 PRIOR_SPREAD = 2.5
-EDGE = 9.0
-"""Log-odds beyond which a rate is as good as 0 or 1."""
-STEP_ALONE, STEP_IN_TASKS = 0.2, 0.3
-"""Grid of the log-odds; the pairs of numbers vary by half a step more than sigma says."""
-MOST = 200
-"""A larger side is taken as one of so many trials: its rate is as good as known then."""
-TASK_NODES = 3
-"""Nodes for each side of a task's mean."""
 ROUNDS = 4
 """Times that the nodes are moved to where the posterior lies."""
-FREEDOM = 5
+FREEDOM = 10
+"""Of Student's t, as which the nodes lie."""
 FEW = 80.0
 """Nodes that have to count while they are being moved."""
-BATCH = 12_000_000
-"""Numbers on the grid that are held at once."""
-NUM_DRAWS = 1_000
-DRAWN_NUMBERS = 120_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class GroupCounts:
-    """What was counted in one group."""
-
-    recorded: tuple[int, int]
-    """Successes and trials that have no partner in the twin."""
-    sim: tuple[int, int]
-    """The twin's, of trials without a recorded partner."""
-    pairs: tuple[int, int, int, int] = (0, 0, 0, 0)
-    """Paired trials in which both succeed, only sim, only recorded, neither."""
-    task: str = ""
-    """Groups of one task share a part of their mean."""
-
-    @property
-    def totals(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Successes and trials, recorded and in the twin, over paired and other trials."""
-        both, only_sim, only_recorded, _ = self.pairs
-        paired = sum(self.pairs)
-        recorded = (self.recorded[0] + both + only_recorded, self.recorded[1] + paired)
-        return recorded, (self.sim[0] + both + only_sim, self.sim[1] + paired)
+NUM_DRAWS = 4_000
+DRAWN_NUMBERS = 200_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,234 +77,28 @@ def estimate(
     return Estimate(mean=mean, sd=sd, low=float(low), high=float(high))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """Covariance of pairs of numbers, one for each node."""
+def from_normal(
+    z: Float64[np.ndarray, "nodes parameters"],
+) -> Float64[np.ndarray, "nodes parameters"]:
+    """Return the parameters (as ``Nodes.of`` reads them) of which standard normal numbers stand.
 
-    first: Float64[np.ndarray, " nodes"]
-    """Standard deviation of the recorded side's log-odds."""
-    second: Float64[np.ndarray, " nodes"]
-    rho: Float64[np.ndarray, " nodes"]
-
-    def entries(self, more: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return variance, variance and covariance, with ``more`` variance on both sides."""
-        shared = self.rho * self.first * self.second
-        return self.first**2 + more, self.second**2 + more, shared
-
-
-@dataclass(frozen=True, kw_only=True)
-class Nodes:
-    """Parameters of the model, one set for each node."""
-
-    mean: Float64[np.ndarray, "nodes 2"]
-    within: Spread
-    """Between groups of one task; between all groups where each has its own task."""
-    between: Spread | None
-    """Between tasks."""
-
-    @staticmethod
-    def of(phi: Float64[np.ndarray, "nodes parameters"]) -> "Nodes":
-        """Read coordinates: both means, then of each spread sigma twice and the arcsine of rho."""
-        spreads = [
-            Spread(
-                first=phi[:, at],
-                second=phi[:, at + 1],
-                rho=np.sin(phi[:, at + 2]),
-            )
-            for at in range(2, phi.shape[1], 3)
-        ]
-        between = spreads[1] if len(spreads) > 1 else None
-        return Nodes(mean=phi[:, :2], within=spreads[0], between=between)
-
-    @property
-    def total(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Variances and covariance of groups of a new task."""
-        found = self.within.entries()
-        if self.between is None:
-            return found
-        first, second, shared = (a + b for a, b in zip(found, self.between.entries(), strict=True))
-        return first, second, shared
-
-
-def log_prior(phi: Float64[np.ndarray, "nodes parameters"]) -> Float64[np.ndarray, " nodes"]:
-    """Return the logarithm of the prior density of coordinates, up to a constant."""
-    found = -0.5 * (phi[:, :2] ** 2).sum(axis=1) / PRIOR_MEAN_SD**2
-    for at in range(2, phi.shape[1], 3):
-        sizes, angle = phi[:, at : at + 2], phi[:, at + 2]
-        found -= 0.5 * (sizes**2).sum(axis=1) / PRIOR_SPREAD**2
-        found[(sizes <= 0).any(axis=1) | (np.abs(angle) >= np.pi / 2)] = -np.inf
-    return np.asarray(found)
-
-
-def common_log_odds(groups: Sequence[GroupCounts]) -> float:
-    """Return the log odds ratio of paired outcomes within groups (Mantel and Haenszel 1959).
-
-    Half a pair is added to each cell in all; 0 without pairs.
-
-    Args:
-        groups: Their ``pairs`` are looked at.
+    A standard normal number has the prior of its parameter: it is carried by equal probability.
     """
-    tables = [group.pairs for group in groups if sum(group.pairs)]
-    if not tables:
-        return 0.0
-    agree = sum(a * d / (a + b + c + d) for a, b, c, d in tables) + 0.25
-    differ = sum(b * c / (a + b + c + d) for a, b, c, d in tables) + 0.25
-    return float(np.clip(np.log(agree / differ), -5.0, 5.0))
+    phi = PRIOR_MEAN_SD * z
+    for at in range(2, z.shape[1], 3):
+        # From the upper tail, which stays exact: P(sigma > s) = P(number > z).
+        phi[:, at : at + 2] = -PRIOR_SPREAD * ndtri(ndtr(-z[:, at : at + 2]) / 2)
+        phi[:, at + 2] = np.pi * (ndtr(z[:, at + 2]) - 0.5)
+    return np.asarray(phi)
 
 
-class Likelihood:
-    """Probability of the counts of every group on a grid of both log-odds."""
-
-    def __init__(self, groups: Sequence[GroupCounts]) -> None:
-        """Lay out.
-
-        Args:
-            groups: At least one trial on each side of each.
-        """
-        names = list(dict.fromkeys(group.task for group in groups))
-        self.members = [
-            np.array([g for g, group in enumerate(groups) if group.task == name]) for name in names
-        ]
-        self.in_tasks = 1 < len(names) < len(groups)
-        if not self.in_tasks:
-            self.members = [np.arange(len(groups))]
-        self.step = STEP_IN_TASKS if self.in_tasks else STEP_ALONE
-        self.grid = np.arange(-EDGE, EDGE + self.step / 2, self.step)
-        self.rate = expit(self.grid)
-        self.shape = (len(self.grid), len(self.grid))
-        odds = common_log_odds(groups)
-        self.log_odds = odds
-        table = np.stack([self._of(group, odds).ravel() for group in groups])
-        self.table: Float32[np.ndarray, "groups cells"] = np.exp(
-            table - table.max(axis=1, keepdims=True)
-        ).astype(np.float32)
-        totals = np.array([group.totals for group in groups], dtype=np.float64)
-        k, n = totals[:, :, 0], totals[:, :, 1]
-        self.logits = np.log((k + 0.5) / (n - k + 0.5))
-        self.noise = 1 / (k + 0.5) + 1 / (n - k + 0.5)
-
-    def _of(self, group: GroupCounts, odds: float) -> Float64[np.ndarray, "recorded sim"]:
-        recorded, sim = (_binomial(*side, self.grid) for side in (group.recorded, group.sim))
-        found = recorded[:, None] + sim[None, :]
-        if not sum(group.pairs):
-            return np.asarray(found)
-        both = _both(self.rate[:, None], self.rate[None, :], float(np.exp(odds)))
-        cells = (
-            both,
-            self.rate[None, :] - both,
-            self.rate[:, None] - both,
-            1 - self.rate[:, None] - self.rate[None, :] + both,
-        )
-        scale = min(1.0, MOST / sum(group.pairs))
-        for count, chance in zip(group.pairs, cells, strict=True):
-            found = found + scale * count * np.log(np.maximum(chance, 1e-300))
-        return np.asarray(found)
-
-    def weights(
-        self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread
-    ) -> Float32[np.ndarray, "nodes cells"]:
-        """Return the normal density of a pair of log-odds on the grid, up to a factor for each."""
-        first, second, shared = spread.entries((self.step / 2) ** 2)
-        det = first * second - shared**2
-        x, y = (self.grid[None, :] - mean[:, [side]] for side in (0, 1))
-        one = (-0.5 * (second / det)[:, None] * x**2).astype(np.float32)
-        two = (-0.5 * (first / det)[:, None] * y**2).astype(np.float32)
-        skew = ((shared / det)[:, None] * x).astype(np.float32)
-        found = skew[:, :, None] * y.astype(np.float32)[:, None, :]
-        found += one[:, :, None]
-        found += two[:, None, :]
-        found = found.reshape(len(mean), -1)
-        np.exp(found, out=found)
-        return np.asarray(found)
-
-    def log(self, phi: Float64[np.ndarray, "nodes parameters"]) -> Float64[np.ndarray, " nodes"]:
-        """Return the logarithm of the probability of all counts, for each set of parameters."""
-        nodes = Nodes.of(phi)
-        found = np.zeros(len(phi))
-        for members in self.members:
-            found += _log_sum(self.of_task(nodes, members)[0])
-        return np.asarray(found)
-
-    def of_task(
-        self, nodes: Nodes, members: Int64[np.ndarray, " groups"]
-    ) -> tuple[Float64[np.ndarray, "nodes centres"], Float64[np.ndarray, "nodes centres 2"]]:
-        """Return the log of each centre's share in a task's probability, and the centres.
-
-        Args:
-            nodes: Parameters.
-            members: Places of the task's groups.
-        """
-        count = len(nodes.mean)
-        centres, log_shares = self.centres(nodes, members)
-        each = centres.shape[1]
-        flat = centres.reshape(-1, 2)
-        spread = Spread(
-            **{name: np.repeat(values, each) for name, values in vars(nodes.within).items()}
-        )
-        ones = np.ones((1, self.table.shape[1]), dtype=np.float32)
-        columns = np.concatenate([self.table[members], ones]).T
-        found = np.empty((len(flat), len(members)))
-        size = max(1, BATCH // self.table.shape[1])
-        for at in range(0, len(flat), size):
-            part = slice(at, at + size)
-            some = Spread(**{name: values[part] for name, values in vars(spread).items()})
-            shares = self.weights(flat[part], some) @ columns
-            found[part] = shares[:, :-1] / np.maximum(shares[:, -1:], 1e-30)
-        logs = np.log(np.maximum(found, 1e-35)).sum(axis=1).reshape(count, each)
-        return logs + log_shares, centres
-
-    def centres(
-        self, nodes: Nodes, members: Int64[np.ndarray, " groups"]
-    ) -> tuple[Float64[np.ndarray, "nodes centres 2"], Float64[np.ndarray, "nodes centres"]]:
-        """Place nodes where a task's mean probably lies, with the log of their weights."""
-        if nodes.between is None:
-            return nodes.mean[:, None, :], np.zeros((len(nodes.mean), 1))
-        prior = _matrix(*nodes.between.entries(1e-4))
-        inverse = np.linalg.inv(prior)
-        precision, pull = inverse.copy(), np.einsum("nij,nj->ni", inverse, nodes.mean)
-        for group in members:
-            first, second, shared = nodes.within.entries((self.step / 2) ** 2)
-            noise = self.noise[group]
-            inside = np.linalg.inv(_matrix(first + noise[0], second + noise[1], shared))
-            precision += inside
-            pull += inside @ self.logits[group]
-        cov = np.linalg.inv(precision) * 1.3
-        middle = np.einsum("nij,nj->ni", np.linalg.inv(precision), pull)
-        chol = np.linalg.cholesky(cov)
-        x, w = np.polynomial.hermite_e.hermegauss(TASK_NODES)
-        z = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
-        log_w = np.log(np.outer(w, w).ravel()) + 0.5 * (z**2).sum(axis=1)
-        centres = middle[:, None, :] + np.einsum("nij,qj->nqi", chol, z)
-        off = centres - nodes.mean[:, None, :]
-        prior_log = -0.5 * np.einsum("nqi,nij,nqj->nq", off, inverse, off)
-        prior_log -= 0.5 * np.linalg.slogdet(prior)[1][:, None] + np.log(2 * np.pi)
-        size = np.log(np.linalg.det(chol))[:, None]
-        return centres, prior_log + size + log_w[None, :]
-
-
-def _binomial(k: int, n: int, grid: Float64[np.ndarray, " grid"]) -> Float64[np.ndarray, " grid"]:
-    scale = min(1.0, MOST / n) if n else 0.0
-    return np.asarray(-scale * (k * np.logaddexp(0, -grid) + (n - k) * np.logaddexp(0, grid)))
-
-
-def _both(
-    first: Float64[np.ndarray, "#a #b"], second: Float64[np.ndarray, "#a #b"], odds: float
-) -> Float64[np.ndarray, "a b"]:
-    """Chance that both succeed, from both rates and the odds ratio (Plackett 1965)."""
-    if abs(odds - 1) < 1e-9:
-        return np.asarray(first * second)
-    total = 1 + (odds - 1) * (first + second)
-    root = np.sqrt(np.maximum(total**2 - 4 * odds * (odds - 1) * first * second, 0.0))
-    return np.asarray(2 * odds * first * second / (total + root))
-
-
-def _matrix(first: np.ndarray, second: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    return np.stack([np.stack([first, shared], -1), np.stack([shared, second], -1)], -2)
-
-
-def _log_sum(logs: Float64[np.ndarray, "nodes parts"]) -> Float64[np.ndarray, " nodes"]:
-    top = logs.max(axis=1)
-    return np.asarray(top + np.log(np.exp(logs - top[:, None]).sum(axis=1)))
+def to_normal(phi: Float64[np.ndarray, " parameters"]) -> Float64[np.ndarray, " parameters"]:
+    """Return the standard normal numbers of one set of parameters."""
+    z = phi / PRIOR_MEAN_SD
+    for at in range(2, len(phi), 3):
+        z[at : at + 2] = -ndtri(2 * ndtr(-phi[at : at + 2] / PRIOR_SPREAD))
+        z[at + 2] = ndtri(phi[at + 2] / np.pi + 0.5)
+    return np.asarray(z)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,27 +161,29 @@ class AgreementModel:
         return float(1 / (self.weights**2).sum())
 
     def _enough(self) -> int:
+        """As many as take some seconds."""
+        count = len(self.groups)
         if not self.in_tasks:
-            return 4096 if len(self.groups) <= 40 else 2048
-        return 2048 if len(self.groups) <= 40 else 1024
+            return 16_384 if count <= 40 else 8192
+        return 8192 if count <= 16 else 2048 if count <= 40 else 1024
 
     def _integrate(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
         """Move nodes to the posterior in some rounds, then weigh as many as were asked for."""
-        start, scale = self._start()
-        centre, chol = np.array(start), np.diag(scale)
+        centre, scale = self._start()
+        chol = np.diag(scale)
         for turn in range(ROUNDS):
-            phi, log_w = self._weigh(centre, chol, max(num_nodes // 4, 512), turn)
+            z, log_w = self._weigh(centre, chol, max(num_nodes // 8, 512), turn)
             weights = _flattened(log_w)
-            centre = weights @ phi
-            off = phi - centre
+            centre = weights @ z
+            off = z - centre
             cov = (weights[:, None] * off).T @ off + 1e-4 * np.eye(len(centre))
             chol = np.linalg.cholesky(cov)
-        phi, log_w = self._weigh(centre, chol, num_nodes, ROUNDS)
+        z, log_w = self._weigh(centre, chol, num_nodes, ROUNDS)
         weights = np.exp(log_w - log_w.max())
-        return phi, weights / weights.sum()
+        return from_normal(z), weights / weights.sum()
 
-    def _start(self) -> tuple[list[float], list[float]]:
-        """Guess the coordinates and how far off the guess may be."""
+    def _start(self) -> tuple[np.ndarray, np.ndarray]:
+        """Guess the normal numbers and how far off the guess may be."""
         like = self.likelihood
         noise = like.noise.mean(axis=0)
         shares = [like.logits[members] for members in like.members]
@@ -436,7 +203,10 @@ class AgreementModel:
             start += [*size, 0.7]
             scale[:2] = [2 * few, 2 * few]
             scale += [*(0.1 + 2 * few * size), min(0.3 + 2 * few, 1.0)]
-        return start, scale
+        guess, reach = np.array(start), np.array(scale) / 2
+        low, high = guess - reach, guess + reach
+        low[2:] = np.maximum(low[2:], 0.02)
+        return to_normal(guess), np.clip(to_normal(high) - to_normal(low), 0.1, 0.8)
 
     def _weigh(
         self, centre: np.ndarray, chol: np.ndarray, num_nodes: int, turn: int
@@ -447,14 +217,14 @@ class AgreementModel:
         cube = qmc.Sobol(dim + 1, scramble=True, rng=rng).random(num_nodes)
         cube = np.clip(cube, 1e-9, 1 - 1e-9)
         stretch = np.sqrt(FREEDOM / chi2.ppf(cube[:, -1], FREEDOM))
-        z = ndtri(cube[:, :-1]) * stretch[:, None]
-        phi = centre + z @ chol.T
-        log_t = -0.5 * (FREEDOM + dim) * np.log1p((z**2).sum(axis=1) / FREEDOM)
-        prior = log_prior(phi)
+        t = ndtri(cube[:, :-1]) * stretch[:, None]
+        z = centre + t @ chol.T
+        log_t = -0.5 * (FREEDOM + dim) * np.log1p((t**2).sum(axis=1) / FREEDOM)
+        prior = -0.5 * (z**2).sum(axis=1)
         found = np.full(num_nodes, -np.inf)
         near = prior > prior.max() - 60
-        found[near] = self.likelihood.log(phi[near]) + prior[near] - log_t[near]
-        return phi, found
+        found[near] = self.likelihood.log(from_normal(z[near])) + prior[near] - log_t[near]
+        return z, found
 
     def of_nodes(self, values: Float64[np.ndarray, " nodes"]) -> Estimate:
         """Sum up a function of the parameters, given at every node."""
@@ -504,23 +274,28 @@ class AgreementModel:
         cells = like.table.shape[1]
         count = int(np.clip(DRAWN_NUMBERS / (cells * len(self.groups)), 400, NUM_DRAWS))
         rng = np.random.default_rng([self._seed, 99])
-        places = np.searchsorted(np.cumsum(self.weights), (np.arange(count) + 0.5) / count)
-        nodes = Nodes.of(self.phi[np.minimum(places, len(self.phi) - 1)])
+        order = np.argsort(self.phi[:, 1] - self.phi[:, 0])  # every bias has its share of draws
+        places = np.searchsorted(np.cumsum(self.weights[order]), (np.arange(count) + 0.5) / count)
+        nodes = Nodes.of(self.phi[order[np.minimum(places, len(order) - 1)]])
         recorded, sim = (np.empty((count, len(self.groups))) for _ in range(2))
         for members in like.members:
             shares, centres = like.of_task(nodes, members)
             mass = np.cumsum(np.exp(shares - shares.max(axis=1, keepdims=True)), axis=1)
-            picked = (mass < rng.random((count, 1)) * mass[:, -1:]).sum(axis=1)
+            picked = (mass < _strata(count, rng)[:, None] * mass[:, -1:]).sum(axis=1)
             at = centres[np.arange(count), picked]
+            shares_of = {group: [_strata(count, rng) for _ in range(2)] for group in members}
             size = max(1, BATCH // cells)
             for first in range(0, count, size):
                 part = slice(first, first + size)
                 some = Spread(**{n: v[part] for n, v in vars(nodes.within).items()})
                 prior = like.weights(at[part], some)
                 for group in members:
-                    mass = prior * like.table[group]
-                    cells_drawn = _draw_cells(mass.reshape(len(mass), *like.shape), rng)
-                    for side, drawn in zip((recorded, sim), cells_drawn, strict=True):
+                    mass = (prior * like.table[group]).reshape(len(prior), *like.shape)
+                    row = _draw_places(mass.sum(axis=2), shares_of[group][0][part])
+                    column = _draw_places(
+                        mass[np.arange(len(mass)), row], shares_of[group][1][part]
+                    )
+                    for side, drawn in ((recorded, row), (sim, column)):
                         inside = like.step * (rng.random(len(mass)) - 0.5)
                         side[part, group] = expit(like.grid[drawn] + inside)
         return Draws(recorded=recorded, sim=sim)
@@ -539,19 +314,17 @@ def _flattened(log_w: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " no
     return np.asarray(weights)
 
 
-def _draw_cells(
-    mass: Float32[np.ndarray, "draws recorded sim"], rng: np.random.Generator
-) -> tuple[Int64[np.ndarray, " draws"], Int64[np.ndarray, " draws"]]:
-    """Draw a cell of each table: its row by the sums of rows, then its column."""
-    row = _draw_places(mass.sum(axis=2), rng)
-    return row, _draw_places(mass[np.arange(len(mass)), row], rng)
+def _strata(count: int, rng: np.random.Generator) -> Float64[np.ndarray, " count"]:
+    """Draw numbers between 0 and 1, one from each of equal parts, in random order."""
+    return np.asarray((rng.permutation(count) + rng.random(count)) / count)
 
 
 def _draw_places(
-    mass: Float32[np.ndarray, "draws places"], rng: np.random.Generator
+    mass: Float32[np.ndarray, "draws places"], share: Float64[np.ndarray, " draws"]
 ) -> Int64[np.ndarray, " draws"]:
+    """Draw a place of each row by its mass, which lies that share of the way through."""
     total = np.cumsum(mass, axis=1, dtype=np.float64)
-    return np.asarray((total < rng.random((len(mass), 1)) * total[:, -1:]).sum(axis=1))
+    return np.asarray((total < share[:, None] * total[:, -1:]).sum(axis=1))
 
 
 POPULATION_NODES = 33

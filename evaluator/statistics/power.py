@@ -1,8 +1,10 @@
 """How many trials a question needs, before or after somebody ran too few."""
 
 import math
+from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Int64
 from scipy.special import ndtr
 
 from evaluator.errors import UndefinedStatisticError
@@ -11,7 +13,7 @@ from evaluator.statistics.intervals import normal_quantile
 ALPHA = 0.05
 """Two-sided."""
 POWER = 0.8
-MAX_PAIRS = 400
+MAX_PAIRS = 4_000
 """The exact paired power counts every outcome out; beyond this a normal formula is as good."""
 
 
@@ -108,7 +110,12 @@ def detectable_rate(
 
 
 def power_paired(
-    p_improved: float, p_worsened: float, num_pairs: int, *, alpha: float = ALPHA
+    p_improved: float,
+    p_worsened: float,
+    num_pairs: int,
+    *,
+    alpha: float = ALPHA,
+    mid: bool = False,
 ) -> float:
     """Return the chance that McNemar's exact test on n pairs is significant.
 
@@ -117,14 +124,15 @@ def power_paired(
     Args:
         p_improved: Chance of a pair to fail before and succeed after.
         p_worsened: Chance of a pair to succeed before and fail after.
-        num_pairs: Pairs, those without a change included; 1 to 400.
+        num_pairs: Pairs, those without a change included; 1 to 4,000.
         alpha: Chance of a false alarm that the test allows.
+        mid: Whether the test has the mid-p correction.
 
     Raises:
-        UndefinedStatisticError: Beyond 400 pairs, or without pairs that can differ.
+        UndefinedStatisticError: Beyond 4,000 pairs, or without pairs that can differ.
     """
     differ = p_improved + p_worsened
-    if not 0 < differ <= 1 or min(p_improved, p_worsened) < 0:
+    if not 0 < differ <= 1 + 1e-12 or min(p_improved, p_worsened) < 0:
         raise UndefinedStatisticError(
             statistic="paired power",
             reason=f"the chances to improve ({p_improved:g}) and to worsen ({p_worsened:g}) are "
@@ -132,18 +140,31 @@ def power_paired(
         )
     if not 1 <= num_pairs <= MAX_PAIRS:
         raise UndefinedStatisticError(
-            statistic="paired power", reason=f"{num_pairs} pairs; it is counted out for 1 to 400"
+            statistic="paired power",
+            reason=f"{num_pairs} pairs; it is counted out for 1 to {MAX_PAIRS}",
         )
-    from scipy.stats import binom  # noqa: PLC0415  # half a second; beyond 400 pairs not needed
+    from scipy.stats import binom  # noqa: PLC0415  # half a second; beyond these pairs not needed
 
-    total = 0.0
-    for discordant in range(1, num_pairs + 1):
-        chance = float(binom.pmf(discordant, num_pairs, differ))
-        improved = np.arange(discordant + 1)
-        smaller = np.minimum(improved, discordant - improved)
-        shown = 2 * binom.cdf(smaller, discordant, 0.5) <= alpha
-        total += chance * float(binom.pmf(improved, discordant, p_improved / differ)[shown].sum())
-    return min(1.0, total)
+    discordant = np.arange(1, num_pairs + 1)
+    least = _largest_shown(num_pairs, alpha, mid)[1:]
+    share = p_improved / differ
+    shown = binom.cdf(least, discordant, share) + binom.cdf(least, discordant, 1 - share)
+    return min(1.0, float(binom.pmf(discordant, num_pairs, min(differ, 1.0)) @ shown))
+
+
+@lru_cache(maxsize=256)
+def _largest_shown(num_pairs: int, alpha: float, mid: bool) -> Int64[np.ndarray, " discordant"]:
+    """The largest smaller count of 0, 1, 2 .. differing pairs that is significant; -1 for none."""
+    from scipy.stats import binom  # noqa: PLC0415
+
+    discordant = np.arange(num_pairs + 1)
+    first = binom.ppf(alpha / 2, discordant, 0.5)  # the first whose tail reaches alpha / 2
+    tail = binom.cdf(first, discordant, 0.5)
+    if mid:
+        tail = tail - binom.pmf(first, discordant, 0.5) / 2
+    found = np.where(tail <= alpha / 2, first, first - 1).astype(np.int64)
+    found[0] = -1
+    return np.asarray(found)
 
 
 def _spreads(p_first: float, p_second: float) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.differences import boschloo
 from evaluator.statistics.gate import Confusion
-from evaluator.statistics.intervals import LEVEL, check_count, normal_quantile, wilson
+from evaluator.statistics.intervals import LEVEL, check_count, normal_quantile
 
 MIN_STARTS = 2
 """On each side; a single start has no neighbour of its own kind."""
@@ -145,6 +145,8 @@ MIN_PAIRS_CLT = 100
 """Below this the central limit theorem promises too much: with 10 pairs 84 to 88 % are covered
 where 95 % are claimed (design page, finding 6)."""
 MAX_SAVED = 10_000
+SHOWN_FROM = 0.025
+"""One-sided p from which on a twin's answers are worth something."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,24 +290,48 @@ def applicability(paired_k: int, paired_n: int, alone_k: int, alone_n: int) -> f
     return boschloo(paired_k, paired_n, alone_k, alone_n)
 
 
-def trials_saved(estimate: Estimate, num_pairs: int) -> int:
-    """Return how many more robot trials Wilson's interval would need to be as narrow.
+def trials_saved(pairs: Confusion, sim_k: int, sim_n: int, *, level: float = LEVEL) -> int:
+    """Return how many further robot trials would make the estimate as narrow without the twin.
 
-    At the estimated rate; 0 when it is as narrow already, never below.
+    The same posterior twice: ``post_stratified`` with the twin, Beta(k + 1/2, n - k + 1/2) without
+    it. A twin saves nothing that is not shown to be right more often after a yes than after a no
+    (Boschloo's test, one-sided at 2.5 %): a useless one would look narrower by chance.
 
     Args:
-        estimate: The rate found with the twin's help, with its interval.
-        num_pairs: Robot trials that it rests on.
+        pairs: Twin's answer against the real outcome, over the robot trials.
+        sim_k: Sim successes over further starts without a robot trial.
+        sim_n: Those starts.
+        level: Credibility.
 
     Raises:
-        UndefinedStatisticError: When it would be more than 10,000.
+        UndefinedStatisticError: Without robot trials, or when it would be more than 10,000.
     """
+    if pairs.n and not _is_right_more_often(pairs):
+        return 0
+    estimate = post_stratified(pairs, sim_k, sim_n, level=level)
     width = estimate.interval.high - estimate.interval.low
-    level = estimate.interval.level
-    for n in range(max(1, num_pairs), MAX_SAVED):
-        alone = wilson(round(estimate.value * n), n, level=level)
-        if alone.high - alone.low <= width:
-            return n - num_pairs
-    raise UndefinedStatisticError(
-        statistic="trials saved", reason=f"more than {MAX_SAVED} robot trials"
-    )
+
+    def is_enough(n: int) -> bool:
+        k = estimate.value * n
+        low, high = betaincinv(k + PRIOR, n - k + PRIOR, [(1 - level) / 2, (1 + level) / 2])
+        return bool(high - low <= width)
+
+    low, high = pairs.n, MAX_SAVED
+    if is_enough(low):
+        return 0
+    if not is_enough(high):
+        raise UndefinedStatisticError(
+            statistic="trials saved", reason=f"more than {MAX_SAVED} robot trials"
+        )
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if is_enough(middle) else (middle, high)
+    return high - pairs.n
+
+
+def _is_right_more_often(pairs: Confusion) -> bool:
+    """Whether success is shown to be more frequent after a yes than after a no."""
+    yes, no = pairs.predicted_success, pairs.predicted_failure
+    if not yes or not no or pairs.true_positive * no <= pairs.false_negative * yes:
+        return False
+    return boschloo(pairs.false_negative, no, pairs.true_positive, yes) <= 2 * SHOWN_FROM

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from evaluator.errors import UndefinedStatisticError
+from evaluator.statistics.calibration import (
+    brier_interval,
+    calibration_error_interval,
+    perfect_forecaster,
+)
 from evaluator.statistics.funnel import failure_taxonomy, funnel, success_curve
 from evaluator.statistics.gate import (
     Confusion,
@@ -197,11 +203,73 @@ def test_a_faithful_twin_narrows_the_real_rate_and_a_useless_one_does_not() -> N
     alone = wilson(6, 10)
     width = good.interval.high - good.interval.low
     assert width < alone.high - alone.low
-    assert trials_saved(good, 10) > 0
+    assert trials_saved(table(6, 0, 0, 4), 60, 100) > 0
     assert useless.interval.high - useless.interval.low > width
     assert good.interval.low < good.value < good.interval.high
     with pytest.raises(UndefinedStatisticError, match="no robot trial"):
         post_stratified(table(0, 0, 0, 0), 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("counts", "sim_k"),
+    [
+        (table(6, 4, 0, 0), 100),  # always yes
+        (table(0, 0, 6, 4), 0),  # always no
+        (table(0, 5, 5, 0), 50),  # wrong in 10 of 10
+        (table(3, 2, 3, 2), 50),  # a coin
+        (table(4, 1, 3, 2), 50),  # right more often, and not shown to be
+    ],
+)
+def test_a_useless_twin_saves_no_trial(counts: Confusion, sim_k: int) -> None:
+    assert trials_saved(counts, sim_k, 100) == 0
+
+
+def test_what_is_saved_are_the_trials_that_the_same_posterior_needs_without_the_twin() -> None:
+    counts = table(12, 1, 1, 6)
+    found = post_stratified(counts, 60, 100)
+    saved = trials_saved(counts, 60, 100)
+    n = counts.n + saved
+    low, high = stats.beta(found.value * n + 0.5, (1 - found.value) * n + 0.5).ppf([0.025, 0.975])
+    width = found.interval.high - found.interval.low
+    assert 0 < high - low <= width
+    n -= 1
+    low, high = stats.beta(found.value * n + 0.5, (1 - found.value) * n + 0.5).ppf([0.025, 0.975])
+    assert high - low > width
+    assert trials_saved(table(24, 2, 2, 12), 60, 100) > saved
+
+
+def test_a_perfect_forecaster_shows_an_error_over_few_trials() -> None:
+    p = (np.arange(20) + 0.5) / 20
+    score, error = perfect_forecaster(p.tolist())
+    assert score.mean == pytest.approx((p * (1 - p)).mean())
+    rng = np.random.default_rng(8)
+    drawn = [rng.random(20) < p for _ in range(400)]
+    seen = [expected_calibration_error(p.tolist(), y.tolist()) for y in drawn]
+    assert error.mean == pytest.approx(np.mean(seen), abs=0.01)
+    assert error.mean > 0.15
+    inside = np.mean([error.low <= each <= error.high for each in seen])
+    assert inside == pytest.approx(0.95, abs=0.04)
+    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
+        perfect_forecaster([])
+
+
+def test_the_brier_interval_of_yes_and_no_is_jeffreys() -> None:
+    predicted, happened = [1.0] * 10 + [0.0] * 10, [True] * 7 + [False] * 13
+    found = brier_interval(predicted, happened)
+    low, high = stats.beta(3.5, 17.5).ppf([0.025, 0.975])  # 3 of 20 were wrong
+    assert found.low == pytest.approx(low, abs=0.01)
+    assert found.high == pytest.approx(high, abs=0.015)
+
+
+def test_the_interval_of_the_calibration_error_takes_the_noise_out() -> None:
+    p = [0.1, 0.4, 0.6, 0.9] * 5
+    kept = [False, False, True, True] * 5
+    found = calibration_error_interval(p, kept)
+    assert found.low == 0.0
+    assert found.low <= expected_calibration_error(p, kept) <= found.high
+    wrong = calibration_error_interval([0.95] * 60, [False] * 45 + [True] * 15)
+    assert wrong.low > 0.5
+    assert wrong.low < 0.95 - 0.25 < wrong.high
 
 
 def test_the_stratified_interval_agrees_with_drawing_from_the_posterior() -> None:

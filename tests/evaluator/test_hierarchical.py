@@ -11,19 +11,19 @@ from scipy.special import expit
 from evaluator.compare.spreadsheet import compare_csv
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.differences import mean_of_intervals, newcombe_difference
+from evaluator.statistics.group_likelihood import GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.hierarchical import (
     AgreementModel,
-    GroupCounts,
-    Likelihood,
-    Nodes,
-    Spread,
     estimate,
-    log_prior,
+    from_normal,
     population,
     ranking,
+    to_normal,
 )
 
 Counts = Sequence[tuple[str, int, int, int, int]]
+NODES = 4096
+"""A quarter of what the evaluator takes."""
 EIGHT: Counts = [
     ("a", 3, 10, 6, 10),
     ("b", 9, 10, 9, 10),
@@ -46,7 +46,7 @@ def swapped(counts: Counts) -> list[GroupCounts]:
 
 @pytest.fixture(scope="module")
 def eight() -> AgreementModel:
-    return AgreementModel(groups_of(EIGHT))
+    return AgreementModel(groups_of(EIGHT), num_nodes=NODES)
 
 
 def test_a_group_has_the_probability_that_scipy_integrates() -> None:
@@ -80,9 +80,9 @@ def test_a_group_has_the_probability_that_scipy_integrates() -> None:
 def test_equal_counts_give_equal_numbers_and_another_seed_hardly_moves_them(
     eight: AgreementModel,
 ) -> None:
-    again = AgreementModel(groups_of(EIGHT))
+    again = AgreementModel(groups_of(EIGHT), num_nodes=NODES)
     assert again.pearson_others == eight.pearson_others
-    other = AgreementModel(groups_of(EIGHT), seed=5)
+    other = AgreementModel(groups_of(EIGHT), num_nodes=NODES, seed=5)
     for first, second in (
         (eight.pearson_others, other.pearson_others),
         (eight.bias_others, other.bias_others),
@@ -92,18 +92,18 @@ def test_equal_counts_give_equal_numbers_and_another_seed_hardly_moves_them(
 
 
 def test_sides_change_places(eight: AgreementModel) -> None:
-    other = AgreementModel(swapped(EIGHT))
+    other = AgreementModel(swapped(EIGHT), num_nodes=NODES)
     assert other.pearson_others.mean == pytest.approx(eight.pearson_others.mean, abs=0.02)
     assert other.bias_others.mean == pytest.approx(-eight.bias_others.mean, abs=0.005)
 
 
 def test_more_trials_and_more_groups_say_more(eight: AgreementModel) -> None:
     more = [(task, 5 * a, 5 * b, 5 * c, 5 * d) for task, a, b, c, d in EIGHT]
-    sharper = AgreementModel(groups_of(more)).pearson_others
+    sharper = AgreementModel(groups_of(more), num_nodes=NODES).pearson_others
     rough = eight.pearson_others
     assert sharper.high - sharper.low < rough.high - rough.low
     twice = [*EIGHT, *((f"{task}2", a, b, c, d) for task, a, b, c, d in EIGHT)]
-    wider = AgreementModel(groups_of(twice)).pearson_others
+    wider = AgreementModel(groups_of(twice), num_nodes=NODES).pearson_others
     assert wider.high - wider.low < rough.high - rough.low
 
 
@@ -123,16 +123,25 @@ def test_pairs_that_agree_make_the_bias_sharper() -> None:
         GroupCounts(recorded=group.totals[0], sim=group.totals[1], task=group.task)
         for group in paired
     ]
-    sharp, rough = (estimate(AgreementModel(g).draws.gap.mean(axis=1)) for g in (paired, apart))
+    sharp, rough = (
+        estimate(AgreementModel(g, num_nodes=NODES).draws.gap.mean(axis=1)) for g in (paired, apart)
+    )
     assert sharp.sd < 0.8 * rough.sd
     assert sharp.mean == pytest.approx(rough.mean, abs=0.03)
 
 
-def test_the_prior_allows_spreads_above_zero_and_true_correlations() -> None:
-    phi = np.array([[0, 0, 1, 1, 0.5], [0, 0, 2, 1, 1.5], [0, 0, -0.1, 1, 0], [0, 0, 1, 1, 1.6]])
-    found = log_prior(phi)
-    assert found[0] - found[1] == pytest.approx((4 - 1) / (2 * 2.5**2))
-    assert np.isneginf(found[2:]).all()
+def test_normal_numbers_stand_for_parameters_with_their_prior() -> None:
+    z = np.tile(np.array([-6.0, -1.0, 0.3, 2.0, 6.0])[:, None], 8)
+    phi = from_normal(z)
+    share = stats.norm.cdf(z)
+    assert stats.norm(scale=2.5).cdf(phi[:, :2]) == pytest.approx(share[:, :2])
+    for at in (2, 5):
+        sizes = phi[:, at : at + 2]
+        assert (sizes >= 0).all()
+        assert stats.halfnorm(scale=2.5).sf(sizes) == pytest.approx(1 - share[:, :2], rel=1e-6)
+        assert phi[:, at + 2] / np.pi + 0.5 == pytest.approx(share[:, 0])
+    assert to_normal(phi[1]) == pytest.approx(z[1])
+    assert to_normal(phi[3]) == pytest.approx(z[3])
 
 
 def test_the_population_has_the_correlation_that_draws_have() -> None:

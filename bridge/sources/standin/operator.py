@@ -34,12 +34,12 @@ from bridge.sources.standin.settings import (
     CONDITION_OF,
     CONDITIONS,
     INTERRUPTED,
-    SEEDS_PER_SESSION,
     SessionConfig,
 )
 from bridge.sources.standin.streams import Session
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success, objects_done
+from bridge.task.protocol import SEEDS_PER_SESSION, arms_in_order
 from bridge.task.task_file import Task, TaskFile
 from bridge.terminal import Output
 
@@ -199,7 +199,6 @@ RESETS_OF_RETRIES = 10
 """Added to the number of the first one's, so that the objects are put back independently."""
 RETRY_SEEDS = 10**13
 """Added to a start's seed, so that what is drawn for a retry is drawn for no trial."""
-ORDER_STREAM = 606
 PROBE_STREAM = 505
 PROBE_TRIES = 100
 """The object is put elsewhere until there is space for the probe."""
@@ -295,9 +294,7 @@ class Operator:
         config = self._config
         if not config.study_arms:
             return [Treatment(condition=condition) for condition in config.conditions]
-        rng = np.random.default_rng([ORDER_STREAM, config.study_seed, start_seed])
-        order = rng.permutation(len(config.study_arms))
-        arms = [config.study_arms[index] for index in order]
+        arms = arms_in_order(config.study_arms, config.study_seed, start_seed)
         return [Treatment(condition=CONDITION_OF[arm], study_arm=arm) for arm in arms]
 
     def _wanted(self) -> list[tuple[int, Treatment]]:

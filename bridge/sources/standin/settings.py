@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 from bridge.episode.metadata import WITH, WITHOUT
 from bridge.errors import UsageError, refuse_outside
+from bridge.task.protocol import SEEDS_PER_SESSION
 
 CONDITIONS = (WITHOUT, WITH)
 CONDITION_OF = {"without": WITHOUT, "with": WITH, "control": WITHOUT}
 """Of each study arm."""
 BUILT_IN, WIRE = "built_in", "wire"
 PLANNERS = (BUILT_IN, WIRE)
-SEEDS_PER_SESSION = 1000
-"""Session 7 starts at start seed 7000; sessions never share a start."""
 INTERRUPTED = "interrupted"
 """What an episode's outcome says that was ended before its time."""
 

@@ -19,6 +19,7 @@ from evaluator.report.figures.distributions import (
 )
 from evaluator.report.figures.drawing import Drawing, NotDrawn
 from evaluator.report.figures.gate import confusion, costs, reliability
+from evaluator.report.figures.order import session_order
 from evaluator.report.figures.rates import funnel, gains, scatter, success
 from evaluator.report.figures.tasks import tasks
 from evaluator.result import Measurement, Table
@@ -56,7 +57,7 @@ def drawable(comparison: Comparison) -> Drawable:
     )
 
 
-TABLES = ("confusion", "gate_costs", "funnel")
+TABLES = ("confusion", "gate_costs", "funnel", "session_order")
 """Those that a figure shows; the one of all trials is as long as the run."""
 
 
@@ -71,6 +72,7 @@ def drawings_of(data: Drawable) -> tuple[list[Drawing], list[NotDrawn]]:
         costs(data.tables),
         reliability(data.bins),
         funnel(data.tables),
+        session_order(data.tables),
         motions(data.motions),
         bands(data.bands),
         *(distributions(subject, panels) for subject, panels in data.distributions),

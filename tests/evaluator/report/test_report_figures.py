@@ -41,7 +41,8 @@ def test_what_has_no_data_is_named_with_its_reason() -> None:
     drawn, not_drawn = drawings_of(drawable(compare_csv(PAPER)))
     assert {item.id for item in drawn} == {"scatter", "tasks", "success", "gains"}
     assert {item.id for item in not_drawn} == {
-        *("confusion", "costs", "reliability", "funnel", "motions", "bands", "states", "views")
+        *("confusion", "costs", "reliability", "funnel", "motions", "bands", "states", "views"),
+        "order",
     }
     assert all(item.reason for item in not_drawn)
 

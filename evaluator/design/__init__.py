@@ -1,0 +1,1 @@
+"""Design a study before its first trial: its size, its order, its locked protocol."""

@@ -1,0 +1,87 @@
+"""Settings of ``robot-gst design``; imports nothing heavy."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from cyclopts import Parameter
+
+from bridge.errors import refuse_outside
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """What is tried; the same options as ``robot-gst trials`` has."""
+
+    task: tuple[str, ...] = ("cube_into_box",)
+    """Tasks: names in datasets/tasks or files."""
+    any_task: bool = False
+    """Accept tasks without a task file, as in a spreadsheet of trials."""
+    policies: tuple[str, ...] = ("perturbed",)
+    """The first one is tried in --arms, the others in the arm without alone."""
+    arms: tuple[str, ...] = ("without", "with")
+    """Of the first policy: without, with, control."""
+    coin: float | None = None
+    """Arm control: the chance of yes to each plan."""
+    rounds: int = 5
+    """Plans per trial in the arms with and control."""
+    seed: int = 1
+    """Draws the laboratory and the starts."""
+    study_seed: int = 0
+    """Draws the order of the starts, of the policies and arms on each, and the codes."""
+    blind: bool = False
+    """Name arms by codes in the operator's list."""
+    interval: str = "wilson"
+    """Interval of rates: wilson, clopper-pearson or jeffreys."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no study can have."""
+        refuse_outside(self, {"coin": (0, 1), "rounds": (1, 1000), "seed": (0, 2**31)})
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What is expected, and what the study is to show; shares from 0 to 1."""
+
+    past: Path | None = None
+    """A run, or its results.json: expected rates and the twin's agreement are taken from there."""
+    rate: float | None = None
+    """Expected success rate of the arm that is compared with."""
+    gain: float | None = None
+    """Expected gain over it, which is to be shown: 0.2 is 20 percentage points."""
+    correlation: float = 0.0
+    """Expected correlation of both outcomes of a start; 0 asks for more starts than more would."""
+    agreement: float | None = None
+    """Expected share of trials in which twin and outcome agree."""
+    width: float | None = None
+    """Wanted width of the gain's interval, from end to end."""
+    rate_width: float | None = None
+    """Wanted width of the interval of each arm's rate in each task."""
+    agrees_above: float | None = None
+    """The claim that twin and outcome agree in more than this share of trials."""
+    power: float = 0.8
+    """Chance with which gain and claim are to be shown."""
+    alpha: float = 0.05
+    """Chance of a false alarm."""
+    per_task: bool = False
+    """Ask for the gain in every task alone; otherwise over all tasks together."""
+    starts: int | None = None
+    """Starts of each task, whatever would be needed; what they can show is said."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no share."""
+        shares = dict.fromkeys(("rate", "agreement", "agrees_above"), (0, 1))
+        refuse_outside(
+            self,
+            {
+                **shares,
+                "gain": (-1, 1),
+                "correlation": (-1, 1),
+                "width": (0.01, 2),
+                "rate_width": (0.01, 1),
+                "power": (0.05, 0.999),
+                "alpha": (0.0001, 0.5),
+                "starts": (1, 1000),
+            },
+        )

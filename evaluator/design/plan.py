@@ -1,0 +1,474 @@
+"""Size a study, draw its order, and lock its protocol before the first trial."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import PathNotFoundError, UsageError
+from bridge.exchange.trials_csv import trials_path
+from bridge.task.find import chosen_task_file
+from bridge.task.plan import STUDY_ARMS
+from bridge.task.protocol import (
+    FILE_NAME,
+    Endpoint,
+    PolicyArms,
+    Protocol,
+    StudyTask,
+    blinding_codes,
+    read_protocol,
+    with_coins,
+)
+from bridge.whole_file import write_whole
+from evaluator.compare.success import CONDITION_OF_ARM
+from evaluator.design.config import StudyOptions, Wanted
+from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import AGREED, RATES
+from evaluator.result import Results, load_results
+from evaluator.statistics.intervals import RATE_INTERVALS
+from evaluator.statistics.planning import (
+    paired_chances,
+    paired_width,
+    pairs_for_power,
+    pairs_for_width,
+    power_above,
+    rate_width,
+    trials_above,
+    trials_for_width,
+)
+from evaluator.statistics.power import power_paired
+
+ORDER_FILE = "order.csv"
+"""In the run folder; with its outcomes filled in it is a trials CSV."""
+NO_TASK_FILE = "0" * 64
+"""Stands for the hash of a task that has no file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """One thing that the study is to show, and what it takes."""
+
+    what: str
+    counted: str
+    """pairs or trials."""
+    needed: int | None
+    """Of them; None where nothing was asked for."""
+    starts: int
+    """Of each task, for this goal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expected:
+    """What is expected of each task, with where it is from."""
+
+    rates: dict[str, tuple[float, float]]
+    """Of the arm compared with, and of the other one, by task."""
+    correlation: float
+    agreement: float | None
+    source: str
+
+    def chances(self, task: str | None = None) -> tuple[float, float]:
+        """Return the chances of a pair to improve and to worsen, in one or over all tasks."""
+        rates = list(self.rates.values()) if task is None else [self.rates[task]]
+        each = [paired_chances(*pair, self.correlation) for pair in rates]
+        return sum(a for a, _ in each) / len(each), sum(b for _, b in each) / len(each)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """A study, its size, and how that came about."""
+
+    protocol: Protocol
+    goals: tuple[Goal, ...]
+    shows: tuple[str, ...]
+    """What the study can show at its size."""
+    expected: Expected
+
+
+def design(study: StudyOptions, wanted: Wanted) -> Design:
+    """Find the number of starts and everything else that a study fixes before its first trial.
+
+    Args:
+        study: What is tried.
+        wanted: What is expected, and what is to be shown.
+
+    Raises:
+        UsageError: When an option contradicts another, or nothing is asked for.
+    """
+    base = _protocol(study, wanted)
+    expected = _expected(base, wanted)
+    goals = _goals(base, wanted, expected)
+    most = max((goal.starts for goal in goals), default=0)
+    starts = wanted.starts or most
+    if not starts:
+        raise UsageError(
+            "nothing says how large the study is to be: give --gain with --rate, --width, "
+            "--rate-width, --agrees-above with --agreement, or --starts."
+        )
+    if starts > 1000:
+        raise UsageError(f"{starts} starts of each task would be needed; a study has 1000 at most.")
+    tasks = tuple(replace(task, starts=starts) for task in base.tasks)
+    sized = replace(base, tasks=tasks)
+    shows = tuple(_shows(sized, wanted, expected))
+    return Design(
+        protocol=replace(sized, reasons=(expected.source, *map(_words, goals), *shows)),
+        goals=tuple(goals),
+        shows=shows,
+        expected=expected,
+    )
+
+
+def _words(goal: Goal) -> str:
+    return f"{goal.what}: {goal.needed} {goal.counted}, {goal.starts} starts of each task"
+
+
+def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
+    """Lay out all but the number of starts."""
+    if study.interval not in RATE_INTERVALS:
+        names = ", ".join(RATE_INTERVALS)
+        raise UsageError(f"--interval {study.interval!r} is unknown. There are: {names}.")
+    for arm in study.arms:
+        if arm not in STUDY_ARMS:
+            raise UsageError(f"--arms {arm!r} is unknown. There are: {', '.join(STUDY_ARMS)}.")
+    first, *others = list(dict.fromkeys(study.policies))
+    policies = (
+        PolicyArms(policy=first, arms=tuple(dict.fromkeys(study.arms))),
+        *(PolicyArms(policy=each, arms=("without",)) for each in others),
+    )
+    primary, *secondary = _endpoints(policies, wanted)
+    protocol = Protocol(
+        tasks=tuple(_task(name, study) for name in dict.fromkeys(study.task)),
+        policies=policies,
+        rounds=study.rounds,
+        study_seed=study.study_seed,
+        primary=primary,
+        secondary=tuple(secondary),
+        interval=study.interval,
+        alpha=wanted.alpha,
+        codes=blinding_codes(policies, study.study_seed) if study.blind else {},
+    )
+    if "control" not in study.arms:
+        return protocol
+    if study.coin is None:
+        raise UsageError("the arm control needs --coin, the chance of yes to each plan.")
+    coins = {task.task: study.coin for task in protocol.tasks}
+    return with_coins(protocol, coins, "given by --coin")
+
+
+def _task(name: str, study: StudyOptions) -> StudyTask:
+    if study.any_task and not name.endswith(".toml"):
+        return StudyTask(task=name, task_sha256=NO_TASK_FILE, session_seed=study.seed, starts=1)
+    file = chosen_task_file(name)
+    return StudyTask(
+        task=file.task().name, task_sha256=file.sha256, session_seed=study.seed, starts=1
+    )
+
+
+def _endpoints(policies: Sequence[PolicyArms], wanted: Wanted) -> list[Endpoint]:
+    """List the questions, the primary one first."""
+    first = policies[0]
+    found = [
+        Endpoint(
+            kind="difference",
+            policy=first.policy,
+            arm="with",
+            against_policy=first.policy,
+            against_arm=arm,
+        )
+        for arm in ("without", "control")
+        if {"with", arm} <= set(first.arms)
+    ]
+    if "without" in first.arms:
+        found += [
+            Endpoint(
+                kind="difference",
+                policy=other.policy,
+                arm="without",
+                against_policy=first.policy,
+                against_arm="without",
+            )
+            for other in policies[1:]
+        ]
+    if wanted.agrees_above is not None:
+        arm = first.arms[0]
+        claim = Endpoint(kind="agreement", policy=first.policy, arm=arm, limit=wanted.agrees_above)
+        found.append(claim)
+    if not found:
+        raise UsageError(
+            "there is nothing to compare: give two arms, two policies, or --agrees-above."
+        )
+    return found
+
+
+def _expected(protocol: Protocol, wanted: Wanted) -> Expected:
+    """Gather expectations: what was given, else what a past run shows."""
+    past = None if wanted.past is None else load_results(wanted.past)
+    primary = protocol.primary
+    rates, sources = {}, []
+    for task in protocol.tasks:
+        before = wanted.rate
+        after = None
+        if past is not None and primary is not None and primary.kind == "difference":
+            arms = (primary.against_policy, primary.against_arm), (primary.policy, primary.arm)
+            before, after = (
+                _past_rate(past, task.task, *arm) if given is None else given
+                for arm, given in zip(arms, (wanted.rate, None), strict=True)
+            )
+        first = 0.5 if before is None else before
+        if wanted.gain is not None:
+            after = first + wanted.gain
+        second = first if after is None else after
+        if not 0 <= second <= 1:
+            raise UsageError(
+                f"a rate of {100 * first:.0f} % and a gain of {100 * (second - first):.0f} points "
+                f"make {100 * second:.0f} %: give another --rate or --gain."
+            )
+        rates[task.task] = (first, second)
+        sources.append(f"{task.task} {100 * first:.0f} % and {100 * second:.0f} %")
+    agreement = wanted.agreement
+    if agreement is None and past is not None:
+        agreement = _share(past, AGREED.of(by="sim_planned", words="").id)
+    where = "as given" if past is None else f"from {past.run} where not given"
+    return Expected(
+        rates=rates,
+        correlation=wanted.correlation,
+        agreement=agreement,
+        source=f"expected rates ({where}): {', '.join(sources)}; correlation of both outcomes of "
+        f"a start {wanted.correlation:g}",
+    )
+
+
+def _past_rate(past: Results, task: str, policy: str, arm: str) -> float:
+    name = RATES["recorded"].of(task=task, condition=CONDITION_OF_ARM[arm], policy=policy).id
+    found = _share(past, name)
+    if found is None:
+        there = ", ".join(m.id for m in past.measurements if m.id.startswith("rate.recorded."))
+        raise UsageError(
+            f"{past.run} has no {name}. There are: {there or 'no recorded rates'}. Give --rate and "
+            "--gain."
+        )
+    return found
+
+
+def _share(past: Results, name: str) -> float | None:
+    """Return a past share as it may be expected again: few trials are no certainty."""
+    for measurement in past.measurements:
+        if measurement.id == name and measurement.k is not None and measurement.n:
+            return (measurement.k + 0.5) / (measurement.n + 1)
+    return None
+
+
+def _goals(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[Goal]:
+    """Size the study for everything that was asked for."""
+    count = len(protocol.tasks)
+    alpha = wanted.alpha / count if wanted.per_task else wanted.alpha
+    difference = protocol.primary is not None and protocol.primary.kind == "difference"
+    found: list[Goal] = []
+    try:
+        if difference and any(a != b for a, b in expected.rates.values()):
+            found.append(_gain_goal(wanted, expected, alpha))
+        if difference and wanted.width is not None:
+            found.append(_width_goal(wanted, expected))
+        if wanted.rate_width is not None:
+            ends = {rate for pair in expected.rates.values() for rate in pair}
+            needed = max(
+                trials_for_width(rate, wanted.rate_width, method=protocol.interval) for rate in ends
+            )
+            what = f"interval of each rate {100 * wanted.rate_width:g} points wide"
+            found.append(Goal(what=what, counted="trials", needed=needed, starts=needed))
+        if wanted.agrees_above is not None:
+            found.append(_agreement_goal(protocol, wanted, expected))
+    except UndefinedStatisticError as error:
+        raise UsageError(f"{error} Expect a larger difference, or a wider interval.") from error
+    return found
+
+
+def _gain_goal(wanted: Wanted, expected: Expected, alpha: float) -> Goal:
+    tasks = list(expected.rates)
+    what = f"gain shown with {100 * wanted.power:g} % power (McNemar's mid-p, {alpha:.3g})"
+    if wanted.per_task:
+        each = [
+            pairs_for_power(*expected.chances(t), power=wanted.power, alpha=alpha) for t in tasks
+        ]
+        return Goal(
+            what=f"{what} in every task", counted="pairs", needed=sum(each), starts=max(each)
+        )
+    needed = pairs_for_power(*expected.chances(), power=wanted.power, alpha=alpha)
+    starts = math.ceil(needed / len(tasks))
+    return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
+
+
+def _width_goal(wanted: Wanted, expected: Expected) -> Goal:
+    tasks = list(expected.rates)
+    width = wanted.width or 0.0
+    what = f"interval of the gain {100 * width:g} points wide (Tango)"
+    if wanted.per_task:
+        each = [pairs_for_width(*expected.chances(task), width) for task in tasks]
+        return Goal(
+            what=f"{what} in every task", counted="pairs", needed=sum(each), starts=max(each)
+        )
+    needed = pairs_for_width(*expected.chances(), width)
+    starts = math.ceil(needed / len(tasks))
+    return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
+
+
+def _agreement_goal(protocol: Protocol, wanted: Wanted, expected: Expected) -> Goal:
+    limit = wanted.agrees_above or 0.0
+    if expected.agreement is None:
+        raise UsageError(
+            "--agrees-above needs --agreement, the expected share of trials in which twin and "
+            "outcome agree, or --past with a run that was evaluated."
+        )
+    needed = trials_above(
+        expected.agreement,
+        limit,
+        power=wanted.power,
+        alpha=wanted.alpha,
+        method=protocol.interval,
+    )
+    return Goal(
+        what=f"twin agrees in more than {100 * limit:g} %, expected {100 * expected.agreement:.0f}"
+        f" %, shown with {100 * wanted.power:g} % power",
+        counted="trials of one arm",
+        needed=needed,
+        starts=math.ceil(needed / len(protocol.tasks)),
+    )
+
+
+def _shows(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[str]:
+    """Say what the study can show at its size."""
+    starts, count = protocol.tasks[0].starts, len(protocol.tasks)
+    found = []
+    if protocol.primary is not None and protocol.primary.kind == "difference":
+        chances = expected.chances()
+        pairs = starts * count
+        width = paired_width(*chances, pairs)
+        found.append(f"interval of the gain over {pairs} pairs: {100 * width:.0f} points wide")
+        if chances[0] != chances[1]:
+            power = power_paired(*chances, pairs, alpha=wanted.alpha, mid=True)
+            found.append(f"power for the gain over {pairs} pairs: {100 * power:.0f} %")
+    ends = sorted({rate for pair in expected.rates.values() for rate in pair})
+    widths = [rate_width(rate, starts, method=protocol.interval) for rate in ends]
+    found.append(
+        f"interval of a task's rate over {starts} trials: up to {100 * max(widths):.0f} points wide"
+    )
+    if wanted.agrees_above is not None and expected.agreement is not None:
+        power = power_above(
+            expected.agreement,
+            wanted.agrees_above,
+            starts * count,
+            alpha=wanted.alpha,
+            method=protocol.interval,
+        )
+        found.append(f"power for the claim that the twin agrees: {100 * power:.0f} %")
+    return found
+
+
+def lock(run_path: Path, made: Design) -> Protocol:
+    """Write protocol and order into a run; a protocol that is there is never overwritten.
+
+    Args:
+        run_path: The run folder; made where it is not there.
+        made: The design.
+
+    Returns:
+        The protocol as written, with its hash.
+
+    Raises:
+        UsageError: When the run has a protocol or trials already.
+    """
+    path = run_path / FILE_NAME
+    if path.exists():
+        raise UsageError(
+            f"{path} is locked: a study is designed once. Use another folder for another study."
+        )
+    run = RunFolder.create(run_path)
+    if run.episodes() or trials_path(run).is_file():
+        raise UsageError(f"{run_path} holds trials already: a study is designed before the first.")
+    write_whole(run_path / ORDER_FILE, order_list(made.protocol))
+    write_whole(path, made.protocol.to_json())
+    written = read_protocol(run_path)
+    if written is None:
+        raise PathNotFoundError(path=path, what="protocol", hint="It was removed just now.")
+    return written
+
+
+def order_list(protocol: Protocol) -> bytes:
+    """Lay out the order of the trials for the operator, as a trials CSV without outcomes."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial_id", "task", "start_id", "policy", "condition", "recorded"])
+    for trial in protocol.order():
+        code = protocol.code_of(trial.policy, trial.arm)
+        treatment = (code, "") if code else (trial.policy, CONDITION_OF_ARM[trial.arm])
+        name = f"trial_{trial.number:04d}"
+        writer.writerow([name, trial.task, trial.start_id, *treatment, ""])
+    return text.getvalue().encode()
+
+
+def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOptions) -> str:
+    """Return the design in words.
+
+    Args:
+        made: The design.
+        written: The protocol with its hash.
+        run_path: Where it lies.
+        study: The options, for the command that carries it out.
+    """
+    protocol = made.protocol
+    arms = sum(len(policy.arms) for policy in protocol.policies)
+    starts, count = protocol.tasks[0].starts, len(protocol.tasks)
+    primary = "" if protocol.primary is None else protocol.primary.words
+    lines = [
+        f"Study of {count} tasks, {arms} arms, {starts} starts of each task: "
+        f"{len(protocol.order())} trials",
+        f"Primary question: {primary}",
+        *(f"Secondary: {each.words}" for each in protocol.secondary),
+        *(f"Needed: {_words(goal)}" for goal in made.goals),
+        *(f"At this size: {each}" for each in made.shows),
+        made.expected.source.capitalize(),
+        f"Locked: {run_path / FILE_NAME}, sha256 {written.sha256}",
+        f"Order: {run_path / ORDER_FILE}, interleaved by --study-seed {protocol.study_seed}"
+        + (", arms by code" if protocol.codes else ""),
+        f"On the stand-in cell: {trials_command(run_path, protocol, study)}",
+        f"Elsewhere: fill in {ORDER_FILE}, robot-gst import trials {run_path / ORDER_FILE} "
+        f"{run_path}, robot-gst evaluate {run_path}",
+    ]
+    return "\n".join(lines)
+
+
+def trials_command(run_path: Path, protocol: Protocol, study: StudyOptions) -> str:
+    """Return the command that carries a design out on the stand-in cell.
+
+    Args:
+        run_path: The run folder.
+        protocol: What was designed.
+        study: The options it was made with.
+    """
+    words = ["robot-gst", "trials", str(run_path)]
+    for name, values in (
+        ("--task", study.task),
+        ("--policies", study.policies),
+        ("--arms", study.arms),
+    ):
+        words += [word for value in values for word in (name, value)]
+    words += ["--trials", str(protocol.tasks[0].starts), "--rounds", str(protocol.rounds)]
+    words += ["--seed", str(study.seed), "--study-seed", str(protocol.study_seed)]
+    if study.coin is not None and "control" in study.arms:
+        words += ["--coin", f"{study.coin:g}"]
+    return " ".join(words)
+
+
+def design_record(made: Design, written: Protocol) -> dict[str, Any]:
+    """Return the design for programs."""
+    return {
+        "starts": made.protocol.tasks[0].starts,
+        "trials": len(made.protocol.order()),
+        "goals": [vars(goal) for goal in made.goals],
+        "shows": list(made.shows),
+        "sha256": written.sha256,
+    }

@@ -1,0 +1,93 @@
+"""What a measurement is made of: its id, unit, definition, and the registry of all of them."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+Better = Literal["higher", "lower", "none"]
+"""Which way a value is better; ``none`` where it describes and does not judge."""
+
+
+def slug(text: str) -> str:
+    """Return text usable as one part of a measurement id.
+
+    Letters beyond ASCII are written as their code points, so that names in any script stay apart.
+    Blanks and signs become ``_``, so that names may still share one: ``refuse_alike``.
+    """
+    plain = text if text.isascii() else "".join(c if c.isascii() else _code(c) for c in text)
+    return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
+
+
+def _code(letter: str) -> str:
+    return f"+{ord(letter):04x}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defined:
+    """What one measurement is: the part of it that its quantity decides."""
+
+    id: str
+    unit: str
+    definition: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """One kind of measurement."""
+
+    id: str
+    """With the names of its variable parts in braces."""
+    unit: str
+    definition: str
+    """With words of the single measurement in braces."""
+    better: Better
+    computed_by: Callable[..., Any] | None
+    """None for plain counts."""
+
+    def of(self, **words: object) -> Defined:
+        """Name one measurement.
+
+        Args:
+            words: The parts of its id, which are made fit for ids, and of its definition.
+        """
+        parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
+        return Defined(
+            id=self.id.format(**parts),
+            unit=self.unit,
+            definition=self.definition.format(**words),
+        )
+
+    @cached_property
+    def pattern(self) -> re.Pattern[str]:
+        """Matches the ids of this quantity, with their parts as groups."""
+        parts = re.split(r"\{(\w+)\}", self.id)
+        ends = [re.escape(text) for text in parts[::2]]
+        names = [rf"(?P<{name}>[A-Za-z0-9_+-]+)" for name in parts[1::2]]
+        return re.compile("".join(a + b for a, b in zip(ends, [*names, ""], strict=True)))
+
+
+REGISTRY: list[Quantity] = []
+"""In the order of docs/metrics.md."""
+
+
+def quantity_of(measurement_id: str) -> Quantity | None:
+    """Return the quantity an id belongs to, the one with the fewest variable parts."""
+    found = [q for q in REGISTRY if q.pattern.fullmatch(measurement_id)]
+    return min(found, key=lambda q: q.id.count("{"), default=None)
+
+
+def new_quantity(
+    id: str,  # the word everywhere
+    unit: str,
+    better: Better,
+    computed_by: Callable[..., Any] | None,
+    definition: str,
+) -> Quantity:
+    """Register a quantity; ids and definitions may hold names of parts in braces."""
+    quantity = Quantity(
+        id=id, unit=unit, definition=definition, better=better, computed_by=computed_by
+    )
+    REGISTRY.append(quantity)
+    return quantity
