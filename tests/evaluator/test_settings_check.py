@@ -105,10 +105,12 @@ def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Pat
     two.replay("a", scene_hash=OLD)
     two.replay("b", scene_hash=NEW)
     report = write_report(compare_run(two.run), tmp_path / "out").report.read_text()
-    rates, note, cells = (
-        report.index(text) for text in ('id="success"', f"1 in scene {OLD}", 'id="agreement"')
+    note = f"1 in scene {OLD}"
+    meaning, rates, cells = (
+        report.index(f'id="{part}"') for part in ("meaning", "success", "agreement")
     )
-    assert rates < note < cells
+    assert meaning < report.index(note) < rates  # on the first page
+    assert rates < report.index(note, rates) < cells
     assert "1 groups" not in report
 
 
