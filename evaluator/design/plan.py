@@ -422,9 +422,10 @@ def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOpt
     protocol = made.protocol
     arms = sum(len(policy.arms) for policy in protocol.policies)
     starts, count = protocol.tasks[0].starts, len(protocol.tasks)
+    tasks = "1 task" if count == 1 else f"{count} tasks"
     primary = "" if protocol.primary is None else protocol.primary.words
     lines = [
-        f"Study of {count} tasks, {arms} arms, {starts} starts of each task: "
+        f"Study of {tasks}, {arms} arms, {starts} starts of each task: "
         f"{len(protocol.order())} trials",
         f"Primary question: {primary}",
         *(f"Secondary: {each.words}" for each in protocol.secondary),
