@@ -76,6 +76,10 @@ class TrialsConfig:
         )
 
 
+DEMO_TASKS = ("cube_into_box", "cube_on_block")
+"""Two, so that the correlation over groups is defined."""
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig:
@@ -89,10 +93,10 @@ class DemoConfig:
     """Start positions and grasp errors of the trials; the cell's hidden parameters too."""
     task: tuple[str, ...] = ()
     """Tasks of the trials, names or files: without and with replanning by the cell's own planner.
-    The first one is scanned. Default: cube_into_box."""
+    The first one is scanned. Default: cube_into_box and cube_on_block; with --quick the first."""
     policies: tuple[str, ...] = ()
     """Policies that try every task too, without replanning, as in robot-gst plan --live, such as
-    nominal. Default: none."""
+    nominal. Default: nominal; with --quick, or with the cell's own policy alone, none."""
     serve: bool | None = None
     """Keep the dashboard running until Ctrl-C. Default: only on a terminal."""
     port: int = 0
@@ -105,12 +109,13 @@ class DemoConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """Tasks of the trials."""
-        return self.task or ("cube_into_box",)
+        return self.task or (DEMO_TASKS[:1] if self.quick else DEMO_TASKS)
 
     @property
     def other_policies(self) -> tuple[str, ...]:
         """Policies that are not the cell's own planner's."""
-        return tuple(each for each in self.policies if each != BUILT_IN_POLICY)
+        chosen = self.policies or (() if self.quick else ("nominal",))
+        return tuple(each for each in chosen if each != BUILT_IN_POLICY)
 
     @property
     def trials(self) -> int:

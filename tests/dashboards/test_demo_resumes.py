@@ -116,11 +116,13 @@ def test_another_policy_on_the_same_start_is_another_trial(run: RunFolder) -> No
 
 
 def test_the_demo_tries_the_tasks_it_is_given() -> None:
-    two = DemoConfig(task=("cube_into_box", "cube_on_block"))
-    usual = [each for group in groups_of(two) for each in group.trials(two)]
-    assert len({(each.task, each.policy, each.condition) for each in usual}) == 4
-    assert len({each.task for each in usual}) == 2
-    assert len(usual) == len(set(usual)) == 12
+    usual = [each for group in groups_of(DemoConfig()) for each in group.trials(DemoConfig())]
+    # Two tasks, each by the cell's own planner without and with replanning, and by another without.
+    assert len({(each.task, each.policy, each.condition) for each in usual}) == 6
+    assert len({each.task for each in usual}) == len({each.policy for each in usual}) == 2
+    assert len(usual) == len(set(usual)) == 18
+    alone = DemoConfig(task=("cube_into_box",), policies=("perturbed",))
+    assert len([each for group in groups_of(alone) for each in group.trials(alone)]) == 6
     quick = [each for group in groups_of(QUICK) for each in group.trials(QUICK)]
     assert {(each.task, each.policy) for each in quick} == {(TASK, "perturbed")}
     own = DemoConfig(quick=True, task=("stack_two_cubes",), policies=("perturbed",))
