@@ -34,7 +34,7 @@ def test_a_run_with_everything_has_every_figure_and_each_has_its_place(
 ) -> None:
     placed = [name for section in SECTIONS for name in section.figures]
     assert sorted(item.drawing.id for item in rendered) == sorted(placed)
-    assert len(placed) == len(set(placed)) == 12
+    assert len(placed) == len(set(placed)) == 13
 
 
 def test_what_has_no_data_is_named_with_its_reason() -> None:
