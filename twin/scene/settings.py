@@ -269,9 +269,17 @@ class RenderConfig:
     """Take camera and pose from this recorded episode; empty: the first of the scene."""
     camera: str = ""
     """Camera id; empty: the episode's first."""
-    at_s: float = 0.0
+    at_s: float | None = None
     """Seconds after the episode's first sample, by the stamps of its source as on the dashboard;
-    when messages arrived does not count."""
+    when messages arrived does not count. Without it an --episode is drawn from its start to its
+    end, and one image is drawn at 0 s."""
+    rate_hz: float | None = None
+    """Frames per second of a whole episode; default: one for each image its camera recorded."""
+    size: str = ""
+    """WIDTHxHEIGHT of the images in pixels; default: as recorded."""
+    compare: bool = False
+    """Of a whole episode: show recorded image, twin and their difference side by side, and measure
+    how much they agree."""
     eye: tuple[float, float, float] | None = None
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
@@ -289,12 +297,23 @@ class RenderConfig:
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
-    """File to write; default: RUN/results/render.png."""
+    """File to write; default: RUN/results/render.png. A whole episode: an .mp4 file, or a folder
+    for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        refuse_outside(
+            self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0), "rate_hz": (0.01, 240.0)}
+        )
         for name, place in (("eye", self.eye), ("target", self.target)):
             if place is not None and not all(math.isfinite(value) for value in place):
                 message = f"--{name} {place} is no place: three numbers in metres."
                 raise UsageError(message)
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether a whole episode is drawn, and not one image."""
+        if self.out is not None and self.out.suffix.lower() == ".png":
+            return False
+        one = self.at_s is not None or self.joints is not None
+        return not one and bool(self.episode)
