@@ -116,6 +116,9 @@ class InitialiseConfig:
     """Standard deviation along the normal, as a fraction of the one in the plane."""
     opacity: float = 0.95
     """Opacity of a new Gaussian."""
+    completion: float = 0.1
+    """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
+    0: such holes stay black."""
     flying_fraction: float = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
@@ -127,6 +130,7 @@ class InitialiseConfig:
             {
                 "footprint_factor": (0.1, 100.0),
                 "flatness": (1e-3, 1.0),
+                "completion": (0.0, 1.0),
                 "flying_fraction": (1e-3, 10.0),
             },
         )
