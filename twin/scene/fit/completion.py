@@ -26,7 +26,7 @@ HOLE_ALPHA = 0.5
 """A pixel that lets more than this through shows nothing."""
 LEAST_PX = 12
 """Smaller holes of a half-size image are left to their surroundings."""
-NUM_DEPTHS = 32
+NUM_DEPTHS = 64
 BEYOND = 2.0
 """The farthest distance that is tried, times the farthest that was drawn."""
 MOST_VIEWS = 24
@@ -112,13 +112,17 @@ def _closed(
 ) -> GaussianCloud:
     """Gaussians for the pixels of one view, coarser where they would be too many."""
     depth_m = _swept(hole, _references(hole.view, views))
-    step = max(1, int(np.ceil(np.sqrt((depth_m > 0).sum() / max(most, 1)))))
+    step = 1
+    while (depth_m[::step, ::step] > 0).sum() > most:
+        step += 1
     chosen = np.zeros_like(hole.mask)
     chosen[::step, ::step] = depth_m[::step, ::step] > 0
     camera, T = hole.target.camera, hole.view.T_base_color
     p_camera = camera.unproject(depth_m.astype(np.float64))[chosen]
-    towards = -p_camera / np.maximum(np.linalg.norm(p_camera, axis=1, keepdims=True), 1e-9)
     colors = np.moveaxis(hole.target.image(), 0, -1)[chosen]
+    _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
+    p_camera, colors = p_camera[allowed], colors[allowed]
+    towards = -p_camera / np.maximum(np.linalg.norm(p_camera, axis=1, keepdims=True), 1e-9)
     sizes = SPACING_PX * step * p_camera[:, 2] / camera.fx
     return flat_gaussians(se3.apply(T, p_camera), towards @ T[:3, :3].T, colors, sizes, config)
 
@@ -148,13 +152,38 @@ def _swept(hole: _Hole, references: Sequence[TrainingView]) -> Float32[np.ndarra
         apart, allowed[index] = _disagreement(p, image, references)
         cost[index] = _averaged(apart, hole.mask) + SMOOTH * np.abs(np.log(depth / beside))
     cost[~allowed] = np.inf
-    best = cost.argmin(axis=0)
-    possible = np.isfinite(cost[best, np.arange(len(rows))])
+    chosen = _least(cost, depths)
     found = np.zeros(hole.mask.shape, dtype=np.float32)
-    found[rows[possible], columns[possible]] = depths[best[possible]]
+    found[rows, columns] = chosen
     around = np.where(found > 0, found, hole.beside_m)
     smooth = ndimage.median_filter(around, size=BLOCK_PX)
     return np.where(found > 0, smooth, np.float32(0.0))
+
+
+def _least(
+    cost: Float[np.ndarray, "num_depths num_points"], depths: Float[np.ndarray, " num_depths"]
+) -> Float[np.ndarray, " num_points"]:
+    """Depth of least cost, refined by a parabola; 0 where no depth has a finite cost.
+
+    Args:
+        cost: Infinite where a distance cannot be.
+        depths: Spaced by one factor.
+    """
+    best = cost.argmin(axis=0)
+    every = np.arange(cost.shape[1])
+    below, middle, above = (
+        cost[np.clip(best + step, 0, len(depths) - 1), every] for step in (-1, 0, 1)
+    )
+    possible = np.isfinite(middle)
+    inner = possible & np.isfinite(below) & np.isfinite(above) & (best > 0)
+    inner &= best < len(depths) - 1
+    shift = np.zeros(len(best))
+    bend = below[inner] - 2 * middle[inner] + above[inner]
+    shift[inner] = np.where(
+        bend > 1e-9, (below[inner] - above[inner]) / np.maximum(2 * bend, 1e-9), 0.0
+    )
+    factor = depths[1] / depths[0]
+    return np.where(possible, depths[best] * factor ** np.clip(shift, -0.5, 0.5), 0.0)
 
 
 def _disagreement(

@@ -123,6 +123,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     training = with_fitted_poses(training, fitted.Ts_base_color)
     raster = RasterConfig(threads=config.fit.threads)
     completed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
+    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
@@ -149,6 +150,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
+        num_completed=len(completed),
     )
     clock.end("objects_and_semantics")
     record = make_record(
