@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt16
+from jaxtyping import Bool, Float, Float32, Int, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -22,8 +22,8 @@ from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknow
 from twin.scene.frames.pairing import name_of
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.movable_scene import read_movable_scene
-from twin.scene.raster.backend import open_rasteriser
-from twin.scene.raster.rasteriser import RasterConfig
+from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
@@ -236,7 +236,10 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     if config.depth:
         depth_path = path.with_name(f"{path.stem}_depth{path.suffix}")
         depth_path.write_bytes(encode_png(depth_image(view.depth_m)))
-        written.append(str(depth_path))
+        seen_path = path.with_name(f"{path.stem}_seen{path.suffix}")
+        seen = seen_mask(rasteriser, view.alpha, scene, len(composed.cloud))
+        seen_path.write_bytes(encode_png(np.where(seen, np.uint8(255), np.uint8(0))))
+        written += [str(depth_path), str(seen_path)]
     return {
         "files": written,
         "scene_hash": scene.scene_hash,
@@ -245,6 +248,33 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "robot": composed.robot,
         "coverage_fraction": float(view.alpha.mean()),
     }
+
+
+SEEN = 0.5
+"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan."""
+
+
+def seen_mask(
+    rasteriser: Rasteriser | CudaRasteriser,
+    alpha: Float32[np.ndarray, "height width"],
+    scene: Scene,
+    num_splats: int,
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels of the image drawn last that show what was measured, and not what was completed.
+
+    Args:
+        rasteriser: Drew a cloud that begins with the scene's background.
+        alpha: Of that image.
+        scene: Its record says how many of the background's last Gaussians nobody measured.
+        num_splats: Gaussians of that cloud.
+    """
+    num_completed = int(scene.record["background"].get("num_completed", 0))
+    if num_completed == 0:
+        return np.asarray(alpha >= SEEN)
+    measured = np.ones((num_splats, 1), dtype=np.float32)
+    last = len(scene.background)
+    measured[last - num_completed : last] = 0.0
+    return np.asarray(rasteriser.draw_features(measured)[0] >= SEEN)
 
 
 def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:

@@ -44,6 +44,7 @@ from twin.scene.render import (
     depth_image,
     episode_of,
     poses_in_scene,
+    seen_mask,
     sized_camera,
     why_no_robot,
 )
@@ -52,8 +53,6 @@ from twin.scene.shape.files import MESH
 from twin.scene.shape.mesh import read_mesh
 from twin.scene.store.folder import Scene, read_scene
 
-SEEN = 0.5
-"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan."""
 CRF = 18
 """Quality of the video: hardly to be told from the frames."""
 MOST_FRAMES = 100_000
@@ -295,7 +294,7 @@ def render_sequence(
         parts=parts,
         urdf="" if episode.postures is None else episode.postures.urdf,
         camera=sized_camera(info.camera, config.size),
-        num_completed=int(scene.record.get("background", {}).get("num_completed", 0)),
+        scene=scene,
     )
     out = config.out or run.results_dir / f"{episode.shown.path.stem}.{camera_id}.mp4"
     comparison = _Comparison.start(run, episode, parts) if config.compare else None
@@ -371,19 +370,14 @@ class Artist:
     parts: MovableScene
     urdf: str
     camera: Camera
-    num_completed: int = 0
-    """So many of the background's last Gaussians stand for what nobody measured."""
+    scene: Scene
+    """Says what was measured."""
 
     def draw(self, frame: Frame) -> Drawn:
         """Draw the scene as it was at one instant."""
         cloud = self.parts.at(frame.Ts_base_object, frame.posture, self.urdf)
         view = self.rasteriser.view(cloud, self.camera, frame.T_base_camera)
-        seen = view.alpha >= SEEN
-        if self.num_completed:
-            measured = np.ones((len(cloud), 1), dtype=np.float32)
-            last = len(self.parts.background)
-            measured[last - self.num_completed : last] = 0.0
-            seen = self.rasteriser.draw_features(measured)[0] >= SEEN
+        seen = seen_mask(self.rasteriser, view.alpha, self.scene, len(cloud))
         return Drawn(image_u8=view.image_u8(), depth_m=view.depth_m, seen_mask=seen)
 
 

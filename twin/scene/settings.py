@@ -297,7 +297,8 @@ class RenderConfig:
     """Put an object elsewhere: ID=x,y,z or ID=x,y,z,qw,qx,qy,qz in the scene's frame; once for
     each object."""
     depth: bool = False
-    """Write a second image with the depth, in millimetres."""
+    """Write two more images: the depth in millimetres, and, white, what was measured in the scan;
+    black is what was completed or never seen."""
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
