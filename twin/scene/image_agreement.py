@@ -19,7 +19,6 @@ from twin.robot.surface import PosedSurface
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices [m] and triangles."""
-PARTS = ("robot", "objects", "background")
 
 
 def part_masks(

@@ -27,7 +27,7 @@ REACH_M = 0.03
 """Colours of points farther away are not the surface's."""
 NEIGHBOURS = 16
 BLUR_M = 0.006
-WIDER = 1.4
+WIDER = 1.15
 """Gaussians are wider than their spacing by this, so that nothing shows through."""
 
 
