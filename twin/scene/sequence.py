@@ -324,9 +324,22 @@ def render_sequence(
         "robot": episode.robot,
         "frames": len(stamps),
         "frames_without_pose": len(episode.unposed),
-        "notes": list(episode.tracks.notes),
+        "notes": [*episode.tracks.notes, *_strangers(episode.tracks, parts)],
         **({} if comparison is None else {"agreement": comparison.agreement.record()}),
     }
+
+
+def _strangers(tracks: ObjectTracks, parts: MovableScene) -> list[str]:
+    """What the scan had and the episode does not know, and the other way round."""
+    known = {*tracks.spans, *tracks.paths}
+    if not known:
+        return []
+    scanned = [name for name in parts.objects if name not in known]
+    new = [name for name in sorted(known) if name not in parts.objects]
+    return [
+        *(f"{name} is not of the episode's task: drawn where it was scanned" for name in scanned),
+        *(f"{name} was not scanned: the scene cannot draw it" for name in new),
+    ]
 
 
 def _check(config: RenderConfig) -> None:
@@ -411,8 +424,8 @@ class _Comparison:
             artist.camera, frame.T_base_camera, robot, self.meshes, frame.Ts_base_object
         )
         self.agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
-        apart = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
-        return np.concatenate([recorded_u8, drawn.image_u8, apart.astype(np.uint8)], axis=1)
+        difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
+        return np.concatenate([recorded_u8, drawn.image_u8, difference.astype(np.uint8)], axis=1)
 
 
 def _rate_of(episode: EpisodeInScene, camera_id: str, config: RenderConfig) -> float:

@@ -5,7 +5,7 @@ starts from depth leaves black holes there. Each pixel of a training view in whi
 shows nothing asks along its ray: which distance looks alike in the other views (a plane sweep,
 Collins 1996), contradicts none of their measurements, and goes on where the surface beside it ends?
 Where no other view helps, the surface beside it decides. No depth loss ever applies to these
-Gaussians. They are kept apart from measured ones, so that renders can say what was seen.
+Gaussians. They are kept separate from measured ones, so that renders can say what was seen.
 """
 
 from collections.abc import Sequence
@@ -40,6 +40,8 @@ MOST_APART = 0.2
 """Colours that differ by more are simply different."""
 BLOCK_PX = 5
 """Pixels of a hole that are this near have about the same distance."""
+RETRIES, FARTHER = 8, 1.1
+"""What stands before another view's measurement is moved away this often, by this factor."""
 SMOOTH = 0.03
 """Weight of leaving the surface beside a hole, by the logarithm of the distance, beside colour."""
 SPACING_PX = 1.6
@@ -120,7 +122,11 @@ def _closed(
     camera, T = hole.target.camera, hole.view.T_base_color
     p_camera = camera.unproject(depth_m.astype(np.float64))[chosen]
     colors = np.moveaxis(hole.target.image(), 0, -1)[chosen]
-    _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
+    for _ in range(RETRIES):
+        _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
+        if allowed.all():
+            break
+        p_camera[~allowed] *= FARTHER
     p_camera, colors = p_camera[allowed], colors[allowed]
     towards = -p_camera / np.maximum(np.linalg.norm(p_camera, axis=1, keepdims=True), 1e-9)
     sizes = SPACING_PX * step * p_camera[:, 2] / camera.fx
@@ -129,12 +135,12 @@ def _closed(
 
 def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[TrainingView]:
     """Views that look the same way from somewhere else, nearest first."""
-    apart_m = np.array(
+    baseline_m = np.array(
         [np.linalg.norm(v.T_base_color[:3, 3] - view.T_base_color[:3, 3]) for v in views]
     )
     along = np.array([v.T_base_color[:3, 2] @ view.T_base_color[:3, 2] for v in views])
-    usable = np.flatnonzero((apart_m > BASELINE_M) & (along > 0.5))
-    return [views[i] for i in usable[np.argsort(apart_m[usable])][:MOST_REFERENCES].tolist()]
+    usable = np.flatnonzero((baseline_m > BASELINE_M) & (along > 0.5))
+    return [views[i] for i in usable[np.argsort(baseline_m[usable])][:MOST_REFERENCES].tolist()]
 
 
 def _swept(hole: _Hole, references: Sequence[TrainingView]) -> Float32[np.ndarray, "height width"]:
@@ -149,8 +155,8 @@ def _swept(hole: _Hole, references: Sequence[TrainingView]) -> Float32[np.ndarra
     allowed = np.empty((NUM_DEPTHS, len(rows)), dtype=bool)
     for index, depth in enumerate(depths):
         p = hole.view.T_base_color[:3, 3] + depth * rays
-        apart, allowed[index] = _disagreement(p, image, references)
-        cost[index] = _averaged(apart, hole.mask) + SMOOTH * np.abs(np.log(depth / beside))
+        difference, allowed[index] = _disagreement(p, image, references)
+        cost[index] = _averaged(difference, hole.mask) + SMOOTH * np.abs(np.log(depth / beside))
     cost[~allowed] = np.inf
     chosen = _least(cost, depths)
     found = np.zeros(hole.mask.shape, dtype=np.float32)
@@ -211,8 +217,8 @@ def _disagreement(
         ids = np.flatnonzero(inside)
         allowed[ids] &= ~(measured > z + slack)
         seen = target.static_mask[v, u] & ~((measured > 0) & (measured < z - slack))
-        apart = np.abs(target.planes_u8[:, v, u].T / 255.0 - colors[ids]).mean(axis=1)
-        total[ids[seen]] += np.minimum(apart[seen], MOST_APART)
+        difference = np.abs(target.planes_u8[:, v, u].T / 255.0 - colors[ids]).mean(axis=1)
+        total[ids[seen]] += np.minimum(difference[seen], MOST_APART)
         count[ids[seen]] += 1
     return np.where(count > 0, total / np.maximum(count, 1), MOST_APART / 2), allowed
 
