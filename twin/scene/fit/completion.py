@@ -122,6 +122,7 @@ def _closed(
     camera, T = hole.target.camera, hole.view.T_base_color
     p_camera = camera.unproject(depth_m.astype(np.float64))[chosen]
     colors = np.moveaxis(hole.target.image(), 0, -1)[chosen]
+    allowed = np.ones(len(p_camera), dtype=bool)
     for _ in range(RETRIES):
         _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
         if allowed.all():

@@ -454,6 +454,32 @@ def test_a_replay_drawn_later_looks_as_when_it_was_replayed(
         assert frame.max() > 200
 
 
+def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(
+    run: RunFolder, script: SimpleNamespace, tmp_path: Path
+) -> None:
+    """The arm moves as recorded."""
+    scene = script.scene()
+    write_scene(run, scene, "cube", block())
+    write_recording(run, scene.urdf)
+    about = render_sequence(
+        run, RenderConfig(episode="trial_0001", camera="side", depth=True, out=tmp_path / "f")
+    )
+    assert about["frames"] == 3
+    assert "cube was not localised: not drawn" in about["notes"]
+    images = [decode_color((tmp_path / "f" / f"{t}.png").read_bytes()) for t in STAMPS_MS]
+    tools = [middle_of(image / 255.0, BLUE) for image in images]
+    assert np.isnan([middle_of(image / 255.0, RED) for image in images]).all()
+    robot = load_robot(scene.urdf)
+    for tool, share in zip(tools, (0.0, 0.5, 1.0), strict=True):
+        p_m = robot.T_base_link("tool0", HOME + share * (AWAY - HOME))[:3, 3]
+        np.testing.assert_allclose(tool, seen_at(T_BASE_SIDE, p_m), atol=1.0)
+    for ending in ("depth", "seen"):
+        assert (tmp_path / "f" / f"{STAMPS_MS[0]}_{ending}.png").is_file()
+
+
+STAMPS_MS = ("0000000", "0001000", "0002000")
+
+
 def place(name: str, T: np.ndarray) -> str:
     q, p = se3.split(T)
     return f"{name}=" + ",".join(repr(float(value)) for value in [*p, *q])
