@@ -7,15 +7,27 @@ import numpy as np
 from measure import ROOT, Target, cpu_seconds, report_targets
 
 from bridge.geometry.camera import Camera
+from bridge.robots.default import ROBOT
+from twin.robot.posture import Posture
 from twin.scene.frames.rgbd import Target as Seen
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, morton_order
+from twin.scene.movable_scene import MovableScene
+from twin.scene.objects.decompose import ObjectSplats
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, available_isas
+from twin.scene.sequence import Artist, Frame
+from twin.scene.store.folder import Scene
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
 COUNTS = (50_000, 200_000)
 SMALL_COUNT = 2_000
 NUMBA_FACTOR, TORCH_FACTOR, THREADS_FACTOR = 8.0, 100.0, 1.8
+FRAME_MS = 200.0
+"""CPU time that a frame of a whole episode may take."""
+LINKS = (
+    *("shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link"),
+    *("wrist_3_link", "base_link", "tool0"),
+)
 RATES = {
     "means_m": 1e-4,
     "quats_wxyz": 1e-3,
@@ -169,6 +181,37 @@ def with_threads(count: int, repeats: int) -> tuple[Target, dict[str, dict[str, 
     return target, {"1": stages_one, "2": stages_two}
 
 
+def of_a_sequence(repeats: int) -> Target:
+    """A frame of ``render --episode``: background, two objects and eight links, put together."""
+    links = {name: surface_cloud(SMALL, 1500) for name in LINKS}
+    thing = ObjectSplats(cloud=surface_cloud(SMALL, 1500), T_base_object=np.eye(4))
+    background = surface_cloud(VGA, COUNTS[0])
+    parts = MovableScene(
+        background=background,
+        objects={"first": thing, "second": thing},
+        links=links,
+        T_root_base=np.eye(4),
+    )
+    artist = Artist(
+        rasteriser=Rasteriser(RasterConfig(threads=1)),
+        parts=parts,
+        urdf=ROBOT.urdf_text(),
+        camera=VGA,
+        scene=Scene(record={"background": {"num_completed": 3000}}, background=background),
+    )
+    posture = Posture(joints_rad=np.full(len(ROBOT.joints), 0.4), width_m=0.04)
+    frame = Frame(
+        stamp_ns=0, T_base_camera=np.eye(4), Ts_base_object={"first": np.eye(4)}, posture=posture
+    )
+    seconds = statistics.median(cpu_seconds(lambda: artist.draw(frame), repeats=repeats))
+    return Target(
+        what="a frame of a sequence, 65k Gaussians with their seen mask",
+        measured=seconds * 1e3,
+        limit=FRAME_MS,
+        unit="ms",
+    )
+
+
 def main() -> None:
     """Measure; ``quick`` as the first argument takes fewer repeats."""
     quick = "quick" in sys.argv[1:]
@@ -177,6 +220,7 @@ def main() -> None:
     target, stages = with_threads(COUNTS[0], repeats)
     targets.append(target)
     targets.append(against_torch(repeats))
+    targets.append(of_a_sequence(repeats))
     note = "640 x 480 unless said, forward and backward, CPU time of one thread unless said wall"
     report_targets("splat_rasteriser", targets, note=note, stages_s=stages)
 

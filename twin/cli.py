@@ -164,9 +164,10 @@ def render(
     config: RenderConfig = RENDER,
     output: Output = OUTPUT,
 ) -> int:
-    """Draw the rebuilt scene to a PNG: any camera, any posture of the robot, any object pose.
+    """Draw the rebuilt scene: one image in any state, or a whole trial or replay as a video.
 
     Example: robot-gst render runs/monday --camera wrist --at-s 3 --object cube=0.5,-0.1,0.02
+    Example: robot-gst render runs/monday --episode trial_0001 --camera side --out trial.mp4
 
     Args:
         run: Run folder.
@@ -177,6 +178,16 @@ def render(
     from twin.scene.render import describe_drawn
     from twin.scene.render import render as render_scene
 
+    if config.is_sequence:
+        from twin.replay.rebuilt_scene import correction_of
+        from twin.scene.sequence import describe_sequence, render_sequence
+        from twin.scene.store.calibration import read_calibration
+
+        run_folder = RunFolder.open(run)
+        correction = correction_of(read_calibration(run_folder))
+        sequence = render_sequence(run_folder, config, correction.as_seen)
+        output.result(sequence, describe_sequence(sequence))
+        return 0
     drawn = render_scene(RunFolder.open(run), config)
     output.result(drawn, describe_drawn(drawn))
     return 0

@@ -9,7 +9,7 @@ Cameras that were calibrated are where the calibration has them, the others wher
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -26,15 +26,15 @@ from twin.replay.dynamics import soft_models
 from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
+from twin.robot.posture import Posture
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
-from twin.scene.objects.decompose import read_objects, read_pose
+from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import carried_camera
-from twin.scene.robot.splats import posed, read_links
 from twin.scene.skinning import Binding, bind, pose_cloud
 from twin.scene.store.calibration import MountedCamera, read_calibration, without_joints
-from twin.scene.store.folder import SCENE_FILE, read_scene
+from twin.scene.store.folder import read_scene
 
 RATE_HZ = 5.0
 """Of the images of a plan that was never executed."""
@@ -46,36 +46,26 @@ MAX_IMAGES = 300
 class _Stage:
     """Everything that can be drawn, ready to be moved."""
 
-    static: GaussianCloud
-    objects: Mapping[str, GaussianCloud]
-    """Those that can move, in their own frames."""
+    parts: MovableScene
+    """Its objects are those that can move; all others belong to its background."""
     bindings: Mapping[str, Binding]
     """Of soft ones: which nodes carry which Gaussians."""
-    links: Mapping[str, GaussianCloud]
-    T_root_base: Float[np.ndarray, "4 4"]
     correction: Correction
 
     def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
         """The scene at one of the replay's states."""
-        parts = [self.static]
-        for name, cloud in self.objects.items():
+        places, bent = {}, {}
+        for name, item in self.parts.objects.items():
             Ts = result.Ts_base_object.get(name)
             T = scene.Ts_base_object[name] if Ts is None else Ts[index]
             nodes = result.nodes_m.get(name)
             if nodes is not None and name in self.bindings:
                 seen = self.correction.nodes_as_seen(nodes[index], T)
-                parts.append(pose_cloud(cloud, self.bindings[name], seen))
+                bent[name] = pose_cloud(item.cloud, self.bindings[name], seen)
             else:
-                parts.append(moved_cloud(cloud, self.correction.as_seen(T)))
-        if self.links:
-            robot = posed(
-                self.links,
-                result.joints_rad[index],
-                scene.urdf,
-                width_m=float(result.width_m[index]),
-            )
-            parts.append(moved_cloud(robot, self.T_root_base))
-        return concatenate(parts)
+                places[name] = self.correction.as_seen(T)
+        posture = Posture(joints_rad=result.joints_rad[index], width_m=float(result.width_m[index]))
+        return self.parts.at(places, posture, scene.urdf, bent)
 
 
 def render_replay(
@@ -164,7 +154,8 @@ def _set_up(
     run: RunFolder, scene: ReplayScene, result: ReplayResult, correction: Correction
 ) -> _Stage:
     rebuilt = read_scene(run)
-    objects = read_objects(run, rebuilt.record)
+    parts = read_movable_scene(run, rebuilt)
+    objects = parts.objects
     places = {name: correction.as_seen(T) for name, T in scene.containers().items()}
     # What the task does not know stands where it was scanned; what it knows and nobody found is
     # absent here too.
@@ -172,20 +163,17 @@ def _set_up(
         name: item.T_base_object for name, item in objects.items() if name not in scene.task.objects
     }
     static = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
-    movable = {name: item.cloud for name, item in objects.items() if name in scene.movable()}
+    movable = {name: item for name, item in objects.items() if name in scene.movable()}
     soft = {name: body for name, body in soft_models(scene).items() if name in movable}
-    root = rebuilt.record.get("robot", {}).get("T_base_root")
-    T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return _Stage(
-        static=concatenate([rebuilt.background, *static]),
-        objects=movable,
+        parts=replace(
+            parts, background=concatenate([rebuilt.background, *static]), objects=movable
+        ),
         bindings={
-            name: bind(movable[name].means_m, body.nodes_m)
+            name: bind(movable[name].cloud.means_m, body.nodes_m)
             for name, body in soft.items()
-            if name in result.nodes_m and len(movable[name])
+            if name in result.nodes_m and len(movable[name].cloud)
         },
-        links=read_links(run, rebuilt.record),
-        T_root_base=se3.invert(T_base_root),
         correction=correction,
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, Int, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -20,14 +20,13 @@ from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
-from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
-from twin.scene.objects.decompose import compose_parts, read_objects, read_pose
-from twin.scene.raster.backend import open_rasteriser
-from twin.scene.raster.rasteriser import RasterConfig
-from twin.scene.robot.splats import posed, read_links
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.movable_scene import read_movable_scene
+from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
-from twin.scene.store.folder import SCENE_FILE, Scene, read_scene
+from twin.scene.store.folder import Scene, read_scene
 
 PROBES = 9
 """Instants of an episode at which a camera's place in the hand is looked at."""
@@ -65,30 +64,29 @@ def compose(
             robot that the scene does not have.
         RobotDescriptionError: The episode does not describe the robot.
     """
-    objects = read_objects(run, scene.record)
-    places = object_places(config.object, list(objects))
-    cloud = compose_parts(scene.background, objects, places)
-    links = read_links(run, scene.record)
-    if not links:
-        remark = scene.record.get("robot", {}).get("remark")
-        reason = "the scene has no robot splats" + (f" ({remark})" if remark else "")
+    parts = read_movable_scene(run, scene)
+    places = object_places(config.object, list(parts.objects))
+    if not parts.links:
+        reason = why_no_robot(scene)
         if config.joints is not None:
             message = f"--joints cannot be followed: {reason}."
             raise UsageError(message)
-        return Composed(cloud=cloud, robot=f"not drawn: {reason}", posture=None)
+        return Composed(cloud=parts.at(places), robot=f"not drawn: {reason}", posture=None)
     try:
         urdf, posture = _posture(episode, stamp_ns, config)
     except GstError as error:
         if config.joints is not None:
             raise
-        return Composed(cloud=cloud, robot=f"not drawn: {error}", posture=None)
-    robot = posed(links, posture.joints_rad, urdf, width_m=posture.width_m)
-    root = scene.record["robot"].get("T_base_root")
-    if root is not None:
-        T_base_root = read_pose(root, run.scene_dir / SCENE_FILE)
-        robot = moved_cloud(robot, se3.invert(T_base_root))
+        return Composed(cloud=parts.at(places), robot=f"not drawn: {error}", posture=None)
     source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
-    return Composed(cloud=concatenate([cloud, robot]), robot=f"joints {source}", posture=posture)
+    cloud = parts.at(places, posture, urdf)
+    return Composed(cloud=cloud, robot=f"joints {source}", posture=posture)
+
+
+def why_no_robot(scene: Scene) -> str:
+    """Why a scene without Gaussians of the robot has none."""
+    remark = scene.record.get("robot", {}).get("remark")
+    return "the scene has no robot splats" + (f" ({remark})" if remark else "")
 
 
 def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
@@ -223,11 +221,11 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
-    episode = _episode(run, scene, config.episode)
-    camera_id = _camera_id(episode, config.camera)
+    episode = episode_of(run, scene, config.episode)
+    camera_id = camera_of(episode, config.camera)
     first_ns = streams.first_stamp_ns(episode)
     began_ns = episode.start_ns if first_ns is None else first_ns
-    stamp_ns = began_ns + round(config.at_s * 1e9)
+    stamp_ns = began_ns + round((config.at_s or 0.0) * 1e9)
     composed = compose(run, scene, episode, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
@@ -237,8 +235,11 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     written = [str(path)]
     if config.depth:
         depth_path = path.with_name(f"{path.stem}_depth{path.suffix}")
-        depth_path.write_bytes(encode_png(_millimetres(view.depth_m)))
-        written.append(str(depth_path))
+        depth_path.write_bytes(encode_png(depth_image(view.depth_m)))
+        seen_path = path.with_name(f"{path.stem}_seen{path.suffix}")
+        seen = seen_mask(rasteriser, view.alpha, scene, len(composed.cloud))
+        seen_path.write_bytes(encode_png(np.where(seen, np.uint8(255), np.uint8(0))))
+        written += [str(depth_path), str(seen_path)]
     return {
         "files": written,
         "scene_hash": scene.scene_hash,
@@ -249,13 +250,50 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     }
 
 
-def _millimetres(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:
+SEEN = 0.5
+"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan."""
+
+
+def seen_mask(
+    rasteriser: Rasteriser | CudaRasteriser,
+    alpha: Float32[np.ndarray, "height width"],
+    scene: Scene,
+    num_splats: int,
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels of the image drawn last that show what was measured, and not what was completed.
+
+    Args:
+        rasteriser: Drew a cloud that begins with the scene's background.
+        alpha: Of that image.
+        scene: Its record says how many of the background's last Gaussians nobody measured.
+        num_splats: Gaussians of that cloud.
+    """
+    num_completed = int(scene.record["background"].get("num_completed", 0))
+    if num_completed == 0:
+        return np.asarray(alpha >= SEEN)
+    measured = np.ones((num_splats, 1), dtype=np.float32)
+    last = len(scene.background)
+    measured[last - num_completed : last] = 0.0
+    return np.asarray(rasteriser.draw_features(measured)[0] >= SEEN)
+
+
+def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:
     """Whole millimetres; what is farther away than they can say is as far as they can."""
     largest = np.iinfo(np.uint16).max
     return np.clip(np.rint(depth_m * 1e3), 0, largest).astype(np.uint16)
 
 
-def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
+def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
+    """Open a recorded episode of a run by its id.
+
+    Args:
+        run: Whose episodes are looked through.
+        scene: Whose first episode is taken where none is wanted.
+        wanted: The id, or nothing.
+
+    Raises:
+        UsageError: There is none; lists those that exist.
+    """
     name = wanted or scene.record["sources"][0]["id"]
     episodes: dict[str, Episode] = {}
     for path in run.episodes():
@@ -272,7 +310,16 @@ def _episode(run: RunFolder, scene: Scene, wanted: str) -> Episode:
     return episodes[name]
 
 
-def _camera_id(episode: Episode, wanted: str) -> str:
+def camera_of(episode: Episode, wanted: str) -> str:
+    """The camera of an episode that is wanted, or the first.
+
+    Args:
+        episode: Its cameras are looked through.
+        wanted: The id, or nothing.
+
+    Raises:
+        UsageError: There is none; lists those that exist.
+    """
     ids = streams.camera_ids(episode)
     if not ids or (wanted and wanted not in ids):
         found = ", ".join(ids) or "none"
@@ -290,41 +337,110 @@ def _view_of(
     config: RenderConfig,
 ) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     info = streams.camera_info(episode, camera_id)
-    if (config.eye is None) != (config.target is None):
+    camera = sized_camera(info.camera, config.size)
+    T_chosen = chosen_view(config)
+    if T_chosen is not None:
+        return camera, T_chosen
+    tree = poses_in_scene(run, scene, episode, camera_id, np.array([stamp_ns]))
+    root = tree.root_of(info.frame_id)
+    if config.joints is not None and root == streams.recorded_robot(episode).base_frame:
+        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints), tree)
+        if T_base_camera is not None:
+            return camera, T_base_camera
+    if unknown_mask(tree, [info.frame_id], np.array([stamp_ns]))[0]:
+        at_s = config.at_s or 0.0
+        message = (
+            f"nobody recorded where {name_of(episode, camera_id)} was at --at-s {at_s:g}: "
+            "choose another time, or say where to stand with --eye and --target."
+        )
+        raise UsageError(message)
+    return camera, tree.T_root_frame(info.frame_id, stamp_ns)
+
+
+def chosen_view(config: RenderConfig) -> Float[np.ndarray, "4 4"] | None:
+    """Where ``--eye`` and ``--target`` put a camera; None without them.
+
+    Raises:
+        UsageError: One without the other, or one straight above the other.
+    """
+    if config.eye is None and config.target is None:
+        return None
+    if config.eye is None or config.target is None:
         message = "--eye and --target belong together: where to stand, and what to look at."
         raise UsageError(message)
-    if config.eye is not None and config.target is not None:
-        eye, target = np.array(config.eye), np.array(config.target)
-        if np.linalg.norm(np.cross(target - eye, UP)) < 1e-6:
-            message = "--eye is straight above or below --target; move it a little sideways."
-            raise UsageError(message)
-        return info.camera, se3.look_at(eye, target, UP)
-    tree = _tree_of(run, scene, episode, camera_id, stamp_ns)
-    is_known = info.frame_id in tree.frames()
-    root = tree.root_of(info.frame_id) if is_known else None
+    eye, target = np.array(config.eye), np.array(config.target)
+    if np.linalg.norm(np.cross(target - eye, UP)) < 1e-6:
+        message = "--eye is straight above or below --target; move it a little sideways."
+        raise UsageError(message)
+    return se3.look_at(eye, target, UP)
+
+
+def sized_camera(camera: Camera, size: str) -> Camera:
+    """The same view as an image of another size: all of it is seen, more only beside it.
+
+    Args:
+        camera: As it was recorded.
+        size: ``WIDTHxHEIGHT``; empty: as recorded.
+
+    Raises:
+        UsageError: When the text is no size.
+    """
+    if not size:
+        return camera
+    words = size.lower().split("x")
+    if len(words) != 2 or not all(word.isdigit() and 16 <= int(word) <= 8192 for word in words):
+        message = f"--size {size!r} is no size: write WIDTHxHEIGHT, each 16 to 8192 pixels."
+        raise UsageError(message)
+    width, height = (int(word) for word in words)
+    factor = min(width / camera.width, height / camera.height)
+    return Camera(
+        width=width,
+        height=height,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=camera.cx * factor + (width - camera.width * factor) / 2,
+        cy=camera.cy * factor + (height - camera.height * factor) / 2,
+    )
+
+
+def poses_in_scene(
+    run: RunFolder,
+    scene: Scene,
+    episode: Episode,
+    camera_id: str,
+    stamps_ns: Int[np.ndarray, " num_stamps"],
+) -> TransformTree:
+    """Poses of a camera in the scene's frame, from where the scene has its own.
+
+    Args:
+        run: May have a calibration.
+        scene: Its record says in which frame it is, and where it has poses from.
+        episode: The recording.
+        camera_id: The camera, by its name in the topics.
+        stamps_ns: When they are asked for.
+
+    Raises:
+        UsageError: When nothing says where the camera was in that frame.
+    """
+    tree = _tree_of(run, scene, episode, camera_id, stamps_ns)
+    frame_id = streams.camera_info(episode, camera_id).frame_id
+    root = tree.root_of(frame_id) if frame_id in tree.frames() else None
     if root != scene.record.get("frame", root) or root is None:
         message = (
             f"nothing says where {name_of(episode, camera_id)} was in the scene's frame "
             f"{scene.record.get('frame')!r}: say where to stand with --eye and --target."
         )
         raise UsageError(message)
-    if config.joints is not None and root == streams.recorded_robot(episode).base_frame:
-        T_base_camera = carried_camera(episode, info.frame_id, np.array(config.joints), tree)
-        if T_base_camera is not None:
-            return info.camera, T_base_camera
-    if unknown_mask(tree, [info.frame_id], np.array([stamp_ns]))[0]:
-        message = (
-            f"nobody recorded where {name_of(episode, camera_id)} was at --at-s {config.at_s:g}: "
-            "choose another time, or say where to stand with --eye and --target."
-        )
-        raise UsageError(message)
-    return info.camera, tree.T_root_frame(info.frame_id, stamp_ns)
+    return tree
 
 
 def _tree_of(
-    run: RunFolder, scene: Scene, episode: Episode, camera_id: str, stamp_ns: int
+    run: RunFolder,
+    scene: Scene,
+    episode: Episode,
+    camera_id: str,
+    stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
-    """Poses of a camera, from where the scene has its own."""
     known = scene.record.get("cameras", [])
     if not any((item["id"], item["poses_from"]) == (camera_id, "hand-eye") for item in known):
         return base_tree(episode)
@@ -332,4 +448,4 @@ def _tree_of(
     place = None if calibration is None else calibration.cameras.get(camera_id)
     if place is None:
         return base_tree(episode)
-    return calibrated_tree_at(episode, camera_id, place, np.array([stamp_ns]))
+    return calibrated_tree_at(episode, camera_id, place, stamps_ns)

@@ -116,6 +116,9 @@ class InitialiseConfig:
     """Standard deviation along the normal, as a fraction of the one in the plane."""
     opacity: float = 0.95
     """Opacity of a new Gaussian."""
+    completion: float = 0.1
+    """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
+    0: such holes stay black."""
     flying_fraction: float = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
@@ -127,6 +130,7 @@ class InitialiseConfig:
             {
                 "footprint_factor": (0.1, 100.0),
                 "flatness": (1e-3, 1.0),
+                "completion": (0.0, 1.0),
                 "flying_fraction": (1e-3, 10.0),
             },
         )
@@ -269,9 +273,17 @@ class RenderConfig:
     """Take camera and pose from this recorded episode; empty: the first of the scene."""
     camera: str = ""
     """Camera id; empty: the episode's first."""
-    at_s: float = 0.0
+    at_s: float | None = None
     """Seconds after the episode's first sample, by the stamps of its source as on the dashboard;
-    when messages arrived does not count."""
+    when messages arrived does not count. Without it an --episode is drawn from its start to its
+    end, and one image is drawn at 0 s."""
+    rate_hz: float | None = None
+    """Frames per second of a whole episode; default: one for each image its camera recorded."""
+    size: str = ""
+    """WIDTHxHEIGHT of the images in pixels; default: as recorded."""
+    compare: bool = False
+    """Of a whole episode: show recorded image, twin and their difference side by side, and measure
+    how much they agree."""
     eye: tuple[float, float, float] | None = None
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
@@ -285,16 +297,28 @@ class RenderConfig:
     """Put an object elsewhere: ID=x,y,z or ID=x,y,z,qw,qx,qy,qz in the scene's frame; once for
     each object."""
     depth: bool = False
-    """Write a second image with the depth, in millimetres."""
+    """Write two more images: the depth in millimetres, and, white, what was measured in the scan;
+    black is what was completed or never seen."""
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
-    """File to write; default: RUN/results/render.png."""
+    """File to write; default: RUN/results/render.png. A whole episode: an .mp4 file, or a folder
+    for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        refuse_outside(
+            self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0), "rate_hz": (0.01, 240.0)}
+        )
         for name, place in (("eye", self.eye), ("target", self.target)):
             if place is not None and not all(math.isfinite(value) for value in place):
                 message = f"--{name} {place} is no place: three numbers in metres."
                 raise UsageError(message)
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether a whole episode is drawn, and not one image."""
+        if self.out is not None and self.out.suffix.lower() == ".png":
+            return False
+        one = self.at_s is not None or self.joints is not None
+        return not one and bool(self.episode)

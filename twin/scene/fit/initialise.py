@@ -56,7 +56,7 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
         _average([getattr(item, name) for item in points], inverse, kept, count)
         for name in ("p_m", "normals", "colors")
     )
-    cloud = _flat_gaussians(means, normals, colors, sizes[kept], config)
+    cloud = flat_gaussians(means, normals, colors, sizes[kept], config)
     return cloud.take(morton_order(cloud.means_m))
 
 
@@ -117,13 +117,22 @@ def _average(
     return means
 
 
-def _flat_gaussians(
+def flat_gaussians(
     means: np.ndarray,
     normals: np.ndarray,
     colors: np.ndarray,
     sizes: np.ndarray,
     config: InitialiseConfig,
 ) -> GaussianCloud:
+    """Gaussians as wide as what they stand for, flat along their normals.
+
+    Args:
+        means: Where they are [m].
+        normals: Along which they are flat; any length.
+        colors: sRGB, 0..1.
+        sizes: Edge of the square or voxel each stands for [m].
+        config: How flat and how opaque.
+    """
     sigma = IN_PLANE_SIGMA * sizes
     scales = np.stack([sigma, sigma, config.flatness * sigma], axis=1)
     logit = np.log(config.opacity / (1 - config.opacity))

@@ -471,23 +471,3 @@ def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
         return se3.pose_from_record(pose)
     except InvalidRecordError as error:
         raise UnreadableSceneError(path=path, found=f"a pose that is none: {pose}") from error
-
-
-def compose_parts(
-    background: GaussianCloud,
-    objects: Mapping[str, ObjectSplats],
-    Ts_base_object: Mapping[str, np.ndarray] | None = None,
-) -> GaussianCloud:
-    """Place every object in the background: where it was scanned, or where the mapping says.
-
-    Args:
-        background: In the base frame.
-        objects: By name, each in its own frame.
-        Ts_base_object: Other places for some of them; None: all stay where they were scanned.
-    """
-    places = {} if Ts_base_object is None else Ts_base_object
-    placed = [
-        moved_cloud(item.cloud, places.get(key, item.T_base_object))
-        for key, item in objects.items()
-    ]
-    return concatenate([background, *placed])

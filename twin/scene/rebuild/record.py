@@ -55,6 +55,7 @@ def make_record(
     fitted: FitResult,
     views: Mapping[str, Any],
     num_background: int,
+    num_completed: int,
     cost: Cost,
 ) -> dict[str, Any]:
     """Put together the content of ``scene.json``.
@@ -69,6 +70,7 @@ def make_record(
         fitted: The cloud, and what fitting it took.
         views: Numbers of the held-out views.
         num_background: Gaussians that belong to no object.
+        num_completed: The last of them, which stand for what nobody measured.
         cost: Of the whole rebuild.
     """
     settings = asdict(config)
@@ -89,7 +91,11 @@ def make_record(
         "cameras": [camera_record(choice) for choice in training.choices],
         "scan": scan | {"remarks": [*left_out, *scan["remarks"]]},
         "settings": settings,
-        "background": {"file": BACKGROUND, "num_splats": num_background},
+        "background": {
+            "file": BACKGROUND,
+            "num_splats": num_background,
+            "num_completed": num_completed,
+        },
         "fit": {
             "num_splats": len(fitted.cloud),
             "iterations": fitted.iterations,

@@ -6,7 +6,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from twin.scene.dataset.training_set import (
     read_training_set,
     with_fitted_poses,
 )
+from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
@@ -53,7 +54,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 20
+METHOD_VERSION = 21
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -120,6 +121,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     fitted = _fit(training, config, kept, output)
     clock.end("initialise_and_fit")
     training = with_fitted_poses(training, fitted.Ts_base_color)
+    raster = RasterConfig(threads=config.fit.threads)
+    completed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
+    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
+    clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
     decomposed = decompose(
@@ -127,10 +132,12 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     )
     if decomposed.remark:
         output.say(decomposed.remark)
+    decomposed = replace(decomposed, background=concatenate([decomposed.background, completed]))
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("take_apart")
-    views = _hold_out(run, training, fitted, decomposed, links, config, clock, output)
+    drawn = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
+    views = _hold_out(run, training, drawn, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     output.say("write objects, robot links and the distances to what is static")
     extras = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
@@ -143,6 +150,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
+        num_completed=len(completed),
     )
     clock.end("objects_and_semantics")
     record = make_record(
@@ -155,6 +163,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         fitted=fitted,
         views=views,
         num_background=len(decomposed.background),
+        num_completed=len(completed),
         cost=clock.cost(),
     )
     record |= extras

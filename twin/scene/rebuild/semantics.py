@@ -1,11 +1,12 @@
 """Semantics as a stage of ``rebuild``: ask the models, find what is what, write it down."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
@@ -43,6 +44,7 @@ def add_semantics(
     features: SceneFeatures | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    num_completed: int = 0,
     threads: int = 0,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, Any]:
@@ -61,6 +63,8 @@ def add_semantics(
         robot_m: Points on the robot where it stood, to leave it out.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
+        num_completed: The background's last Gaussians, which nobody measured: they are guessed
+            surfaces, and without masks no thing is looked for in them.
         threads: For drawing; 0: all cores.
         advance: Told the percentage done.
 
@@ -77,15 +81,18 @@ def add_semantics(
             step = -(-len(viewpoints) // MAX_VIEWPOINTS) or 1
             sizes = list(rows.values())
             known = {key: np.repeat([name == key for name in rows], sizes) for key in objects}
+            measured = np.ones(len(cloud), dtype=bool)
+            measured[len(background) - num_completed : len(background)] = False
             scene = scene_by_default(
-                cloud,
+                cloud.take(measured),
                 viewpoints[::step],
                 rasteriser,
                 robot_m=robot_m,
-                known=known,
+                known={key: mask[measured] for key, mask in known.items()},
                 surfaces_m=surfaces_m,
                 advance=advance,
             )
+            scene = _among_all(scene, measured)
     except SemanticsError as error:
         nothing = np.zeros(len(cloud), dtype=np.uint16)
         source = masks[0][1].source if masks else SOURCE
@@ -104,6 +111,25 @@ def add_semantics(
             "explained_fraction": round(features.basis.explained_fraction, 4),
         }
     return record
+
+
+def _among_all(scene: SemanticScene, measured: Bool[np.ndarray, " num_splats"]) -> SemanticScene:
+    """The same things among all Gaussians; only the measured ones were looked at."""
+
+    def spread_out(values: np.ndarray) -> np.ndarray:
+        spread_values = np.zeros(len(measured), dtype=values.dtype)
+        spread_values[measured] = values
+        return spread_values
+
+    things = tuple(
+        replace(
+            item,
+            mask=spread_out(item.mask),
+            parts={name: spread_out(mask) for name, mask in item.parts.items()},
+        )
+        for item in scene.instances
+    )
+    return replace(scene, instances=things, labels=spread_out(scene.labels))
 
 
 def ask_models_about(
@@ -169,6 +195,7 @@ def write_scene_semantics(
     models: ModelConfig | None = None,
     choices: Sequence[FrameChoice] = (),
     task: Task | None = None,
+    num_completed: int = 0,
 ) -> dict[str, Any]:
     """Say what is what in a decomposed scene.
 
@@ -181,6 +208,7 @@ def write_scene_semantics(
         models: Large models to ask beside the default segmenter; None: none.
         choices: Training frames that these look at.
         task: Names what they look for.
+        num_completed: The background's last Gaussians, which nobody measured.
 
     Returns:
         ``{"semantics": ...}`` for ``scene.json``.
@@ -203,6 +231,7 @@ def write_scene_semantics(
             masks=found.masks,
             features=found.features,
             surfaces_m=decomposed.surfaces_m(),
+            num_completed=num_completed,
             threads=threads,
             advance=advance,
         )

@@ -21,13 +21,14 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
-from twin.robot.surface import PosedSurface, link_poses, link_surfaces
+from twin.robot.surface import LinkSurface, PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
+from twin.scene.robot.link_surface import on_surface, surface_area_m2
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
 
@@ -160,12 +161,24 @@ class RobotFrames:
         return owner
 
     def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
-        """Fuse what was collected of each link, in the link's frame."""
+        """Gaussians of each link that was seen, in the link's frame.
+
+        They lie on the shapes of the description where these fit what was measured; else what was
+        measured is fused.
+        """
         total = sum(len(item.p_m) for sets in self._points.values() for item in sets)
         clouds = {}
+        shapes = self._shapes()
+        area_m2 = sum(surface_area_m2(shapes.get(link, [])) for link in self._points)
+        spacing_m = float(np.sqrt(area_m2 / (ROBOT_SHARE * config.max_splats)))
         for link, sets in sorted(self._points.items()):
             count = sum(len(item.p_m) for item in sets)
             if count < MIN_POINTS:
+                continue
+            own = shapes.get(link)
+            cloud = None if own is None else on_surface(own, sets, spacing_m, config)
+            if cloud is not None:
+                clouds[link] = cloud
                 continue
             budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
             try:
@@ -173,6 +186,16 @@ class RobotFrames:
             except NoSurfaceError:
                 continue
         return clouds
+
+    def _shapes(self) -> dict[str, list[LinkSurface]]:
+        """Shapes of the links by name, where all episodes have one description."""
+        robots = {tracked.robot for tracked in self._tracked.values()}
+        if len(robots) != 1:
+            return {}
+        shapes: dict[str, list[LinkSurface]] = {}
+        for item in link_surfaces(next(iter(robots))):
+            shapes.setdefault(item.link, []).append(item)
+        return shapes
 
     def joined(
         self,

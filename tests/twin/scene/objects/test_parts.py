@@ -10,7 +10,8 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.decompose import compose_parts, read_objects, split_objects, write_objects
+from twin.scene.movable_scene import MovableScene
+from twin.scene.objects.decompose import read_objects, split_objects, write_objects
 
 
 def cube_on_table(T_base_cube: np.ndarray) -> GaussianCloud:
@@ -69,11 +70,12 @@ def test_putting_together_gives_every_gaussian_back(
 ) -> None:
     run, record, background, _ = written
     objects = read_objects(run, record)
-    whole = compose_parts(background, objects)
+    scene = MovableScene(background=background, objects=objects, links={}, T_root_base=np.eye(4))
+    whole = scene.at({})
     assert len(whole) == len(background) + len(objects["cube"].cloud)
     moved_to = np.eye(4)
     moved_to[:3, 3] = [0.3, 0.3, 0.02]
-    moved = compose_parts(background, objects, {"cube": moved_to})
+    moved = scene.at({"cube": moved_to})
     centre = moved.means_m[len(background) :].mean(axis=0)
     np.testing.assert_allclose(centre, [0.3, 0.3, 0.02], atol=2e-3)
 

@@ -19,9 +19,9 @@ from twin.scene.gaussians import (
     read_ply,
 )
 from twin.scene.localise.result import LocalisedObject
+from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import (
     SplitConfig,
-    compose_parts,
     fill_footprint,
     shape_mesh,
     split_objects,
@@ -109,7 +109,10 @@ def test_objects_come_in_their_own_frame_and_compose_back(
     parts = split_objects(cloud, localised(**POSES), TASK)
     half = np.array(TASK.objects["cube"].size_m) / 2
     assert np.all(np.abs(parts.objects["cube"].cloud.means_m) < half + 0.002)
-    again = compose_parts(parts.background, parts.objects)
+    whole = MovableScene(
+        background=parts.background, objects=parts.objects, links={}, T_root_base=np.eye(4)
+    )
+    again = whole.at({})
     for rows in (cloud.means_m, again.means_m):
         assert rows.shape == (len(cloud), 3)
     ours = again.means_m[np.lexsort(again.means_m.round(4).T)]

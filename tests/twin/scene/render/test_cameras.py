@@ -72,4 +72,4 @@ def test_an_episode_that_cannot_be_read_does_not_stop_the_others(
 
 def test_depth_beyond_what_a_depth_image_can_say_is_not_wrapped_around() -> None:
     depth = np.array([[0.0, 1.2344, 65.6, 1e4]], dtype=np.float32)
-    assert render_module._millimetres(depth).tolist() == [[0, 1234, 65535, 65535]]
+    assert render_module.depth_image(depth).tolist() == [[0, 1234, 65535, 65535]]

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from table_scene import World, make_world, table
 
+from bridge.geometry import se3
+from twin.scene.gaussians import concatenate, moved_cloud
 from twin.scene.rebuild.semantics import add_semantics
 from twin.scene.semantics.features import FeatureBasis, SceneFeatures
 from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.semantics.store import UnreadableSemanticsError, read_semantics
+
+T_ABOVE = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.02]))
 
 
 def added(folder: Path, world: World, **options: object) -> dict[str, object]:
@@ -62,6 +66,32 @@ def test_semantics_of_other_splats_are_refused(tabletop: World, tmp_path: Path) 
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(UnreadableSemanticsError, match="unreadable"):
         read_semantics(tmp_path, rows)
+
+
+def test_completed_gaussians_are_nothing_and_change_no_thing(
+    tabletop: World, tmp_path: Path
+) -> None:
+    """A second copy of what stands on the table, lifted beside it, would be things."""
+    is_cube = tabletop.true_instances() == 1
+    background = tabletop.cloud.take(~is_cube)
+    is_thing = tabletop.true_instances()[~is_cube] > 1
+    ghosts = moved_cloud(background.take(is_thing), T_ABOVE)
+    assert len(ghosts) > 100
+    labels = []
+    for name, more, count in (("plain", [], 0), ("ghosts", [ghosts], len(ghosts))):
+        folder = tmp_path / name
+        folder.mkdir()
+        whole = concatenate([background, *more])
+        cube = tabletop.cloud.take(is_cube)
+        viewpoints = [shot.viewpoint for shot in tabletop.train]
+        add_semantics(folder, whole, {"red_cube": cube}, viewpoints, num_completed=count, threads=1)
+        rows = {"background": len(whole), "red_cube": len(cube)}
+        labels.append(read_semantics(folder, rows).labels)
+    plain, ghostly = labels
+    first = len(background)
+    assert plain.any()
+    assert not ghostly[first : first + len(ghosts)].any()
+    np.testing.assert_array_equal(np.delete(ghostly, np.s_[first : first + len(ghosts)]), plain)
 
 
 def test_an_empty_table_is_a_remark_not_an_error(tmp_path: Path) -> None:

@@ -1,0 +1,128 @@
+"""Objects over a trial: standing until the fingers close on them, then with the tool."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from bridge.episode.streams import JointTrack
+from bridge.geometry import se3
+from bridge.robots.default import ROBOT
+from bridge.task.task_file import load_task
+from twin.robot.model import load_robot
+from twin.robot.posture import PostureTrack
+from twin.scene.object_tracks import ObjectTracks, carried_tracks
+
+S = 1_000_000_000
+HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
+TURN = np.array([0.6, 0.1, -0.1, 0.0, 0.0, 0.0])
+URDF = ROBOT.urdf_text()
+TASK = load_task("cube_into_box")
+STANDS = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 0.2, 0.0]))
+
+
+def posture_track(held_m: float = 0.04) -> PostureTrack:
+    """Ten seconds: closed from 3 s to 7 s, in which the arm turns."""
+    stamps = np.arange(0, 10 * S + 1, S // 20)
+    share = np.clip((stamps / S - 3.5) / 3.0, 0.0, 1.0)
+    t_s = stamps / S
+    width = np.interp(
+        t_s, [0, 2.9, 3.0, 7.0, 7.1, 10], [0.085, 0.085, held_m, held_m, 0.085, 0.085]
+    )
+    arm = JointTrack(names=ROBOT.joints, stamps_ns=stamps, position=HOME + share[:, None] * TURN)
+    widths = JointTrack(names=("gripper_width",), stamps_ns=stamps, position=width[:, None])
+    return PostureTrack(urdf=URDF, arm=arm, widths=widths)
+
+
+def T_tcp(t_s: float, track: PostureTrack) -> np.ndarray:
+    return load_robot(URDF).T_base_tcp(track.at(round(t_s * S)).joints_rad)
+
+
+def record(name: str, T: np.ndarray | None, plan_id: str | None = None) -> Mapping[str, object]:
+    pose = None if T is None else se3.pose_record(T)
+    return {"object": name, "found": T is not None, "T_base_object": pose, "plan_id": plan_id}
+
+
+def tracks(
+    before: np.ndarray | None, after: np.ndarray | None, track: PostureTrack | None = None
+) -> ObjectTracks:
+    track = posture_track() if track is None else track
+    boxes = [record("box", STANDS), record("box", STANDS, "plan_1")]
+    records = [record("cube", before), record("cube", after, "plan_1"), *boxes]
+    return carried_tracks(records, {"plan_1": (S, 9 * S)}, TASK, track)
+
+
+IN_HAND = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.005, -0.004, 0.01]))
+
+
+def test_what_the_fingers_close_on_goes_with_the_tool_and_stays_where_they_open() -> None:
+    track = posture_track()
+    before, after = T_tcp(3, track) @ IN_HAND, T_tcp(7, track) @ IN_HAND
+    found = tracks(before, after)
+    assert found.notes == ()
+    for t_s, expected in (
+        (0.0, before), (2.9, before), (4.3, T_tcp(4.3, track) @ IN_HAND),
+        (5.5, T_tcp(5.5, track) @ IN_HAND), (7.2, after), (20.0, after),
+    ):  # fmt: skip
+        poses = found.at(round(t_s * S), T_tcp(min(t_s, 10.0), track))
+        np.testing.assert_allclose(poses["cube"], expected, atol=1e-9, err_msg=str(t_s))
+        np.testing.assert_allclose(poses["box"], STANDS, atol=1e-12)
+
+
+def test_what_localisation_and_joints_disagree_about_is_spread_over_the_carry() -> None:
+    track = posture_track()
+    before, after = T_tcp(3, track) @ IN_HAND, T_tcp(7, track) @ IN_HAND
+    off = after.copy()
+    off[:3, 3] += [0.01, -0.02, 0.0]
+    found = tracks(before, off)
+    poses = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in np.arange(2.9, 7.2, 0.01)]
+    steps = np.linalg.norm(np.diff([T[:3, 3] for T in poses], axis=0), axis=1)
+    assert steps.max() < 0.005  # the tool itself moves by as much
+    np.testing.assert_allclose(poses[-1], off, atol=1e-9)
+    assert found.notes == ()
+
+
+def test_a_cube_that_looks_the_same_after_a_quarter_turn_does_not_spin_in_the_hand() -> None:
+    track = posture_track()
+    before, after = T_tcp(3, track) @ IN_HAND, T_tcp(7, track) @ IN_HAND
+    quarter = np.eye(4)
+    quarter[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, np.pi / 2]))
+    poses = tracks(before, after @ quarter).at(5 * S, T_tcp(5, track))
+    np.testing.assert_allclose(poses["cube"], T_tcp(5, track) @ IN_HAND, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("fell_m", "width_m", "before_s", "moved_s", "note"),
+    [
+        (0.2, 0.04, 6.9, 7.1, "cube lay 20 cm from where it was let go"),
+        (0.0, 0.0005, 8.9, 9.0, "without being held"),
+    ],
+)
+def test_a_fall_and_a_push_are_said_and_change_the_place_at_once(
+    fell_m: float, width_m: float, before_s: float, moved_s: float, note: str
+) -> None:
+    track = posture_track(width_m)
+    before, after = T_tcp(3, track) @ IN_HAND, T_tcp(7, track) @ IN_HAND
+    after[2, 3] -= fell_m
+    found = tracks(before, after, track)
+    assert note in found.notes[0]
+    was = T_tcp(before_s, track) @ IN_HAND if fell_m else before
+    at = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in (before_s, moved_s)]
+    np.testing.assert_allclose(at[0], was, atol=1e-9)
+    np.testing.assert_allclose(at[1], after, atol=1e-9)
+
+
+def test_an_object_far_from_the_fingers_is_not_carried() -> None:
+    track = posture_track()
+    before = T_tcp(3, track) @ IN_HAND
+    before[0, 3] += 0.2
+    poses = tracks(before, before).at(5 * S, T_tcp(5, track))
+    np.testing.assert_allclose(poses["cube"], before, atol=1e-12)
+
+
+def test_what_nobody_found_is_absent_and_what_is_lost_stays_where_the_hand_put_it() -> None:
+    track = posture_track()
+    assert tracks(None, None).absent == {"cube"}
+    found = tracks(T_tcp(3, track) @ IN_HAND, None)
+    np.testing.assert_allclose(found.at(8 * S, None)["cube"], T_tcp(7, track) @ IN_HAND, atol=1e-9)
+    assert "left where the hand put it" in found.notes[0]

@@ -1,0 +1,296 @@
+"""Where the objects of an episode were at any instant: as localised, carried, or replayed.
+
+A trial is localised while nothing is executed. In between nobody looks, but the joints and the
+fingers say what happened: an object between the fingers when they stop closing goes with the tool
+until they open. What localisation and joints disagree about is spread evenly over the carry, so
+that nothing jumps where it is put down. An object that is found far from where it was let go fell,
+and one that was never held was moved by something else: both change place when that is known.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.episode.reader import Episode
+from bridge.geometry import se3
+from bridge.geometry.trajectory import PoseTrajectory
+from bridge.task.task_file import ObjectModel, Task
+from twin.robot.model import RobotModel, load_robot
+from twin.robot.posture import PostureTrack
+from twin.scene.shape.known import yaw_period_rad
+
+BETWEEN_M = 0.03
+"""An object this near to the tool, beside half its largest side, is between the fingers."""
+PLATEAU_M = 0.003
+"""Fingers that are this near to the least opening of a grasp hold what is between them."""
+FELL_M = 0.05
+"""An object found this far from where it was let go did not stay there."""
+MOVED_M = 0.005
+"""Less than this is the scatter of localisation."""
+EMPTY_M = 0.002
+"""Fingers that close to less have nothing between them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """A stretch of time in which the fingers were closed around something."""
+
+    start_ns: int
+    end_ns: int
+    T_base_tcp_start: Float[np.ndarray, "4 4"]
+    T_base_tcp_end: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rest:
+    """From here on the object stands in the base frame."""
+
+    start_ns: int
+    T_base_object: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Carry:
+    """From here on it moves with the tool, its place in the hand changing evenly."""
+
+    start_ns: int
+    end_ns: int
+    T_tcp_start: Float[np.ndarray, "4 4"]
+    T_tcp_end: Float[np.ndarray, "4 4"]
+
+    def T_tcp_object(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
+        """Where it is in the hand."""
+        share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
+        return _between(self.T_tcp_start, self.T_tcp_end, float(np.clip(share, 0.0, 1.0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectTracks:
+    """Poses of objects over source time, in the frame in which cameras see them."""
+
+    spans: Mapping[str, Sequence[_Rest | _Carry]] = field(default_factory=dict)
+    """By object, in the order of time; the first also holds before it."""
+    paths: Mapping[str, PoseTrajectory] = field(default_factory=dict)
+    """Objects whose poses are known at every instant, as in a replay."""
+    absent: frozenset[str] = frozenset()
+    """Objects that nobody found: they are not drawn."""
+    notes: tuple[str, ...] = ()
+    """What nobody saw and what was assumed instead."""
+
+    def at(
+        self, stamp_ns: int, T_base_tcp: Float[np.ndarray, "4 4"] | None
+    ) -> dict[str, Float[np.ndarray, "4 4"]]:
+        """Poses ``T_base_object`` at one instant.
+
+        Args:
+            stamp_ns: Source time.
+            T_base_tcp: Of the tool then; None where no joints are known: what is carried then
+                stays where it was taken.
+        """
+        found = {}
+        for name, track in self.paths.items():
+            found[name] = track.at(np.array([stamp_ns])).transforms()[0]
+        for name, spans in self.spans.items():
+            begun = [span for span in spans if span.start_ns <= stamp_ns]
+            span = begun[-1] if begun else spans[0]
+            if isinstance(span, _Carry) and T_base_tcp is not None:
+                found[name] = T_base_tcp @ span.T_tcp_object(stamp_ns)
+            else:
+                rests = [item for item in begun or spans if isinstance(item, _Rest)]
+                found[name] = rests[-1].T_base_object
+        return found
+
+
+def replayed_tracks(
+    episode: Episode,
+    as_seen: Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]] | None = None,
+) -> ObjectTracks:
+    """The poses that a derived episode has of its objects.
+
+    Args:
+        episode: The replay.
+        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
+    """
+    paths = {}
+    for name, topic in streams.object_pose_topics(episode).items():
+        track = streams.pose_track(episode, topic)
+        if as_seen is not None:
+            q, p = se3.split(np.stack([as_seen(T) for T in track.transforms()]))
+            track = PoseTrajectory(track.stamps_ns, p, q)
+        paths[name] = track
+    return ObjectTracks(paths=paths)
+
+
+def carried_tracks(
+    localised: Sequence[Mapping[str, object]],
+    executions_ns: Mapping[str, tuple[int, int]],
+    task: Task,
+    track: PostureTrack | None,
+) -> ObjectTracks:
+    """Join what was localised before and after executions by what the hand did meanwhile.
+
+    Args:
+        localised: The gst localisation v1 records of one episode, each with its ``phase`` and the
+            ``plan_id`` after whose execution it holds.
+        executions_ns: When each plan was executed, by its id.
+        task: The objects.
+        track: Joints and fingers; None where nobody recorded them: objects then change place at
+            the end of an execution.
+    """
+    robot = None if track is None else load_robot(track.urdf)
+    spans: dict[str, list[_Rest | _Carry]] = {}
+    notes, absent = [], set()
+    for name, model in task.objects.items():
+        seen = _seen(name, localised)
+        if not seen:
+            notes.append(f"{name} was not localised: not drawn")
+            absent.add(name)
+            continue
+        spans[name] = [_Rest(start_ns=0, T_base_object=next(iter(seen.values())))]
+        for plan_id, (start_ns, end_ns) in sorted(executions_ns.items(), key=lambda i: i[1]):
+            grips = (
+                grips_between(track, robot, start_ns, end_ns)
+                if track is not None and robot is not None and not model.fixed
+                else []
+            )
+            after = seen.get(plan_id)
+            added, note = _moved(model, spans[name], grips, after, end_ns)
+            spans[name] += added
+            notes += [f"{name} {note}"] if note else []
+    return ObjectTracks(spans=spans, absent=frozenset(absent), notes=tuple(notes))
+
+
+def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns: int) -> list[Grip]:
+    """When the fingers stood closed around something, by their recorded opening.
+
+    Args:
+        track: Joints and fingers.
+        robot: Says where the tool was.
+        start_ns: Of the execution that is looked at.
+        end_ns: Of it.
+    """
+    widths = track.widths
+    if widths is None:
+        return []
+    inside = (widths.stamps_ns >= start_ns) & (widths.stamps_ns <= end_ns)
+    stamps, width_m = widths.stamps_ns[inside], widths.position[inside, 0]
+    if len(stamps) == 0 or np.ptp(width_m) < PLATEAU_M:
+        return []
+    is_closed = width_m < (width_m.min() + width_m.max()) / 2
+    edges = np.flatnonzero(np.diff(is_closed.astype(np.int8), prepend=0, append=0))
+    grips = []
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        least_m = float(width_m[first:last].min())
+        held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
+        if least_m < EMPTY_M:
+            continue
+        t0, t1 = int(stamps[held[0]]), int(stamps[held[-1]])
+        T0, T1 = (robot.T_base_tcp(track.at(t).joints_rad) for t in (t0, t1))
+        grips.append(Grip(start_ns=t0, end_ns=t1, T_base_tcp_start=T0, T_base_tcp_end=T1))
+    return grips
+
+
+def _seen(
+    name: str, localised: Sequence[Mapping[str, object]]
+) -> dict[str | None, Float[np.ndarray, "4 4"]]:
+    """Poses by the plan after which they were found; None: before the first. In that order."""
+    own = [record for record in localised if record["object"] == name and record["found"]]
+    return {
+        None if record.get("plan_id") is None else str(record["plan_id"]): se3.pose_from_record(
+            record["T_base_object"]
+        )
+        for record in own
+    }
+
+
+def _moved(
+    model: ObjectModel,
+    before: Sequence[_Rest | _Carry],
+    grips: Sequence[Grip],
+    after: Float[np.ndarray, "4 4"] | None,
+    end_ns: int,
+) -> tuple[list[_Rest | _Carry], str]:
+    """What one execution did to an object, and what had to be assumed."""
+    (T,) = [item.T_base_object for item in before[-1:] if isinstance(item, _Rest)]
+    added: list[_Rest | _Carry] = []
+    own = _held(model, T, grips)
+    for index, grip in enumerate(own):
+        in_hand = se3.invert(grip.T_base_tcp_start) @ T
+        put_in_hand, T = in_hand, grip.T_base_tcp_end @ in_hand
+        if after is not None and index == len(own) - 1:
+            found = _turned_alike(after, T, model)
+            if np.linalg.norm(found[:3, 3] - T[:3, 3]) < FELL_M:
+                put_in_hand, T = se3.invert(grip.T_base_tcp_end) @ found, found
+        added += [
+            _Carry(
+                start_ns=grip.start_ns,
+                end_ns=grip.end_ns,
+                T_tcp_start=in_hand,
+                T_tcp_end=put_in_hand,
+            ),
+            _Rest(start_ns=grip.end_ns, T_base_object=T),
+        ]
+    if after is None:
+        note = (
+            "was not found after an execution: left where the hand put it"
+            if own
+            else ("was not found after an execution: left where it was")
+        )
+        return added, note
+    away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
+    if away_m <= MOVED_M:
+        return added, ""
+    fell_ns = own[-1].end_ns if own else end_ns
+    note = (
+        f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
+        if own
+        else f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
+    )
+    return [*added, _Rest(start_ns=fell_ns, T_base_object=after)], note
+
+
+def _held(
+    model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"], grips: Sequence[Grip]
+) -> list[Grip]:
+    """Those grips that had this object between the fingers."""
+    reach_m = BETWEEN_M + max(model.size_m) / 2
+    T, own = T_base_object, []
+    for grip in grips:
+        in_hand = se3.invert(grip.T_base_tcp_start) @ T
+        if np.linalg.norm(in_hand[:3, 3]) < reach_m:
+            own.append(grip)
+            T = grip.T_base_tcp_end @ in_hand
+    return own
+
+
+def _turned_alike(
+    T_base_object: Float[np.ndarray, "4 4"],
+    T_base_expected: Float[np.ndarray, "4 4"],
+    model: ObjectModel,
+) -> Float[np.ndarray, "4 4"]:
+    """Of the poses in which an object looks the same, the one turned nearest to another."""
+    period = yaw_period_rad(model)
+    turns = [
+        se3.rotation_from_vector(np.array([0.0, 0.0, k * period]))
+        for k in range(round(2 * np.pi / period))
+    ]
+    best = min(
+        (T_base_object[:3, :3] @ turn for turn in turns),
+        key=lambda R: float(se3.rotation_angle_rad(R.T @ T_base_expected[:3, :3])),
+    )
+    T = T_base_object.copy()
+    T[:3, :3] = best
+    return T
+
+
+def _between(
+    T_a: Float[np.ndarray, "4 4"], T_b: Float[np.ndarray, "4 4"], share: float
+) -> Float[np.ndarray, "4 4"]:
+    turn = se3.vector_from_rotation(T_a[:3, :3].T @ T_b[:3, :3])
+    T = T_a.copy()
+    T[:3, :3] = T_a[:3, :3] @ se3.rotation_from_vector(share * turn)
+    T[:3, 3] += share * (T_b[:3, 3] - T_a[:3, 3])
+    return T

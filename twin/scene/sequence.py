@@ -1,0 +1,483 @@
+"""Draw a whole episode: the rebuilt scene with arm and objects where they were at each instant.
+
+One process draws all frames. The scene is read once; for each frame the links and objects are
+moved rigidly, and background, objects and robot are drawn together, as for a single image.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from bridge.episode import streams
+from bridge.episode.cdr.messages import color_from_message
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.transforms import TransformTree
+from bridge.errors import GstError, UsageError
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.media.color import encode_png
+from twin.robot.model import load_robot
+from twin.robot.posture import Posture, PostureTrack, posture_track
+from twin.robot.surface import PosedSurface
+from twin.scene.frames.camera_poses import unknown_mask
+from twin.scene.image_agreement import (
+    ImageAgreement,
+    Mesh,
+    describe_agreement,
+    part_masks,
+)
+from twin.scene.localise.episode import write_localised
+from twin.scene.movable_scene import MovableScene, read_movable_scene
+from twin.scene.object_tracks import ObjectTracks, carried_tracks, replayed_tracks
+from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.render import (
+    camera_of,
+    carried_camera,
+    chosen_view,
+    depth_image,
+    episode_of,
+    poses_in_scene,
+    seen_mask,
+    sized_camera,
+    why_no_robot,
+)
+from twin.scene.settings import RenderConfig
+from twin.scene.shape.files import MESH
+from twin.scene.shape.mesh import read_mesh
+from twin.scene.store.folder import Scene, read_scene
+
+CRF = 18
+"""Quality of the video: hardly to be told from the frames."""
+MOST_FRAMES = 100_000
+OTHER_FILES = (".avi", ".gif", ".h264", ".jpeg", ".jpg", ".mkv", ".mov", ".webm")
+"""Files that somebody may ask for and that are not written."""
+
+AsSeen = Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One instant as it is to be drawn."""
+
+    stamp_ns: int
+    T_base_camera: Float[np.ndarray, "4 4"]
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]]
+    posture: Posture | None
+    """None: no robot is drawn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeInScene:
+    """What an episode says of robot, objects and camera while its scene is drawn."""
+
+    recorded: Episode
+    """Has the cameras; of a replay, the recording it was made from."""
+    shown: Episode
+    """Has joints and objects; the same, or the replay."""
+    tracks: ObjectTracks
+    postures: PostureTrack | None
+    robot: str
+    """How the robot stands, or why it is not drawn."""
+    unposed: list[int] = field(default_factory=list)
+    """Instants left out because nobody knows where the camera was."""
+
+
+def open_episode(
+    run: RunFolder, scene: Scene, wanted: str, as_seen: AsSeen | None = None
+) -> EpisodeInScene:
+    """Find an episode by its id, or a replay by its file name, with all that moves in it.
+
+    A recorded trial is localised before and after its executions if it was not yet.
+
+    Args:
+        run: Whose episodes are looked through.
+        scene: The poses are meant for it.
+        wanted: Id of a recorded episode, or name of a replay in ``derived``.
+        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
+
+    Raises:
+        UsageError: There is no such episode; lists those that exist.
+    """
+    replay = _replay_named(run, wanted)
+    recorded = episode_of(run, scene, wanted if replay is None else _source_of(replay))
+    shown = recorded if replay is None else replay
+    postures, robot = None, f"joints as {shown.path.stem} has them"
+    if not scene.record.get("robot", {}).get("links"):
+        robot = f"not drawn: {why_no_robot(scene)}"
+    try:
+        postures = posture_track(shown)
+    except GstError as error:
+        robot = f"not drawn: {error}"
+    if replay is not None:
+        tracks = replayed_tracks(replay, as_seen)
+    else:
+        tracks = recorded_tracks(run, scene, recorded, postures)
+    return EpisodeInScene(
+        recorded=recorded, shown=shown, tracks=tracks, postures=postures, robot=robot
+    )
+
+
+def _replay_named(run: RunFolder, wanted: str) -> Episode | None:
+    name = wanted.removesuffix(".mcap")
+    for path in run.derived():
+        if path.stem == name:
+            episode = Episode.open(path)
+            if episode.derived is not None and episode.derived.kind == "replay":
+                return episode
+    return None
+
+
+def _source_of(replay: Episode) -> str:
+    return "" if replay.derived is None else replay.derived.source_episode
+
+
+def recorded_tracks(
+    run: RunFolder, scene: Scene, episode: Episode, postures: PostureTrack | None
+) -> ObjectTracks:
+    """Where a recorded episode's objects were: localised, and carried in between.
+
+    Args:
+        run: Keeps what was localised.
+        scene: Whose objects they are.
+        episode: The recording.
+        postures: Joints and fingers, if they were recorded.
+    """
+    try:
+        task = streams.task_file(episode).task()
+        path = write_localised(run, episode, task, scene_hash=scene.scene_hash)
+        records = streams.localisations(Episode.open(path))
+    except GstError as error:
+        return ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
+    plan_ids = {
+        str(event["plan_id"])
+        for event in streams.events(episode)
+        if event["type"] == "execution_ended" and event.get("plan_id") is not None
+    }
+    executions = {
+        plan_id: span
+        for plan_id in plan_ids
+        if (span := streams.executed_interval_ns(episode, plan_id)) is not None
+    }
+    return carried_tracks(records, executions, task, postures)
+
+
+def frames_of(
+    run: RunFolder, scene: Scene, episode: EpisodeInScene, camera_id: str, config: RenderConfig
+) -> Iterator[Frame]:
+    """Yield the instants to be drawn, in the order of time.
+
+    Args:
+        run: May have a calibration of the cameras.
+        scene: In whose frame the camera must be known.
+        episode: What is drawn.
+        camera_id: From where; ``eye`` and ``target`` of the settings go before.
+        config: Rate and camera.
+
+    Raises:
+        UsageError: When nothing says where the camera was.
+    """
+    stamps = _stamps(episode, camera_id, config)
+    T_chosen = chosen_view(config)
+    frame_id = streams.camera_info(episode.recorded, camera_id).frame_id
+    tree: TransformTree | None = None
+    T_tcp_camera = None
+    unknown = np.zeros(len(stamps), dtype=bool)
+    robot = None if episode.postures is None else load_robot(episode.postures.urdf)
+    if T_chosen is None:
+        tree = poses_in_scene(run, scene, episode.recorded, camera_id, stamps)
+        T_tcp_camera = _in_planned_hand(episode, frame_id, tree)
+        if T_tcp_camera is None:
+            unknown = unknown_mask(tree, [frame_id], stamps)
+    for stamp_ns, is_unknown in zip(stamps.tolist(), unknown.tolist(), strict=True):
+        if is_unknown:
+            episode.unposed.append(stamp_ns)
+            continue
+        posture = None
+        if episode.postures is not None and episode.postures.covers(stamp_ns):
+            posture = episode.postures.at(stamp_ns)
+        T_tcp = None
+        if robot is not None and posture is not None:
+            T_tcp = robot.T_base_tcp(posture.joints_rad)
+        T = T_chosen
+        if T is None and T_tcp_camera is not None and T_tcp is not None:
+            T = T_tcp @ T_tcp_camera
+        if T is None and tree is not None:
+            T = tree.T_root_frame(frame_id, stamp_ns)
+        if T is not None:
+            places = episode.tracks.at(stamp_ns, T_tcp)
+            yield Frame(stamp_ns=stamp_ns, T_base_camera=T, Ts_base_object=places, posture=posture)
+
+
+def _in_planned_hand(
+    episode: EpisodeInScene, frame_id: str, tree: TransformTree
+) -> Float[np.ndarray, "4 4"] | None:
+    """Where a camera sits in the hand, which in a planned replay goes another way than recorded."""
+    derived = episode.shown.derived
+    if derived is None or derived.trajectory != "planned" or episode.postures is None:
+        return None
+    joints = episode.postures.at(int(episode.postures.arm.stamps_ns[0])).joints_rad
+    T_base_camera = carried_camera(episode.recorded, frame_id, joints, tree)
+    if T_base_camera is None:
+        return None
+    T_base_tcp = load_robot(episode.postures.urdf).T_base_tcp(joints)
+    return np.asarray(se3.invert(T_base_tcp) @ T_base_camera)
+
+
+def _stamps(episode: EpisodeInScene, camera_id: str, config: RenderConfig) -> np.ndarray:
+    recorded = np.array(_recorded_stamps(episode.recorded, camera_id), dtype=np.int64)
+    first_ns, last_ns = episode.shown.start_ns, episode.shown.end_ns
+    if episode.postures is not None:
+        first_ns, last_ns = (int(episode.postures.arm.stamps_ns[k]) for k in (0, -1))
+    if config.rate_hz is None or config.compare:
+        stamps = recorded[(recorded >= first_ns) & (recorded <= last_ns)]
+        if config.rate_hz is not None:
+            stamps = stamps[:: max(1, round(_rate_hz(stamps) / config.rate_hz))]
+    else:
+        stamps = np.arange(first_ns, last_ns, round(1e9 / config.rate_hz), dtype=np.int64)
+    if not 0 < len(stamps) <= MOST_FRAMES:
+        message = (
+            f"{len(stamps)} frames of camera {camera_id} in episode {episode.shown.info.id}: "
+            f"choose --rate-hz so that there are 1 to {MOST_FRAMES}."
+        )
+        raise UsageError(message)
+    return stamps
+
+
+def _recorded_stamps(episode: Episode, camera_id: str) -> list[int]:
+    return [message.stamp_ns for message in _recorded_images(episode, camera_id)]
+
+
+def _recorded_images(episode: Episode, camera_id: str) -> Iterator[Any]:
+    topic = streams.find_camera_topic(episode, camera_id, "color/image")
+    for message in streams.image_messages(episode, [] if topic is None else [topic]):
+        yield color_from_message(message.type_name, message.data)
+
+
+def _rate_hz(stamps_ns: np.ndarray) -> float:
+    """How many frames come each second; 1 for a single one."""
+    return float(1e9 / np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
+
+
+def render_sequence(
+    run: RunFolder, config: RenderConfig, as_seen: AsSeen | None = None
+) -> dict[str, Any]:
+    """Draw a whole episode to a video or to one PNG a frame, and return what was drawn.
+
+    Args:
+        run: Whose scene is drawn.
+        config: Episode, camera, rate, size, and where the files go.
+        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
+
+    Raises:
+        UsageError: When the episode or the camera is unknown, when nothing says where the camera
+            was, or when what is asked for does not go together.
+        MissingDependencyError: A video without PyAV, or the backend cuda without a GPU.
+    """
+    _check(config)
+    rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
+    scene = read_scene(run)
+    parts = read_movable_scene(run, scene)
+    episode = open_episode(run, scene, config.episode, as_seen)
+    there = {k: item for k, item in parts.objects.items() if k not in episode.tracks.absent}
+    parts = replace(parts, objects=there)
+    camera_id = camera_of(episode.recorded, config.camera)
+    info = streams.camera_info(episode.recorded, camera_id)
+    artist = Artist(
+        rasteriser=rasteriser,
+        parts=parts,
+        urdf="" if episode.postures is None else episode.postures.urdf,
+        camera=sized_camera(info.camera, config.size),
+        scene=scene,
+    )
+    out = config.out or run.results_dir / f"{episode.shown.path.stem}.{camera_id}.mp4"
+    comparison = _Comparison.start(run, episode, parts) if config.compare else None
+    recorded = _recorded_images(episode.recorded, camera_id) if config.compare else iter(())
+    begun_ns: int | None = None
+    stamps: list[int] = []
+    with _writer(out, _rate_of(episode, camera_id, config)) as write:
+        for frame in frames_of(run, scene, episode, camera_id, config):
+            drawn = artist.draw(frame)
+            begun_ns = frame.stamp_ns if begun_ns is None else begun_ns
+            image = drawn.image_u8
+            if comparison is not None:
+                before = next(item for item in recorded if item.stamp_ns == frame.stamp_ns)
+                image = comparison.add(before.image_u8(), drawn, frame, artist)
+            planes = {"": image} | (
+                {"_depth": depth_image(drawn.depth_m), "_seen": drawn.seen_u8()}
+                if config.depth
+                else {}
+            )
+            write(frame.stamp_ns - begun_ns, planes)
+            stamps.append(frame.stamp_ns)
+    return {
+        "files": [str(out)],
+        "scene_hash": scene.scene_hash,
+        "episode": episode.shown.path.stem,
+        "camera": camera_id,
+        "robot": episode.robot,
+        "frames": len(stamps),
+        "frames_without_pose": len(episode.unposed),
+        "notes": [*episode.tracks.notes, *_strangers(episode.tracks, parts)],
+        **({} if comparison is None else {"agreement": comparison.agreement.record()}),
+    }
+
+
+def _strangers(tracks: ObjectTracks, parts: MovableScene) -> list[str]:
+    """What the scan had and the episode does not know, and the other way round."""
+    known = {*tracks.spans, *tracks.paths}
+    if not known:
+        return []
+    scanned = [name for name in parts.objects if name not in known]
+    new = [name for name in sorted(known) if name not in parts.objects]
+    return [
+        *(f"{name} is not of the episode's task: drawn where it was scanned" for name in scanned),
+        *(f"{name} was not scanned: the scene cannot draw it" for name in new),
+    ]
+
+
+def _check(config: RenderConfig) -> None:
+    is_video = config.out is None or config.out.suffix.lower() == ".mp4"
+    if config.out is not None and config.out.suffix.lower() in OTHER_FILES:
+        message = f"--out {config.out}: a whole episode becomes an .mp4 file or a folder of frames."
+        raise UsageError(message)
+    if is_video and config.depth:
+        message = "--depth goes into a folder of frames, not into a video: --out FOLDER."
+        raise UsageError(message)
+    if config.object or config.joints is not None:
+        message = (
+            "--object and --joints are for one image; an episode says itself where things are. "
+            "Choose the image with --at-s."
+        )
+        raise UsageError(message)
+    if config.compare and (config.eye is not None or config.size):
+        message = "--compare needs the recorded camera and size: leave out --eye and --size."
+        raise UsageError(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """One frame as it was drawn."""
+
+    image_u8: UInt8[np.ndarray, "height width 3"]
+    depth_m: Float32[np.ndarray, "height width"]
+    seen_mask: Bool[np.ndarray, "height width"]
+    """Pixels that show what was measured in the scan, and not what was completed."""
+
+    def seen_u8(self) -> UInt8[np.ndarray, "height width"]:
+        """The mask as an image, white where seen."""
+        return np.where(self.seen_mask, np.uint8(255), np.uint8(0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Artist:
+    """Draws frames of one scene through one camera."""
+
+    rasteriser: Rasteriser | CudaRasteriser
+    parts: MovableScene
+    urdf: str
+    camera: Camera
+    scene: Scene
+    """Says what was measured."""
+
+    def draw(self, frame: Frame) -> Drawn:
+        """Draw the scene as it was at one instant."""
+        cloud = self.parts.at(frame.Ts_base_object, frame.posture, self.urdf)
+        view = self.rasteriser.view(cloud, self.camera, frame.T_base_camera)
+        seen = seen_mask(self.rasteriser, view.alpha, self.scene, len(cloud))
+        return Drawn(image_u8=view.image_u8(), depth_m=view.depth_m, seen_mask=seen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Comparison:
+    """Recorded images beside drawn ones."""
+
+    agreement: ImageAgreement
+    meshes: Mapping[str, Mesh]
+    episode: EpisodeInScene
+    parts: MovableScene
+
+    @staticmethod
+    def start(run: RunFolder, episode: EpisodeInScene, parts: MovableScene) -> "_Comparison":
+        folder = run.scene_dir / "objects"
+        meshes = {name: read_mesh(folder / name / MESH) for name in parts.objects}
+        return _Comparison(agreement=ImageAgreement(), meshes=meshes, episode=episode, parts=parts)
+
+    def add(
+        self,
+        recorded_u8: UInt8[np.ndarray, "height width 3"],
+        drawn: Drawn,
+        frame: Frame,
+        artist: Artist,
+    ) -> UInt8[np.ndarray, "height three_widths 3"]:
+        """Measure one frame, and put recorded image, twin and difference side by side."""
+        robot = None
+        if frame.posture is not None:
+            robot = PosedSurface(load_robot(artist.urdf), frame.posture)
+        masks = part_masks(
+            artist.camera, frame.T_base_camera, robot, self.meshes, frame.Ts_base_object
+        )
+        self.agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
+        difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
+        return np.concatenate([recorded_u8, drawn.image_u8, difference.astype(np.uint8)], axis=1)
+
+
+def _rate_of(episode: EpisodeInScene, camera_id: str, config: RenderConfig) -> float:
+    if config.rate_hz is not None:
+        return config.rate_hz
+    return _rate_hz(np.array(_recorded_stamps(episode.recorded, camera_id), dtype=np.int64))
+
+
+Write = Callable[[int, Mapping[str, np.ndarray]], None]
+
+
+@contextmanager
+def _writer(out: Path, rate_hz: float) -> Iterator[Write]:
+    """Write frames to a video, or to a folder under the milliseconds since the first."""
+    if out.suffix.lower() != ".mp4":
+        out.mkdir(parents=True, exist_ok=True)
+
+        def write_images(since_ns: int, planes: Mapping[str, np.ndarray]) -> None:
+            for ending, pixels in planes.items():
+                name = f"{since_ns // 1_000_000:07d}{ending}.png"
+                (out / name).write_bytes(encode_png(pixels))
+
+        yield write_images
+        return
+    from bridge.exchange.lerobot.video import VideoWriter  # noqa: PLC0415  # the extra [video]
+
+    video: VideoWriter | None = None
+
+    def append(since_ns: int, planes: Mapping[str, np.ndarray]) -> None:
+        nonlocal video
+        image = planes[""]
+        if video is None:
+            height, width = image.shape[:2]
+            fps = max(1, round(rate_hz))
+            video = VideoWriter(out, fps=fps, width=width, height=height, crf=CRF)
+        video.write(image, first=since_ns == 0)
+
+    try:
+        yield append
+    finally:
+        if video is not None:
+            video.close()
+
+
+def describe_sequence(drawn: Mapping[str, Any]) -> str:
+    """The files, how many frames they hold, and what a reader should know about them."""
+    lines = [*drawn["files"], f"{drawn['frames']} frames of {drawn['episode']}, {drawn['camera']}"]
+    if drawn["frames_without_pose"]:
+        lines.append(
+            f"{drawn['frames_without_pose']} left out: nobody recorded where the camera was"
+        )
+    lines += [f"robot: {drawn['robot']}", *drawn["notes"]]
+    if "agreement" in drawn:
+        lines.append(describe_agreement(drawn["agreement"]))
+    return "\n".join(lines)
