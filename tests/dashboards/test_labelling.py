@@ -146,8 +146,7 @@ def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Pat
         review = Review(trial_id="t", rater="Ann", note=str(number))
         try:
             save_review(tmp_path, "t", "Ann", review, seen="")
-        except ReviewConflictError as error:
-            assert error.saved.review is not None
+        except ReviewConflictError:
             return False
         return True
 
@@ -256,7 +255,13 @@ def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFol
         ({"json": label(result="maybe")}, 400),
         ({"json": label(flag="yes")}, 400),
         ({"json": label(note="x" * 5000)}, 400),
-        ({"json": label(note="\ud800")}, 400),
+        (
+            {
+                "content": json.dumps(label(note="\ud800")).encode(),
+                "headers": {"Content-Type": "application/json"},
+            },
+            400,
+        ),
         ({"json": label(seen=3)}, 400),
         ({"json": [label()]}, 400),
         ({"content": b"{", "headers": {"Content-Type": "application/json"}}, 400),
@@ -341,7 +346,7 @@ def test_a_hundred_trials_by_keyboard_and_a_server_that_is_killed(
     with chromium(tmp_path) as tab:
         with dashboard(hundred) as (process, url):
             port = int(url.rstrip("/").rpartition(":")[2])
-            tab.show(f"{url}label?rater=Ann", width=1280, dark=False)
+            tab.show(f"{url}label?rater=Ann", width=390, dark=False)
             label_by_keyboard(tab, 40)
             bob = threading.Thread(target=label_by_http, args=(url, acknowledged, enough))
             bob.start()
@@ -356,12 +361,11 @@ def test_a_hundred_trials_by_keyboard_and_a_server_that_is_killed(
         with dashboard(hundred, port):
             tab.await_load()  # the page asked again until it was heard
             label_by_keyboard(tab, NUM_TRIALS - 42)
-            # The last one by n, a digit and undo.
+            # The last one wrongly, with undo.
             here = tab.ask("document.getElementById('label').dataset.trial")
             tab.press("2" if key_for(here) != "2" else "u", loads=True)
             assert "All 100 trials are labelled" in tab.ask("document.body.innerText")
-            tab.call("Page.navigate", url=f"{url}label?rater=Ann&at={here}")
-            tab.await_load()
+            tab.show(f"{url}label?rater=Ann&at={here}", width=390, dark=False)
             tab.press("z", loads=True)
             assert tab.ask("document.getElementById('label').dataset.result") == ""
             tab.press(key_for(here), loads=True)
