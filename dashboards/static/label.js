@@ -89,9 +89,9 @@ async function save(change, { onward = false, words = "" } = {}) {
   const reply = await post(label);
   busy = false;
   if (reply.status === 409) {
-    const typed = note.value;
+    const typed = note.value === note.defaultValue ? null : note.value;
     take(reply);
-    note.value = typed;
+    note.value = typed ?? note.defaultValue; // the other tab's note stays, unless one was typed here
     tell("NOT SAVED. " + reply.message + " Now " + describe() + ".", true);
     return false;
   }
