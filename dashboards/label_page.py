@@ -102,7 +102,7 @@ def rater_name(text: str) -> str:
 
 
 def _shuffled(ids: Sequence[str], salt: str) -> list[str]:
-    """Order ids by a hash: the same each time, and telling nothing of where they came from."""
+    """Order ids by a hash: the same each time, whatever their order was."""
     return sorted(
         ids, key=lambda name: hashlib.sha256(f"{salt}\0{name}".encode(errors="replace")).digest()
     )

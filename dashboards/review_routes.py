@@ -140,17 +140,9 @@ class _ReviewPages:
 
 
 def _told(saved: SavedReview) -> dict[str, Any]:
-    review = saved.review
-    said = None
-    if review is not None:
-        said = {
-            "result": review.result,
-            "cause": review.cause,
-            "note": review.note,
-            "flag": review.flag,
-            "time": review.time,
-        }
-    return {"version": saved.version, "saved": said}
+    parts = ("result", "cause", "note", "flag", "time")
+    label = None if saved.review is None else {name: getattr(saved.review, name) for name in parts}
+    return {"version": saved.version, "saved": label}
 
 
 def _refused(status: int, message: str) -> Response:

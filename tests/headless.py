@@ -111,10 +111,18 @@ class Browser:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
+    def ask_when(self, condition: str) -> None:
+        """Wait until a JavaScript condition holds, looked at before each repaint."""
+        expression = (
+            "new Promise((done) => { const look = () =>"
+            f" ({condition}) ? done() : requestAnimationFrame(look); look(); }})"
+        )
+        self.call("Runtime.evaluate", expression=expression, awaitPromise=True)
+
     def press(self, key: str, *, loads: bool = False) -> None:
         """Press a key as a person would; ``loads``: and wait for the page that it leads to."""
         self._seen.clear()
-        told = KEYS.get(key, {"text": key})
+        told = KEYS.get(key, {"text": key} if len(key) == 1 else {})
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **told)
         if loads:

@@ -143,12 +143,11 @@ const answers = {
 const because = (cause) => save({ result: "failure", cause }, { onward: true });
 const flag = () => save({ flag: form.dataset.flag !== "yes" });
 const toNote = () => note.focus();
-const step = (key) => document.getElementById("clock")?.dispatchEvent(new KeyboardEvent("keydown", { key, cancelable: true }));
 const follow = (id) => document.getElementById(id)?.click();
 
 const KEYS = {
   y: answers.success, n: answers.failure, u: answers.unknown, f: flag, z: undo, m: toNote,
-  s: () => follow("after"), b: () => follow("before"), " ": () => follow("play"), Enter: () => go(null),
+  s: () => follow("after"), b: () => follow("before"), Enter: () => go(null),
 };
 
 document.addEventListener("keydown", (event) => {
@@ -157,11 +156,7 @@ document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") note.blur();
     return;
   }
-  if (event.target.matches("button, a") && (event.key === " " || event.key === "Enter")) return;
-  if (event.key === "ArrowLeft" || event.key === "ArrowRight") {
-    if (event.target.id !== "clock") step(event.key);
-    return;
-  }
+  if (event.target.matches("button, a") && event.key === "Enter") return;
   const causes = form.querySelectorAll("[data-because]");
   const cause = /^[1-9]$/.test(event.key) && causes[Number(event.key) - 1];
   const action = cause ? () => because(cause.dataset.because) : KEYS[event.key];
