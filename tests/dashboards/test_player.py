@@ -44,7 +44,7 @@ def run(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
                     seed=0,
                 ),
             )
-            log = synthetic._Log(writer)  # noqa: SLF001  # the same writer as the trials'
+            log = synthetic._Log(writer)  # the same writer as the trials'
             for step in range(20, 80, 5):
                 t_s = step / 20
                 drawn = synthetic.picture(t_s - 1, 0)  # the cube lags behind: a difference
