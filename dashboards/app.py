@@ -1,4 +1,4 @@
-"""The application: addresses to pages. All state is in the address; nothing is ever written."""
+"""The application: addresses to pages. All state is in the address; only labels are written."""
 
 import shlex
 from pathlib import Path
@@ -25,6 +25,7 @@ from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.overview_page import Selection, build_overview, neighbours
 from dashboards.recording import PageClock, read_recording
+from dashboards.review_routes import review_routes
 from dashboards.twin_page import build_twin, view_image
 
 HERE = Path(__file__).parent
@@ -44,6 +45,7 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/episode/{id}/frame/{camera}", pages.frame),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
+        *pages.reviews(),
         Route("/twin", pages.twin),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static")),
@@ -168,6 +170,10 @@ class Pages:
     def derived_file(self, request: Request) -> Response:
         """``/derived/<file>/file``: a derived episode."""
         return _download(derived_path(self._run(request), request.path_params["name"]))
+
+    def reviews(self) -> list[Route]:
+        """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
+        return review_routes(self._run, self._page)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -17,8 +17,9 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.verdict import Factor, Verdict
 from dashboards.figures import Signal, Span, StageChart, TimePlot, stage_chart, time_plot
-from dashboards.frames import CameraTrack
+from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
+from dashboards.queue_page import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
 from evaluator.compare import TrialRow
 
@@ -330,12 +331,26 @@ class VerdictView:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TwinView:
+    """The twin's pictures from one recorded camera, drawn at the instants of recorded ones."""
+
+    file: str
+    """The replay that holds them."""
+    trajectory: str
+    times_s: tuple[float, ...]
+    stamps_ns: tuple[int, ...]
+    shown: int
+    """Index of the one to show first."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CameraView:
     """One camera: its frames' page times, and the one to show first."""
 
     id: str
     times_s: tuple[float, ...]
     shown_s: float
+    twin: TwinView | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,6 +382,9 @@ class EpisodePage:
     clock: PageClock
     t_s: float
     failure_t_s: float | None
+    divergence: Moment | None
+    """The first divergence of recording and twin, where the replays tell one."""
+    divergence_t_s: float | None
     sent_plan: Plan | None
     problems: tuple[str, ...]
 
@@ -388,7 +406,8 @@ def build_page(
         run: The run folder.
         episode_id: Id of the recorded episode, as it stands in the address.
         row: The trial beside its replays; None where it was not compared.
-        t_s: Page time of the cursor [s]; None puts it at the first failure, else at the end.
+        t_s: Page time of the cursor [s]; None puts it at the first divergence, else at the first
+            failure, else at the end.
 
     Raises:
         NotHereError: When the run has no such episode.
@@ -404,8 +423,10 @@ def build_page(
     factors = [f for view in verdicts if view.of_sent_plan and view.counts for f in view.factors]
     failures_s = [f.t_s for f in factors if f.factor.value is False and f.t_s is not None]
     failure_t_s = next(iter(failures_s), None)
-    first_s = clock.end_s if failure_t_s is None else failure_t_s
-    cursor = clock.clamp(first_s if t_s is None else t_s)
+    moment = None if row is None else moment_of(run, row)
+    divergence_t_s = None if moment is None else clock.of_plan_time(moment.plan_id, moment.t_ns)
+    known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
+    cursor = clock.clamp(next(known, clock.end_s))
     return EpisodePage(
         recording=recording,
         replays=replays,
@@ -416,11 +437,17 @@ def build_page(
         stages=episode_stages(recording, clock, failure_t_s),
         plots=main_plots(recording, replays, sent_plan, row, clock),
         joint_plots=plots_of_joints(recording, clock),
-        cameras=tuple(_camera(track, clock, cursor) for track in recording.cameras.values()),
+        cameras=tuple(
+            _camera(track, replays, clock, cursor)
+            for name, track in recording.cameras.items()
+            if not name.startswith(RENDERED)
+        ),
         events=tuple(_event(event, clock) for event in recording.events),
         clock=clock,
         t_s=cursor,
         failure_t_s=failure_t_s,
+        divergence=moment,
+        divergence_t_s=divergence_t_s,
         sent_plan=sent_plan,
         problems=tuple(problems.texts),
     )
@@ -527,10 +554,42 @@ def _view(
     )
 
 
-def _camera(track: CameraTrack, clock: PageClock, t_s: float) -> CameraView:
+def _camera(
+    track: CameraTrack, replays: Sequence[Recording], clock: PageClock, t_s: float
+) -> CameraView:
     times = tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns)
     return CameraView(
-        id=track.camera_id, times_s=times, shown_s=times[track.nearest(clock.stamp_ns(t_s))]
+        id=track.camera_id,
+        times_s=times,
+        shown_s=times[track.nearest(clock.stamp_ns(t_s))],
+        twin=_twin_view(track.camera_id, replays, clock, t_s),
+    )
+
+
+def _twin_view(
+    camera_id: str, replays: Sequence[Recording], clock: PageClock, t_s: float
+) -> TwinView | None:
+    """Find the pictures that a replay drew through this camera: the plan's before the execution's.
+
+    Those of a plan that was never executed have no time on this page.
+    """
+    found = []
+    for age, replay in enumerate(replays):
+        track = replay.cameras.get(RENDERED + camera_id)
+        made = replay.derived
+        if track is None or made is None or made.plan_id not in clock.starts_ns:
+            continue
+        if clock.recorded_ns[0] <= track.stamps_ns[0] <= clock.recorded_ns[1]:
+            found.append((made.trajectory == PLANNED, age, replay, track))
+    if not found:
+        return None
+    _, _, replay, track = max(found, key=lambda each: each[:2])
+    return TwinView(
+        file=replay.path.name,
+        trajectory=(replay.derived.trajectory if replay.derived else None) or "",
+        times_s=tuple(round(clock.seconds(stamp), 3) for stamp in track.stamps_ns),
+        stamps_ns=track.stamps_ns,
+        shown=track.nearest(clock.stamp_ns(t_s)),
     )
 
 

@@ -1,11 +1,11 @@
-"""Who may talk to the review pages: host names, the access token, and strict headers."""
+"""Who may talk to the review pages: host names, origins, the access token, strict headers."""
 
 import hmac
 import ipaddress
 import socket
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
@@ -72,7 +72,10 @@ class Admission:
 
 
 class Guard:
-    """ASGI middleware: 400 on a foreign host, 403 without the token, headers on every answer."""
+    """ASGI middleware that lets in whoever may be here, with strict headers on every answer.
+
+    400 on a foreign host; 403 without the token, and to a page of another origin that would write.
+    """
 
     def __init__(self, app: ASGIApp, admission: Admission) -> None:
         """Wrap an application."""
@@ -104,6 +107,11 @@ class Guard:
                 "This server does not answer to that host name; use the address it printed.\n",
                 status_code=400,
             )
+        if scope["method"] not in ("GET", "HEAD") and not _is_own_origin(headers):
+            return PlainTextResponse(
+                "Only a page of this server may change something here (Origin header).\n",
+                status_code=403,
+            )
         token = self._admission.token
         if token is None or _same(_cookie(headers), token):
             return None
@@ -122,6 +130,16 @@ def _remember_token(path: str, query: list[tuple[str, str]], token: str) -> ASGI
     response = RedirectResponse(path + (f"?{rest}" if rest else ""), status_code=303)
     response.set_cookie(COOKIE, token, httponly=True, samesite="strict")
     return response
+
+
+def _is_own_origin(headers: Headers) -> bool:
+    """Say whether a page of this very server asks; a browser tells the origin of every POST."""
+    try:
+        origin = urlsplit(headers.get("origin", ""))
+    except ValueError:
+        return False
+    own = headers.get("host", "").lower()
+    return origin.scheme in ("http", "https") and origin.netloc.lower() == own
 
 
 def _same(found: str, wanted: str) -> bool:

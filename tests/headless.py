@@ -103,8 +103,7 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
         self._seen.clear()
         self.call("Page.navigate", url=address)
-        while "Page.loadEventFired" not in self._seen:
-            self._read()
+        self.await_load()
 
     def ask(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; the page's own policy does not bind it."""
@@ -112,10 +111,27 @@ class Browser:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def press(self, key: str) -> None:
-        """Press a key as a person would."""
+    def ask_when(self, condition: str) -> None:
+        """Wait until a JavaScript condition holds, looked at before each repaint."""
+        expression = (
+            "new Promise((done) => { const look = () =>"
+            f" ({condition}) ? done() : requestAnimationFrame(look); look(); }})"
+        )
+        self.call("Runtime.evaluate", expression=expression, awaitPromise=True)
+
+    def press(self, key: str, *, loads: bool = False) -> None:
+        """Press a key as a person would; ``loads``: and wait for the page that it leads to."""
+        self._seen.clear()
+        told = KEYS.get(key, {"text": key} if len(key) == 1 else {})
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **KEYS[key])
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **told)
+        if loads:
+            self.await_load()
+
+    def await_load(self) -> None:
+        """Wait for the page that the last key led to, unless it is there already."""
+        while "Page.loadEventFired" not in self._seen:
+            self._read()
 
     def picture(self) -> bytes:
         """Take a PNG of the whole page."""

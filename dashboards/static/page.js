@@ -5,6 +5,8 @@ const clock = document.getElementById("clock");
 const frames = [...document.querySelectorAll("img.frame")].map((img) => ({
   img,
   times: img.dataset.times.split(" ").map(Number),
+  // What names a frame in its address: its time, or the stamp of a picture of the twin.
+  stamps: img.dataset.stamps ? img.dataset.stamps.split(" ") : null,
   label: img.closest("figure").querySelector(".frame-time"),
   shown: null,
   wanted: null,
@@ -49,6 +51,7 @@ function nearest(times, t) {
 // Fetch one image at a time per camera, always the newest wanted one.
 function showFrame(frame, t) {
   frame.wanted = nearest(frame.times, t);
+  if (frame.img.closest("[hidden]")) return;
   if (frame.loading || frame.wanted === frame.shown) return;
   frame.loading = true;
   const at = frame.wanted;
@@ -60,12 +63,24 @@ function showFrame(frame, t) {
   };
   next.onload = () => {
     frame.img.src = next.src;
-    frame.label.textContent = at.toFixed(2);
+    if (frame.label) frame.label.textContent = at.toFixed(2);
     done();
   };
   next.onerror = done;
   const source = frame.img.dataset.source;
-  next.src = source + (source.includes("?") ? "&" : "?") + "t=" + at;
+  const name = frame.stamps ? "stamp=" + frame.stamps[frame.times.indexOf(at)] : "t=" + at;
+  next.src = source + (source.includes("?") ? "&" : "?") + name;
+}
+
+// A difference means something only where both pictures are of one instant.
+const SAME_INSTANT_S = 0.02;
+function showDifferences() {
+  for (const figure of document.querySelectorAll(".beside")) {
+    const [recorded, twin] = frames.filter(({ img }) => figure.contains(img));
+    const apart = Math.abs(recorded.wanted - twin.wanted) > SAME_INSTANT_S;
+    figure.classList.toggle("apart", apart);
+    figure.querySelector(".apart").hidden = !apart;
+  }
 }
 
 function showCharts(t) {
@@ -104,6 +119,7 @@ function setTime(t, { remember = true } = {}) {
   clock.value = bounded;
   document.getElementById("clock-text").textContent = bounded.toFixed(2) + " s";
   for (const frame of frames) showFrame(frame, bounded);
+  showDifferences();
   showCharts(bounded);
   if (remember) keepInAddress(bounded);
 }
@@ -159,10 +175,39 @@ if (clock) {
     svg.addEventListener("click", (event) => setTime(timeAt(svg, event)));
   }
   showCharts(Number(clock.value));
+  for (const frame of frames) frame.wanted = nearest(frame.times, Number(clock.value));
+  showDifferences();
+}
+
+// With the twin's pictures beside the recorded ones there is room for one camera at a time.
+const cameras = [...document.querySelectorAll(".trio")];
+function showCamera(index) {
+  cameras.forEach((camera, at) => { camera.hidden = at !== index % cameras.length; });
+  setTime(Number(clock.value), { remember: false });
+}
+if (cameras.length > 1) {
+  const other = document.getElementById("camera");
+  other.hidden = false;
+  other.addEventListener("click", () => showCamera(cameras.findIndex((camera) => !camera.hidden) + 1));
+  showCamera(0);
+}
+
+// Keys of the player, wherever the focus is.
+function playerKey(event) {
+  const onControl = event.target.matches("button, a, summary");
+  if (event.key === " " && !onControl && !event.repeat) document.getElementById("play").click();
+  else if (event.key === "ArrowLeft") setTime(Number(clock.value) - 0.1);
+  else if (event.key === "ArrowRight") setTime(Number(clock.value) + 0.1);
+  else if (event.key === "c") document.getElementById("camera")?.click();
+  else if (event.key === "d") document.getElementById("divergence")?.click();
+  else return;
+  event.preventDefault();
 }
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea")) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
+  if (event.target.matches("input:not([type=range]), select, textarea")) return;
+  if (clock) playerKey(event);
   const relation = { "[": "prev", "]": "next" }[event.key];
   const link = relation && document.querySelector(`a[rel="${relation}"]`);
   if (link) link.click();

@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import httpx
 import numpy as np
@@ -22,6 +23,7 @@ from bridge.robots.default import ARM_JOINTS
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
 from dashboards.app import create_app
+from dashboards.guard import Admission
 from dashboards.library import Library
 from evaluator.compare import compare_run
 from evaluator.result import write_results
@@ -31,6 +33,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 START_NS = 1_760_000_000_000_000_000
 EXECUTION_NS = START_NS + 1_000_000_000
 END_S = 6.0
+BASE = "http://127.0.0.1:8600"
 STAGES = (("approach", 0.0, 1.5), ("grasp", 1.5, 2.2), ("carry", 2.2, 3.8), ("release", 3.8, 4.5))
 
 
@@ -358,19 +361,25 @@ class Browser:
 
     def get(self, address: str, **options: object) -> httpx.Response:
         """Return the answer; redirects are not followed."""
+        return self._ask("GET", address, **options)
 
+    def post(self, address: str, **options: Any) -> httpx.Response:
+        """Send something as a page of the same server does; headers replace that page's."""
+        headers = {"Origin": BASE, **options.pop("headers", {})}
+        return self._ask("POST", address, headers=headers, **options)
+
+    def _ask(self, method: str, address: str, **options: Any) -> httpx.Response:
         async def ask() -> httpx.Response:
             transport = httpx.ASGITransport(app=self._app)
-            base = "http://127.0.0.1:8600"
-            async with httpx.AsyncClient(transport=transport, base_url=base) as client:
-                return await client.get(address, **options)
+            async with httpx.AsyncClient(transport=transport, base_url=BASE) as client:
+                return await client.request(method, address, **options)
 
         return asyncio.run(ask())
 
 
-def browser_of(*runs: RunFolder) -> Browser:
+def browser_of(*runs: RunFolder, admission: Admission | None = None) -> Browser:
     """Return a browser on the pages of some runs."""
-    return Browser(create_app(Library.open([run.path for run in runs])))
+    return Browser(create_app(Library.open([run.path for run in runs]), admission))
 
 
 @pytest.fixture

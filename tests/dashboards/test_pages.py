@@ -338,10 +338,13 @@ def test_an_open_address_asks_for_its_token(synthetic: ModuleType, shared_run: R
     assert not away.headers.get("location", "/").startswith("//")
 
 
-def test_nothing_can_be_written(shared_run: RunFolder) -> None:
+def test_nothing_but_labels_can_be_written(shared_run: RunFolder, browser: Any) -> None:
     app = create_app(Library.open([shared_run.path]))
-    methods = {method for route in app.routes for method in getattr(route, "methods", None) or ()}
-    assert methods == {"GET", "HEAD"}
+    routes = [(getattr(r, "path", ""), getattr(r, "methods", None) or set()) for r in app.routes]
+    assert [path for path, methods in routes if methods - {"GET", "HEAD"}] == ["/label"]
+    for path in ("/", "/queue", "/label", "/reviews", "/episode/trial_0001"):
+        foreign = browser.post(path, headers={"Origin": "http://evil.example"}, content=b"")
+        assert foreign.status_code == 403
 
 
 def test_the_views_follow_the_few_numbers_to_read_first(browser: Any) -> None:

@@ -1,6 +1,5 @@
 """The command listens where it should, says so, and ends when asked; a real browser sees it."""
 
-import json
 import os
 import re
 import signal
@@ -8,12 +7,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, chromium
+from serving import ROOT, dashboard
 
 import robot_gst
 from bridge.episode.metadata import EpisodeInfo
@@ -28,8 +26,6 @@ from dashboards.errors import AddressTakenError, NotHereError
 from dashboards.guard import Admission, host_name, is_loopback
 from dashboards.library import derived_paths, episode_path
 from dashboards.server import Address, listen
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_a_taken_port_is_one_clear_sentence() -> None:
@@ -135,37 +131,6 @@ def test_host_headers_are_split_from_their_port() -> None:
     assert host_name("[::1]:80") == "::1"
     assert host_name("a:b") == ""
     assert not Admission().admits_host("")
-
-
-@contextmanager
-def dashboard(run: RunFolder) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start the real command and wait for its address."""
-    command = [
-        sys.executable,
-        "-m",
-        "robot_gst",
-        "dashboard",
-        str(run.path),
-        "--port",
-        "0",
-        "--json",
-    ]
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    try:
-        text = ""
-        while not text.endswith("}\n"):
-            line = process.stdout.readline()
-            assert line, process.stderr.read()
-            text += line
-        yield process, json.loads(text)["url"]
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
 
 
 @pytest.mark.slow

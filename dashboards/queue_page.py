@@ -1,0 +1,282 @@
+"""The queue: which trial to look at first, why, and a picture of the moment it went wrong."""
+
+import hashlib
+import io
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from bridge.clock import NS_PER_S
+from bridge.episode import schema, streams
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from bridge.exchange.reviews import Review
+from bridge.media.color import open_image
+from bridge.task.record import parse_record
+from bridge.whole_file import write_whole
+from dashboards.comparison import Judgement, agrees
+from dashboards.errors import NotHereError
+from dashboards.frames import RENDERED, CameraTrack, camera_tracks, read_frame
+from dashboards.library import episode_path
+from evaluator.compare import TrialRow
+
+PER_PAGE = 24
+SHOW = {
+    "": "all",
+    "wrong_yes": "wrong yes",
+    "disagree": "disagreements",
+    "diverged": "largest divergence",
+    "flagged": "flagged",
+}
+REASONS = (
+    "wrong yes: the twin succeeds, the trial failed",
+    "wrong no: the twin fails, the trial succeeded",
+    "undecided: a side is unknown",
+    "agree",
+)
+"""Why a trial is where it is in the queue, worst first. A wrong yes sends a bad plan to a robot."""
+THUMBNAILS = "thumbnails"
+"""Folder in the run's ``results/``."""
+THUMBNAIL_PX = 360
+"""Width of a thumbnail: twice what a card shows, for dense screens."""
+_DRAWING = threading.Lock()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """When recording and twin first differ, as the replays of the plan sent tell it."""
+
+    plan_id: str
+    t_ns: int
+    """Since the start of the plan."""
+    text: str
+    """What differs then."""
+
+    @property
+    def t_s(self) -> float:
+        """Seconds into the plan."""
+        return self.t_ns / NS_PER_S
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueueItem:
+    """One trial of the queue."""
+
+    row: TrialRow
+    reason: str
+    distance_m: float | None
+    """Largest distance of the recorded tool from the planned replay's, where it was measured."""
+    moment: Moment | None
+    num_labels: int
+    """How many raters labelled it; what they said is not shown here."""
+    flagged: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueuePage:
+    """Everything the queue's template needs."""
+
+    items: tuple[QueueItem, ...]
+    show: str
+    counts: Mapping[str, int]
+    """How many trials each choice of ``SHOW`` holds."""
+    page: int
+    num_pages: int
+    problems: tuple[str, ...]
+
+
+def rank(row: TrialRow) -> int:
+    """Place a trial among ``REASONS``, 0 first."""
+    agreed = agrees(row)
+    if agreed is None:
+        return 2
+    if agreed:
+        return 3
+    return 0 if row.sim_planned else 1
+
+
+def distances_m(judgement: Judgement) -> dict[str, float]:
+    """How far each trial's tool was from its planned replay at most, as the evaluator measured."""
+    motions = () if judgement.comparison is None else judgement.comparison.motions
+    return {
+        motion.episode: motion.position_max_m
+        for motion in motions
+        if (motion.side, motion.against) == ("recorded", "planned")
+    }
+
+
+def worst_first(judgement: Judgement) -> list[TrialRow]:
+    """Order trials: wrong yes, wrong no, undecided, the rest; within each the farthest first."""
+    far = distances_m(judgement)
+    return sorted(
+        judgement.rows, key=lambda row: (rank(row), -far.get(row.episode, 0.0), row.episode)
+    )
+
+
+def build_queue(
+    run: RunFolder,
+    judgement: Judgement,
+    reviews: tuple[Sequence[Review], Sequence[str]],
+    *,
+    show: str,
+    page: int,
+) -> QueuePage:
+    """Gather one page of the queue.
+
+    Args:
+        run: The run folder.
+        judgement: Its trials.
+        reviews: The labels in the run, and what is wrong with files that hold none.
+        show: One of ``SHOW``; anything else shows all.
+        page: Which page, from 1; one that is not there shows the nearest.
+    """
+    found, problems = reviews
+    far = distances_m(judgement)
+    flagged = {review.trial_id for review in found if review.flag}
+    rows = worst_first(judgement)
+    chosen = {
+        "": rows,
+        "wrong_yes": [row for row in rows if rank(row) == 0],
+        "disagree": [row for row in rows if agrees(row) is False],
+        "diverged": sorted(
+            (row for row in rows if row.episode in far), key=lambda row: -far[row.episode]
+        ),
+        "flagged": [row for row in rows if row.episode in flagged],
+    }
+    show = show if show in chosen else ""
+    rows = chosen[show]
+    num_pages = max(1, -(-len(rows) // PER_PAGE))
+    page = min(max(page, 1), num_pages)
+    labels: dict[str, int] = {}
+    for review in found:
+        if is_label(review):
+            labels[review.trial_id] = labels.get(review.trial_id, 0) + 1
+    return QueuePage(
+        items=tuple(
+            QueueItem(
+                row=row,
+                reason=REASONS[rank(row)],
+                distance_m=far.get(row.episode),
+                moment=moment_of(run, row),
+                num_labels=labels.get(row.episode, 0),
+                flagged=row.episode in flagged,
+            )
+            for row in rows[(page - 1) * PER_PAGE : page * PER_PAGE]
+        ),
+        show=show,
+        counts={name: len(rows) for name, rows in chosen.items()},
+        page=page,
+        num_pages=num_pages,
+        problems=tuple(problems),
+    )
+
+
+def is_label(review: Review) -> bool:
+    """Whether a review holds an answer, if only that it cannot be told."""
+    return review.result in ("success", "failure", "unknown")
+
+
+def moment_of(run: RunFolder, row: TrialRow) -> Moment | None:
+    """Find the first divergence that the replays of a trial tell, or the first failing factor.
+
+    Args:
+        run: The run folder.
+        row: The trial.
+    """
+    for name in (row.executed_replay, row.planned_replay):
+        path = run.derived_dir / name if name else None
+        if path is None or not path.is_file():
+            continue
+        status = path.stat()
+        moment = _moment(path, status.st_mtime_ns, status.st_size)
+        if moment is not None:
+            return moment
+    return None
+
+
+@lru_cache(maxsize=4096)
+def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
+    try:
+        episode = Episode.open(path)
+        messages = episode.messages(episode.topics_of_type(schema.DIVERGENCE))
+        for message in messages:
+            record = parse_record(message.data, name="divergence")
+            if first := record["first"]:
+                return Moment(
+                    plan_id=record["plan_id"], t_ns=first["first_t_ns"], text=first["detail"]
+                )
+        for _, verdict in streams.verdicts(episode):
+            name = verdict.first_failing
+            factor = verdict.factors()[name] if name else None
+            if factor is not None and factor.first_t_ns is not None:
+                text = factor.detail or factor.cause or f"{name} fails in the twin"
+                return Moment(plan_id=verdict.plan_id, t_ns=factor.first_t_ns, text=text)
+    except GstError:
+        return None  # the trial's own page says what is wrong with the file
+    return None
+
+
+def thumbnail(run: RunFolder, row: TrialRow) -> bytes:
+    """Draw a trial at the moment of its divergence, as JPEG; drawn once, and kept in the run.
+
+    Without such a moment it shows the last picture.
+
+    Args:
+        run: The run folder.
+        row: The trial.
+
+    Raises:
+        NotHereError: When the recording has no picture.
+        GstError: When it cannot be read.
+    """
+    path = episode_path(run, row.episode)
+    moment = moment_of(run, row)
+    status = path.stat()
+    what = (row.episode, status.st_mtime_ns, status.st_size, moment, THUMBNAIL_PX)
+    name = hashlib.sha256(row.episode.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+    key = hashlib.sha256(repr(what).encode()).hexdigest()[:16]
+    kept = run.results_dir / THUMBNAILS / f"{name}-{key}.jpg"
+    with _DRAWING:
+        if kept.is_file():
+            return kept.read_bytes()
+        data = _drawn(path, moment)
+        try:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            for old in kept.parent.glob(f"{name}-*.jpg"):
+                old.unlink()
+            write_whole(kept, data)
+        except OSError:  # a run that only can be read is drawn anew each time
+            pass
+    return data
+
+
+def _drawn(path: Path, moment: Moment | None) -> bytes:
+    track = main_camera(path)
+    stamp_ns = track.stamps_ns[-1]
+    if moment is not None:
+        start_ns, _ = streams.execution_ns(streams.events(Episode.open(path)), moment.plan_id)
+        stamp_ns = stamp_ns if start_ns is None else start_ns + moment.t_ns
+    data, _ = read_frame(path, track.camera_id, stamp_ns)
+    with open_image(data) as image:
+        small = image.convert("RGB")
+        small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+        buffer = io.BytesIO()
+        small.save(buffer, format="jpeg", quality=78)
+    return buffer.getvalue()
+
+
+def main_camera(path: Path) -> CameraTrack:
+    """Return the recorded camera that shows most: the first that is not on the wrist.
+
+    Raises:
+        NotHereError: When the recording has no picture.
+    """
+    tracks = camera_tracks(path)
+    names = sorted(name for name in tracks if not name.startswith(RENDERED))
+    if not names:
+        message = f"no camera images in {path.name}."
+        raise NotHereError(message)
+    return tracks[min(names, key=lambda name: ("wrist" in name or "hand" in name, name))]

@@ -1,0 +1,43 @@
+"""The real command as a process of its own."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bridge.episode.run_folder import RunFolder
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def dashboard(run: RunFolder, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start the real command and wait for its address."""
+    command = [
+        sys.executable,
+        "-m",
+        "robot_gst",
+        "dashboard",
+        str(run.path),
+        "--port",
+        str(port),
+        "--json",
+    ]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        text = ""
+        while not text.endswith("}\n"):
+            line = process.stdout.readline()
+            assert line, process.stderr.read()
+            text += line
+        yield process, json.loads(text)["url"]
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()

@@ -1,0 +1,390 @@
+"""Labels by raters who see neither the twin nor each other, and none of which is ever lost."""
+
+import json
+import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from urllib.parse import quote
+
+import httpx
+import pytest
+from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
+from serving import dashboard
+from visible import words
+
+from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
+from bridge.exchange.reviews import (
+    Review,
+    ReviewConflictError,
+    read_reviews,
+    readable_reviews,
+    save_review,
+    saved_review,
+)
+from dashboards.comparison import judge
+from dashboards.guard import Admission
+from dashboards.label_page import OPERATOR, next_unrated, rater_name, trials_to_label
+from dashboards.review_routes import MAX_BODY
+from evaluator.compare.raters import with_reviews
+
+ANN = "/label?rater=Ann"
+
+
+def label(trial: str = "trial_0001", result: str = "success", **more: object) -> dict[str, object]:
+    return {"trial_id": trial, "seen": "", "result": result, **more}
+
+
+@pytest.fixture
+def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+    """Return the synthetic run, for a test that writes labels into it."""
+    copy = tmp_path / "monday"
+    shutil.copytree(shared_run.path, copy)
+    return RunFolder(copy)
+
+
+@pytest.fixture
+def pages(run: RunFolder, synthetic: ModuleType) -> Any:
+    """Return a browser on that run."""
+    return synthetic.browser_of(run)
+
+
+def test_a_label_is_on_disk_as_the_evaluator_reads_it(pages: Any, run: RunFolder) -> None:
+    answer = pages.post(ANN, json=label(result="failure", cause="dropped it", note="é", flag=True))
+    assert answer.status_code == 200
+    (kept,) = read_reviews(run.path / "reviews")
+    assert (kept.trial_id, kept.rater, kept.success) == ("trial_0001", "Ann", False)
+    assert kept.says == ("failure", "dropped it", "é", True)
+    assert kept.time.endswith("Z")
+    assert answer.json()["next"] != "trial_0001"
+    assert pages.post(ANN, json=label(cause="dropped it", seen=answer.json()["version"])).json()[
+        "saved"
+    ]["cause"] == ("")  # a success has none
+
+
+def test_nothing_that_anybody_else_said_changes_what_a_rater_sees(
+    tmp_path: Path, synthetic: ModuleType
+) -> None:
+    """The law of blindness: two runs that differ only in what others said give the same bytes."""
+    sides = {  # recorded and twin, trial by trial: another one is the worst on each side
+        "a": ((True, False), (True, True), (False, False)),
+        "b": ((False, False), (True, True), (False, True)),
+    }
+    shown = []
+    for side, outcomes in sides.items():
+        run = RunFolder.create(tmp_path / side / "run")
+        for number, (recorded, twin) in enumerate(outcomes, start=1):
+            trial = synthetic.Trial(
+                id=f"trial_000{number}",
+                condition="with_replanning" if recorded else "without_replanning",
+                start_id="s1",
+                recorded=recorded,
+                planned=twin,
+            )
+            synthetic.write_trial(run, trial)
+            synthetic.write_replay(run, trial, "planned", twin)
+            heard = "success" if recorded else "failure"
+            other = Review(trial_id=trial.id, rater="Bob", result=heard, note=heard, flag=recorded)
+            other.write(run.path)
+        browser = synthetic.browser_of(run)
+        seen = []
+        for at in ("", *(f"&at=trial_000{number}" for number in (1, 2, 3))):
+            page = browser.get(f"{ANN}{at}", follow_redirects=True)
+            assert page.status_code == 200
+            seen.append(page.text.replace(str(tmp_path / side), ""))
+        for number in (1, 2, 3):
+            answer = browser.post(ANN, json=label(f"trial_000{number}")).json()
+            seen.append((answer["next"], answer["saved"]["result"]))
+        shown.append(seen)
+    assert shown[0] == shown[1]
+    assert "Bob" not in str(shown)
+
+
+def test_each_rater_has_an_order_of_their_own_over_the_same_trials(shared_run: RunFolder) -> None:
+    judgement = judge(shared_run)
+    orders = {name: trials_to_label(judgement, "", name) for name in ("Ann", "Bob", "Cleo", "Di")}
+    assert len({tuple(order) for order in orders.values()}) > 1
+    assert len({frozenset(order) for order in orders.values()}) == 1
+    assert orders["Ann"] == trials_to_label(judgement, "", "Ann")
+    assert next_unrated(["a", "b", "c"], {"b"}, "a") == "c"
+    assert next_unrated(["a", "b", "c"], {"b", "c"}, "b") == "a"
+    assert next_unrated(["a"], {"a"}, None) is None
+
+
+def test_the_worst_are_mixed_with_as_many_others(
+    shared_run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dashboards.label_page.WORST", 1)
+    judgement = judge(shared_run)
+    chosen = {name: trials_to_label(judgement, "worst", name) for name in ("Ann", "Bob", "Cleo")}
+    assert all(len(order) == 2 and "trial_0002" in order for order in chosen.values())
+    assert len({frozenset(order) for order in chosen.values()}) == 1
+
+
+def test_the_second_of_two_tabs_is_told_and_may_replace(pages: Any, run: RunFolder) -> None:
+    first = pages.post(ANN, json=label(result="failure", cause="collision"))
+    late = pages.post(ANN, json=label(result="success"))
+    assert late.status_code == 409
+    assert "changed elsewhere" in late.json()["message"]
+    assert late.json()["saved"]["cause"] == "collision"
+    assert late.json()["version"] == first.json()["version"]
+    assert read_reviews(run.path / "reviews")[0].result == "failure"
+    # The same answer once more is no conflict: a page asks again when it heard nothing.
+    again = pages.post(ANN, json=label(result="failure", cause="collision"))
+    assert (again.status_code, again.json()["version"]) == (200, first.json()["version"])
+    replaced = pages.post(ANN, json=label(result="success", seen=late.json()["version"]))
+    assert replaced.status_code == 200
+    assert read_reviews(run.path / "reviews")[0].result == "success"
+
+
+def test_of_many_who_save_at_once_one_wins_and_the_others_are_told(tmp_path: Path) -> None:
+    start = threading.Barrier(8)
+
+    def save(number: int) -> bool:
+        start.wait()
+        review = Review(trial_id="t", rater="Ann", note=str(number))
+        try:
+            save_review(tmp_path, "t", "Ann", review, seen="")
+        except ReviewConflictError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        won = list(pool.map(save, range(8)))
+    assert sum(won) == 1
+    (kept,) = read_reviews(tmp_path / "reviews")
+    assert kept.note == str(won.index(True))
+    assert len(list((tmp_path / "reviews").iterdir())) == 1
+
+
+def test_undo_brings_back_what_was_there_even_nothing(pages: Any, run: RunFolder) -> None:
+    first = pages.post(ANN, json=label(result="failure", note="hm")).json()
+    second = pages.post(ANN, json=label(result="success", seen=first["version"])).json()
+    back = pages.post(
+        ANN, json=label(**{**first["saved"], "seen": second["version"], "time": "ignored"})
+    ).json()
+    assert (back["saved"]["result"], back["saved"]["note"]) == ("failure", "hm")
+    gone = pages.post(ANN, json=label(result=None, seen=back["version"]))  # type: ignore[arg-type]
+    assert gone.json()["saved"] is None
+    assert gone.json()["next"] is not None
+    assert read_reviews(run.path / "reviews") == []
+
+
+def test_a_flag_without_an_answer_is_no_label(pages: Any, run: RunFolder) -> None:
+    pages.post(ANN, json=label(result="unrated", flag=True, note="look again"))
+    assert "Ann 0 4" in words(pages.get("/reviews").text)
+    assert "flagged 1" in words(pages.get("/queue").text)
+    assert "look again" not in pages.get("/queue").text
+    comparison = judge(run).comparison
+    assert comparison is not None
+    missing = with_reviews(comparison, read_reviews(run.path / "reviews")).missing
+    assert "raters: no trial has two known labels" in missing
+
+
+def test_agreement_is_held_back_until_everybody_is_done(pages: Any, run: RunFolder) -> None:
+    for rater, last in (("Ann", 5), ("Bob", 4)):
+        for number in range(1, last):
+            result = "success" if number % 2 else "failure"
+            body = label(f"trial_000{number}", result, note=f"says {rater}")
+            assert pages.post(f"/label?rater={rater}", json=body).status_code == 200
+    held = words(pages.get("/reviews").text)
+    assert "Bob has trials left" in held
+    assert "kappa" not in held.lower()
+    assert "says Ann" not in held
+    assert "kappa" in words(pages.get("/reviews?show=1").text).lower()
+    pages.post("/label?rater=Bob", json=label("trial_0004"))
+    shown = words(pages.get("/reviews").text)
+    assert "says Ann" in shown
+    comparison = judge(run).comparison
+    assert comparison is not None
+    tables = {
+        table.id: table
+        for table in with_reviews(comparison, read_reviews(run.path / "reviews")).tables
+    }
+    at = tables["raters"].columns.index("kappa")
+    assert len(tables["raters"].rows) == 3  # the operator is a rater, too
+    for row in tables["raters"].rows:
+        assert row[at] is None or f"{row[at]:.3f}" in shown
+    done = words(pages.get(ANN).text)
+    assert "All 4 trials are labelled" in done
+
+
+def test_names_that_look_alike_on_disk_keep_labels_of_their_own(tmp_path: Path) -> None:
+    trials = ["a/1", "a_1", "a 1", "../a", "ä", "x" * 400, "x" * 401]
+    for trial in trials:
+        for rater in ("Ann Lee", "Ann_Lee"):
+            Review(trial_id=trial, rater=rater, result="success").write(tmp_path)
+    assert len(read_reviews(tmp_path / "reviews")) == 2 * len(trials)
+    assert {path.parent.name for path in tmp_path.rglob("*.json")} == {"reviews"}
+    assert saved_review(tmp_path, "a/1", "Ann Lee").review is not None
+    assert saved_review(tmp_path, "a/1", "Nobody").version == ""
+
+
+def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
+    pages: Any, run: RunFolder
+) -> None:
+    (run.path / "reviews").mkdir()
+    table = "trial_id,rater,time,result,note\ntrial_0001,Ann,2026-01-01,fail,from a table\n"
+    (run.path / "reviews" / "ann.csv").write_text(table)
+    page = pages.get(f"{ANN}&at=trial_0001").text
+    assert 'data-result="failure"' in page
+    assert "from a table" in page
+    assert pages.post(ANN, json=label(result="success")).status_code == 200
+    assert [r.result for r in read_reviews(run.path / "reviews")] == ["success"]
+
+
+def test_a_broken_label_file_is_named_and_hides_no_other(pages: Any, run: RunFolder) -> None:
+    pages.post(ANN, json=label())
+    (run.path / "reviews" / "broken.json").write_text("{")
+    assert "broken.json" in words(pages.get("/queue").text)
+    found, problems = readable_reviews(run.path)
+    assert ([r.rater for r in found], len(problems)) == (["Ann"], 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "status"),
+    [
+        ({"headers": {"Origin": "http://evil.example"}}, 403),
+        ({"headers": {"Origin": "null"}}, 403),
+        ({"headers": {"Origin": ""}}, 403),
+        ({"headers": {"Origin": "http://127.0.0.1:8601"}}, 403),
+        ({"headers": {"Host": "evil.example", "Origin": "http://evil.example"}}, 400),
+        ({"json": label("trial_9999")}, 404),
+        ({"json": label("../episodes/trial_0001")}, 404),
+        ({"json": label(result="maybe")}, 400),
+        ({"json": label(flag="yes")}, 400),
+        ({"json": label(note="x" * 5000)}, 400),
+        (
+            {
+                "content": json.dumps(label(note="\ud800")).encode(),
+                "headers": {"Content-Type": "application/json"},
+            },
+            400,
+        ),
+        ({"json": label(seen=3)}, 400),
+        ({"json": [label()]}, 400),
+        ({"content": b"{", "headers": {"Content-Type": "application/json"}}, 400),
+        ({"content": b"{}", "headers": {"Content-Type": "text/plain"}}, 415),
+        ({"content": b" " * (MAX_BODY + 1), "headers": {"Content-Type": "application/json"}}, 413),
+    ],
+)
+def test_what_is_no_label_of_this_page_changes_nothing(
+    pages: Any, run: RunFolder, options: dict[str, Any], status: int
+) -> None:
+    body = {} if {"json", "content"} & options.keys() else {"json": label()}
+    assert pages.post(ANN, **body, **options).status_code == status
+    assert readable_reviews(run.path) == ([], [])
+
+
+def test_without_the_token_nothing_is_written(run: RunFolder, synthetic: ModuleType) -> None:
+    admission = Admission(host="0.0.0.0", token="secret")
+    browser = synthetic.browser_of(run, admission=admission)
+    assert browser.post(ANN, json=label()).status_code == 403
+    cookie = {"Cookie": "robot_gst_token=secret"}
+    assert browser.post(ANN, json=label(), headers=cookie).status_code == 200
+
+
+@pytest.mark.parametrize("name", ["", " ", "a\nb\x00", "x" * 81, OPERATOR])
+def test_a_name_that_no_rater_can_have_is_refused(name: str, pages: Any) -> None:
+    with pytest.raises(UsageError):
+        rater_name(name)
+    answer = pages.get(f"/label?rater={quote(name)}")
+    assert answer.status_code == 200
+    assert "Start labelling" in answer.text
+    assert pages.post(f"/label?rater={quote(name)}", json=label()).status_code == 400
+
+
+NUM_TRIALS = 100
+ANSWERS = ("y", "2", "u")
+RESULTS = {"y": ("success", ""), "2": ("failure", "dropped it"), "u": ("unknown", "")}
+
+
+@pytest.fixture
+def hundred(tmp_path: Path) -> RunFolder:
+    """Return a run of a hundred trials without pictures."""
+    run = RunFolder.create(tmp_path / "run")
+    for number in range(NUM_TRIALS):
+        name = f"trial_{number:04d}"
+        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
+            writer.describe(EpisodeInfo(id=name, kind="trial", task="cube_into_box"))
+    return run
+
+
+def key_for(trial: str) -> str:
+    return ANSWERS[int(trial[-4:]) % 3]
+
+
+def label_by_keyboard(tab: Browser, count: int) -> None:
+    for _ in range(count):
+        tab.press(key_for(tab.ask("document.getElementById('label').dataset.trial")), loads=True)
+
+
+def label_by_http(url: str, acknowledged: dict[str, str], enough: threading.Event) -> None:
+    """Save labels until the server is gone; remember those it said were on disk."""
+    with httpx.Client(base_url=url, headers={"Origin": url.rstrip("/")}) as client:
+        for number in range(NUM_TRIALS):
+            body = label(f"trial_{number:04d}", note=str(number))
+            try:
+                answer = client.post("/label?rater=Bob", json=body)
+            except httpx.HTTPError:
+                return
+            assert answer.status_code == 200
+            acknowledged[f"trial_{number:04d}"] = str(number)
+            if number == 5:
+                enough.set()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_a_hundred_trials_by_keyboard_and_a_server_that_is_killed(
+    hundred: RunFolder, tmp_path: Path
+) -> None:
+    """No mouse; the server dies by SIGKILL in the middle; every label that was given is there."""
+    acknowledged: dict[str, str] = {}
+    enough = threading.Event()
+    with chromium(tmp_path) as tab:
+        with dashboard(hundred) as (process, url):
+            port = int(url.rstrip("/").rpartition(":")[2])
+            tab.show(f"{url}label?rater=Ann", width=390, dark=False)
+            label_by_keyboard(tab, 40)
+            bob = threading.Thread(target=label_by_http, args=(url, acknowledged, enough))
+            bob.start()
+            assert enough.wait(60)
+            process.kill()
+            bob.join()
+        kept = {r.trial_id: r for r in read_reviews(hundred.path / "reviews") if r.rater == "Bob"}
+        assert acknowledged
+        assert {name: kept[name].note for name in acknowledged} == acknowledged
+        here = tab.ask("document.getElementById('label').dataset.trial")
+        tab.press(key_for(here))
+        with dashboard(hundred, port):
+            tab.await_load()  # the page asked again until it was heard
+            label_by_keyboard(tab, NUM_TRIALS - 42)
+            # The last one wrongly, with undo.
+            here = tab.ask("document.getElementById('label').dataset.trial")
+            tab.press("2" if key_for(here) != "2" else "u", loads=True)
+            assert "All 100 trials are labelled" in tab.ask("document.body.innerText")
+            tab.show(f"{url}label?rater=Ann&at={here}", width=390, dark=False)
+            tab.press("z", loads=True)
+            assert tab.ask("document.getElementById('label').dataset.result") == ""
+            tab.press("n")  # stays, for the cause
+            tab.ask_when("!busy && form.dataset.result === 'failure'")
+            tab.press("f")
+            tab.ask_when("!busy && form.dataset.flag === 'yes'")
+            tab.press("m")
+            tab.call("Input.insertText", text="yes, under the box")  # no key of a note is an answer
+            tab.press("Escape")
+            tab.ask_when("!busy && note.defaultValue.startsWith('yes')")
+            tab.press(key_for(here), loads=True)
+    said = {r.trial_id: r for r in read_reviews(hundred.path / "reviews") if r.rater == "Ann"}
+    assert len(said) == NUM_TRIALS
+    for name, review in said.items():
+        assert (review.result, review.cause) == RESULTS[key_for(name)]
+    assert not list(hundred.path.rglob("*.part"))
+    assert {name for name, review in said.items() if review.note or review.flag} == {here}
+    assert said[here].note == "yes, under the box"
