@@ -370,7 +370,7 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
             BRIER.of(),
             lambda: (brier(probabilities, happened), brier_interval(probabilities, happened)),
         ),
-        make(BRIER_PERFECT.of(), lambda: _shown(ideal[0])),
+        make(BRIER_PERFECT.of(), lambda: _shown(ideal[0]), reason_without_interval=CERTAIN),
         make(
             BRIER_OF_BASE_RATE.of(),
             lambda: brier_of_base_rate(happened),
@@ -383,7 +383,7 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
                 calibration_error_interval(probabilities, happened),
             ),
         ),
-        make(ECE_PERFECT.of(), lambda: _shown(ideal[1])),
+        make(ECE_PERFECT.of(), lambda: _shown(ideal[1]), reason_without_interval=CERTAIN),
     ]
     bins = reliability_bins(probabilities, happened)
     table = Table(
@@ -396,6 +396,11 @@ def reliability(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Tabl
     return measurements, (table,)
 
 
-def _shown(perfect: Perfect) -> tuple[float, Interval]:
+CERTAIN = "every stated probability is 0 or 1: a perfect forecaster shows nothing else"
+
+
+def _shown(perfect: Perfect) -> float | tuple[float, Interval]:
+    if perfect.low == perfect.high:
+        return perfect.mean
     range_ = Interval(low=perfect.low, high=perfect.high, level=LEVEL, method="perfect-forecaster")
     return perfect.mean, range_
