@@ -153,8 +153,8 @@ def measurement_text(measurement: Measurement) -> str:
         return text
     # The model's r is without the noise of counting: what was counted may lie outside.
     inside = measurement.interval.low <= measurement.value <= measurement.interval.high
-    apart = "" if inside else "; without the noise of counting it lies in"
-    return f"{text}{apart} {ends_text(measurement)} ({method_text(measurement)})"
+    beyond = "" if inside else "; without the noise of counting it lies in"
+    return f"{text}{beyond} {ends_text(measurement)} ({method_text(measurement)})"
 
 
 def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
