@@ -37,8 +37,10 @@ class Judgement:
     run: RunFolder
     index: ReviewIndex | None
     """None while a large run that nobody evaluated is read for the first time."""
+    is_old: bool = False
+    """Whether files of a large run changed since."""
     is_being_updated: bool = False
-    """Whether files changed since, and another process reads them now."""
+    """Whether another process reads them now."""
 
     @property
     def about(self) -> dict[str, Any]:
@@ -128,8 +130,8 @@ def judge(run: RunFolder) -> Judgement:
         if index is not None and _holds(index, state, known):
             return Judgement(run=run, index=index)
         if state.num_files > WAITED_FOR:
-            _update_behind(run, known, state)
-            return Judgement(run=run, index=index, is_being_updated=True)
+            is_read = _update_behind(run, known, state)
+            return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
         from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
 
         known.unwritten, known.tried = refresh(run), state.digest
@@ -166,19 +168,23 @@ def _state(run: RunFolder, known: _Known) -> RunState:
     places = (run.episodes_dir, run.derived_dir, run.notes_dir, run.path / "reviews")
     folders = tuple(stamp_of(path) for path in (*places, run.path / RESULTS))
     is_recent = time.monotonic() - known.looked_s < LOOKED_AT_S
-    if known.state is not None and known.state.num_files > WAITED_FOR:
-        if is_recent and folders == known.folders:
-            return known.state
+    is_large = known.state is not None and known.state.num_files > WAITED_FOR
+    if known.state is not None and is_large and is_recent and folders == known.folders:
+        return known.state
     known.state, known.folders = state_of(run), folders
     known.looked_s = time.monotonic()
     return known.state
 
 
-def _update_behind(run: RunFolder, known: _Known, state: RunState) -> None:
-    """Let another process read a large run, once for each state: it takes minutes and memory."""
+def _update_behind(run: RunFolder, known: _Known, state: RunState) -> bool:
+    """Let another process read a large run, once for each state: it takes minutes and memory.
+
+    Returns:
+        Whether one reads it now.
+    """
     is_reading = known.update is not None and known.update.poll() is None
     if is_reading or known.tried == state.digest:
-        return
+        return is_reading
     known.tried = state.digest
     known.update = subprocess.Popen(
         [sys.executable, "-m", "evaluator.report.review", str(run.path)],
@@ -187,6 +193,7 @@ def _update_behind(run: RunFolder, known: _Known, state: RunState) -> None:
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+    return True
 
 
 def stop_updates() -> None:

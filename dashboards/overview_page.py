@@ -10,7 +10,6 @@ import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from bridge.episode.run_folder import RunFolder
@@ -34,6 +33,17 @@ MOST_TASKS = 60
 MOST_VALUES = 300
 MOST_FAILURES = 8
 MOST_FILES = 100
+COLUMNS = (
+    ("name", "Episode"),
+    ("task", "Task and condition"),
+    ("start", "Start"),
+    ("recorded", "Recorded"),
+    ("planned", "Twin, planned"),
+    ("executed", "Twin, executed"),
+    ("gate", "Gate, before motion"),
+    ("agreement", "Agreement"),
+    ("cause", "First failing factor in the twin"),
+)
 LONGEST = 60
 """Characters of a name in a list to choose from."""
 
@@ -163,9 +173,7 @@ def _names_of(group: str) -> tuple[str, str, str]:
     return task, condition, policy
 
 
-def rate_table(
-    measurements: Sequence[Measurement], selection: Selection
-) -> RateTable | None:
+def rate_table(measurements: Sequence[Measurement], selection: Selection) -> RateTable | None:
     """Arrange rates by group and side; None when there are none.
 
     Args:
@@ -229,7 +237,7 @@ def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
     found: dict[tuple[str, str], dict[str, Measurement]] = {}
     for measurement in measurements:
         parts = measurement.id.split(".", 3)
-        if len(parts) == 4 and parts[0] == "gain":
+        if len(parts) == 4 and parts[0] == "gain" and parts[1] in ("pp", "relative"):
             found.setdefault((parts[3], parts[2]), {})[parts[1]] = measurement
     rows = []
     for (name, side), kinds in found.items():
@@ -282,6 +290,18 @@ class TrialList:
     page: int
     pages: int
     facets: tuple[Facet, ...]
+
+    @property
+    def columns(self) -> tuple[tuple[str, str], ...]:
+        """Order and title of the columns in which any trial of the screen has something."""
+        shown = {
+            "planned": any(t.planned_replay or t.sim_planned is not None for t in self.trials),
+            "executed": any(t.executed_replay or t.sim_executed is not None for t in self.trials),
+            "gate": any(t.verdict is not None for t in self.trials),
+            "cause": any(t.first_failing for t in self.trials),
+        }
+        shown["agreement"] = shown["planned"]
+        return tuple((name, title) for name, title in COLUMNS if shown.get(name, True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,6 +366,7 @@ class Overview:
     outdated: str | None
     """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
+    is_old: bool
     is_being_read: bool
 
 
@@ -416,6 +437,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         notices=_notices(judgement),
         outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
+        is_old=judgement.is_old,
         is_being_read=judgement.is_being_updated,
     )
 
@@ -529,17 +551,11 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     path = shlex.quote(str(run.path))
     if judgement.index is None:
         return f"robot-gst evaluate {path}"
-    has_trials = judgement.index.count(Selection()) > 0
-    evaluates = not judgement.has_results or judgement.outdated() is not None
-    if not has_trials and not _holds_episodes(run.episodes_dir):
+    trials, recorded, replayed = judgement.index.totals()
+    if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
         return f"robot-gst record {path}"
-    if has_trials and not _holds_episodes(run.derived_dir):
-        is_rebuilt = (run.scene_dir / "scene.json").is_file()
-        return f"robot-gst {'replay' if is_rebuilt else 'rebuild'} {path}"
-    if has_trials and judgement.index.replayed() == 0:
-        return f"robot-gst replay {path}"
-    return f"robot-gst evaluate {path}" if evaluates else None
-
-
-def _holds_episodes(folder: Path) -> bool:
-    return next(folder.glob("*.mcap"), None) is not None
+    if recorded and not replayed:
+        has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
+        return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
+    is_due = not judgement.has_results or judgement.outdated() is not None
+    return f"robot-gst evaluate {path}" if is_due else None

@@ -373,11 +373,12 @@ class ReviewIndex:
             found = db.execute(f"SELECT count(*) FROM trials WHERE {where}", values)
             return int(found.fetchone()[0])
 
-    def replayed(self) -> int:
-        """Return how many trials have a replay of the plan sent."""
+    def totals(self) -> tuple[int, int, int]:
+        """Return how many trials there are, how many were recorded, how many were replayed."""
+        text = "SELECT count(*), count(nullif(file, '')), count(planned_replay) FROM trials"
         with self._reading() as db:
-            found = db.execute("SELECT count(planned_replay) FROM trials")
-            return int(found.fetchone()[0])
+            trials, recorded, replayed = db.execute(text).fetchone()
+        return trials, recorded, replayed
 
     def trial(self, episode: str) -> IndexedTrial | None:
         """Return the trial of one recorded episode."""

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,8 @@ def refresh(run: RunFolder) -> bytes:
     began_ns = time.time_ns()
     comparison, reason = None, None
     try:
-        with SummaryCache(run.results_dir / FOLDER) as cache:
-            comparison = compare_run(run, cache=cache)
+        with SummaryCache(run.results_dir / FOLDER) as kept:
+            comparison = compare_run(run, cache=kept)
     except GstError as error:
         reason = str(error)
     return _write(run, comparison, _load(run), reason, began_ns)
@@ -104,9 +105,9 @@ def _write(
         "outdated": _outdated(stored.results, comparison),
         **_about(comparison, stored, has_trials=bool(rows)),
     }
-    slugs: dict[str, str] = {}
+    slug_of = cache(slug)
     content = written_index(
-        ((trial, {name: _slug(getattr(trial, name), slugs) for name in FACETS}) for trial in trials),
+        ((each, {name: slug_of(getattr(each, name)) for name in FACETS}) for each in trials),
         _files(run, comparison, {trial.file for trial in trials}),
         about,
     )
@@ -117,12 +118,6 @@ def _write(
     except OSError:  # a read-only run is shown all the same, and read again next time
         pass
     return content
-
-
-def _slug(text: str, known: dict[str, str]) -> str:
-    if text not in known:
-        known[text] = slug(text)
-    return known[text]
 
 
 def _trial(row: TrialRow) -> IndexedTrial:
@@ -154,9 +149,7 @@ def _trial(row: TrialRow) -> IndexedTrial:
     )
 
 
-def _about(
-    comparison: Comparison | None, stored: _Stored, *, has_trials: bool
-) -> dict[str, Any]:
+def _about(comparison: Comparison | None, stored: _Stored, *, has_trials: bool) -> dict[str, Any]:
     results = stored.results
     stand_in = next(
         (s.stand_in for s in (results, comparison) if s is not None and s.stand_in is not None),

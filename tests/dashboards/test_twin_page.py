@@ -11,7 +11,7 @@ from bridge.episode.run_folder import RunFolder
 from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.twin_page import VIEWS_TITLE, build_twin, view_image
-from evaluator.result import load_results, write_results
+from evaluator.result import Table, load_results, write_results
 
 COLUMNS = ("camera", "stamp_ns", "PSNR (dB)", "SSIM")
 
@@ -27,7 +27,8 @@ def rate(run: RunFolder, psnr_db: list[float | None]) -> None:
     (path,) = run.derived("*.views.*")
     views = sorted(build_twin(run, judge(run)).views, key=lambda view: view.stamp_ns)
     rows = tuple((v.camera_id, v.stamp_ns, db, 0.8) for v, db in zip(views, psnr_db, strict=False))
-    table = replace(results.tables[0], title=VIEWS_TITLE + path.stem, columns=COLUMNS, rows=rows)
+    title = VIEWS_TITLE + path.stem
+    table = Table(id="views_0", title=title, columns=COLUMNS, rows=rows)
     tables = (table,) if psnr_db else ()
     write_results(replace(results, tables=tables), run.results_dir / "results.json")
 
