@@ -70,7 +70,7 @@ class IndexedTrial:
 
 @dataclass(frozen=True, kw_only=True)
 class IndexedFile:
-    """A file of the run that is no trial: a scan, an import, or one that cannot be read."""
+    """A file of the run that is not a trial: a scan, an import, or one that cannot be read."""
 
     name: str
     kind: str = ""
@@ -154,7 +154,7 @@ class Selection:
 
     @property
     def page_number(self) -> int:
-        """The page asked for; what is no number asks for the first."""
+        """The page asked for; anything but a number asks for the first."""
         digits = self.page if self.page.isascii() and self.page.isdigit() else "1"
         return max(1, int(digits[:9]))
 
