@@ -81,6 +81,7 @@ def _environment() -> Environment:
         wording.percent,
         wording.success_share,
         wording.answer_tone,
+        wording.length_text,
         wording.breakable,
     ):
         environment.filters[function.__name__] = function

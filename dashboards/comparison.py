@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bridge.episode.run_folder import RunFolder
+from evaluator.cache import FOLDER, SummaryCache
 from evaluator.result import Exclusion, Measurement, Results, load_results
 from evaluator.review_index import (
     RESULTS,
@@ -23,6 +24,9 @@ from evaluator.review_index import (
     stamp_of,
     state_of,
 )
+
+if TYPE_CHECKING:
+    from evaluator.compare import Comparison
 
 WAITED_FOR = 3_000
 """Files of a run that a page waits for; a larger run is brought up to date behind the page."""
@@ -73,6 +77,19 @@ class Judgement:
         return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
 
     @property
+    def comparison(self) -> "Comparison | None":
+        """Everything the evaluator finds now, for pages that ask it more; None where it cannot."""
+        if self.index is None or self.comparison_reason is not None:
+            return None
+        return _comparison(self.run, self.about["state"])
+
+    @property
+    def comparison_reason(self) -> str | None:
+        """Why the trials cannot be compared."""
+        found = self.about.get("comparison_reason")
+        return found if isinstance(found, str) else None
+
+    @property
     def stand_in(self) -> bool | None:
         """Whether the recorded side is a simulated laboratory; None when nothing says so."""
         found = self.about.get("stand_in")
@@ -99,6 +116,14 @@ class Judgement:
 @lru_cache(maxsize=2)
 def _results(run: RunFolder, _stamp: str) -> Results:
     return load_results(run.path)
+
+
+@lru_cache(maxsize=2)
+def _comparison(run: RunFolder, _state: str) -> "Comparison":
+    from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
+
+    with SummaryCache(run.results_dir / FOLDER) as cache:
+        return compare_run(run, cache=cache)
 
 
 @dataclass
@@ -165,7 +190,7 @@ def _state(run: RunFolder, known: _Known) -> RunState:
 
     A file that comes, goes or is written whole changes its folder.
     """
-    places = (run.episodes_dir, run.derived_dir, run.notes_dir, run.path / "reviews")
+    places = (run.episodes_dir, run.derived_dir, run.notes_dir)
     folders = tuple(stamp_of(path) for path in (*places, run.path / RESULTS))
     is_recent = time.monotonic() - known.looked_s < LOOKED_AT_S
     is_large = known.state is not None and known.state.num_files > WAITED_FOR

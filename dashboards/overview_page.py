@@ -42,6 +42,7 @@ COLUMNS = (
     ("executed", "Twin, executed"),
     ("gate", "Gate, before motion"),
     ("agreement", "Agreement"),
+    ("distance", "Tool off by"),
     ("cause", "First failing factor in the twin"),
 )
 LONGEST = 60
@@ -298,6 +299,7 @@ class TrialList:
             "planned": any(t.planned_replay or t.sim_planned is not None for t in self.trials),
             "executed": any(t.executed_replay or t.sim_executed is not None for t in self.trials),
             "gate": any(t.verdict is not None for t in self.trials),
+            "distance": any(t.distance_m is not None for t in self.trials),
             "cause": any(t.first_failing for t in self.trials),
         }
         shown["agreement"] = shown["planned"]
@@ -530,8 +532,8 @@ def _notices(judgement: Judgement) -> tuple[str, ...]:
     about = judgement.about
     if about.get("results_reason") not in (None, NO_RESULTS):
         notices.append(f"The results cannot be shown: {about['results_reason']}")
-    if about.get("comparison_reason"):
-        notices.append(f"The trials cannot be compared: {about['comparison_reason']}")
+    if judgement.comparison_reason is not None:
+        notices.append(f"The trials cannot be compared: {judgement.comparison_reason}")
     return tuple(notices)
 
 

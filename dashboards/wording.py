@@ -82,6 +82,11 @@ def _figure(value: float, unit: str) -> tuple[str, str]:
     return text.replace("-", "−"), shown
 
 
+def length_text(length_m: float | None) -> str:
+    """Print a length [m] in millimetres, or that it is missing."""
+    return MISSING if length_m is None else number(length_m, "m")
+
+
 SHARES = ("average.", "rate.", "rate_common.")
 """Rates that are means of shares have no count of their own."""
 

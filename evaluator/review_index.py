@@ -21,7 +21,7 @@ from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
 FILE_NAME = "review_index.sqlite"
-VERSION = 1
+VERSION = 2
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -59,6 +59,8 @@ class IndexedTrial:
     planned_replay: str | None
     executed_replay: str | None
     began_ns: int
+    distance_m: float | None
+    """Largest distance of the recorded tool from the planned replay's, where it was measured."""
 
     @property
     def agrees(self) -> bool | None:
@@ -66,6 +68,16 @@ class IndexedTrial:
         if self.sim_planned is None or self.recorded is None:
             return None
         return self.sim_planned == self.recorded
+
+
+def severity(trial: IndexedTrial) -> tuple[int, float, str]:
+    """Sort trials: a wrong yes, a wrong no, undecided, the rest; in each the farthest first.
+
+    A wrong yes, success in the twin of a trial that failed, sends a bad plan to a robot.
+    """
+    agreed = trial.agrees
+    rank = 2 if agreed is None else 3 if agreed else 0 if trial.sim_planned else 1
+    return rank, -(trial.distance_m or 0.0), trial.episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,10 +114,12 @@ SORT = {
     "start": "start_id, seq",
     "recorded": "recorded, seq",
     "planned": "sim_planned, seq",
-    "cause": "failing_cause IS NULL, failing_cause, seq",
+    "cause": "ifnull(failing_cause,'~'), seq",
+    "distance": "ifnull(-distance_m,1), seq",
     "date": "began_ns, seq",
 }
-"""Orders of the list; the first puts disagreements first."""
+"""Orders of the list; the first is that of ``severity``. Only the column before the first comma
+and blank is turned round."""
 FACETS = ("task", "condition", "policy")
 
 
@@ -204,7 +218,7 @@ class RunState:
 def state_of(run: RunFolder) -> RunState:
     """Look at every file that numbers follow from: name, size and time of writing."""
     marks, newest_ns = list[str](), 0
-    for folder in (run.episodes_dir, run.derived_dir, run.notes_dir, run.path / "reviews"):
+    for folder in (run.episodes_dir, run.derived_dir, run.notes_dir):
         for name, size, written_ns in _files_of(folder):
             is_part = name.endswith(PART)
             marks.append(f"{folder.name}/{name} {'' if is_part else f'{size} {written_ns}'}")

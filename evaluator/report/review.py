@@ -28,6 +28,7 @@ from evaluator.review_index import (
     IndexedTrial,
     index_path,
     plain_record,
+    severity,
     state_of,
     written_index,
 )
@@ -95,8 +96,13 @@ def _write(
 ) -> bytes:
     state = state_of(run)
     rows = [] if comparison is None else list(comparison.rows)
-    rank = {False: 0, None: 1, True: 2}
-    trials = sorted(map(_trial, rows), key=lambda each: (rank[each.agrees], each.episode))
+    motions = () if comparison is None else comparison.motions
+    far_m = {
+        motion.episode: motion.position_max_m
+        for motion in motions
+        if (motion.side, motion.against) == ("recorded", "planned")
+    }
+    trials = sorted((_trial(row, far_m.get(row.episode)) for row in rows), key=severity)
     about = {
         "state": state.digest,
         "as_of_ns": began_ns,
@@ -120,7 +126,7 @@ def _write(
     return content
 
 
-def _trial(row: TrialRow) -> IndexedTrial:
+def _trial(row: TrialRow, distance_m: float | None) -> IndexedTrial:
     return IndexedTrial(
         episode=row.episode,
         file="" if row.path is None else row.path.name,
@@ -146,6 +152,7 @@ def _trial(row: TrialRow) -> IndexedTrial:
         planned_replay=row.planned_replay,
         executed_replay=row.executed_replay,
         began_ns=row.began_ns,
+        distance_m=distance_m,
     )
 
 

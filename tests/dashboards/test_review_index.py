@@ -1,9 +1,11 @@
 """The index says what the evaluation says, in any order, page and filter, and is never old."""
 
 import os
+import random
 import shutil
 import sqlite3
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,6 +29,7 @@ from evaluator.review_index import (
     Selection,
     UnusableIndexError,
     index_path,
+    severity,
     state_of,
     written_index,
 )
@@ -37,7 +40,7 @@ PLAIN = IndexedTrial(
     recorded=None, unit="trial", k=None, n=None, plan_id=None, num_plans=0, num_plans_sent=0,
     sim_planned=None, sim_executed=None, verdict=None, p_success=None, first_failing=None,
     failing_detail=None, failing_cause=None, failed_stage="", planned_replay=None,
-    executed_replay=None, began_ns=0,
+    executed_replay=None, began_ns=0, distance_m=None,
 )  # fmt: skip
 ANSWERS = (True, False, None)
 
@@ -64,6 +67,7 @@ def many() -> list[IndexedTrial]:
             failed_stage="grasp" if number % 7 else "",
             start_id=f"s{number % 11}",
             began_ns=10**18 - number,
+            distance_m=number % 13 / 1000 if number % 4 else None,
         )
         for number in range(120)
     ]
@@ -99,6 +103,13 @@ def test_every_order_pages_through_every_trial_once(sort: str) -> None:
     assert steps == list(zip([None, *names], [*names[1:], None], strict=False))
 
 
+def test_the_farthest_come_first_and_what_was_not_measured_last() -> None:
+    found = [trial.distance_m for trial in made(many()).trials(Selection(sort="distance"))]
+    known = [far for far in found if far is not None]
+    assert known == sorted(known, reverse=True)
+    assert found[: len(known)] == known
+
+
 @pytest.mark.parametrize("text", ["TRIAL_0007", "tisch über", "grasp pour", "%", "' OR 1=1 --"])
 def test_words_are_found_in_whatever_case_and_order_and_mean_nothing_to_sql(text: str) -> None:
     trials = many()
@@ -109,6 +120,16 @@ def test_words_are_found_in_whatever_case_and_order_and_mean_nothing_to_sql(text
         return all(word in held.casefold() for word in text.casefold().split())
 
     assert list(found) == [trial for trial in trials if has(trial)]
+
+
+def test_a_wrong_yes_comes_first_and_in_each_kind_the_farthest() -> None:
+    kinds = [(True, False), (False, True), (None, True), (True, True)]
+    trials = [
+        replace(PLAIN, episode=f"{number}", sim_planned=sim, recorded=real, distance_m=far)
+        for number, ((sim, real), far) in enumerate(product(kinds, (0.02, 0.01, None)))
+    ]
+    shuffled = random.Random(1).sample(trials, len(trials))
+    assert sorted(shuffled, key=severity) == trials
 
 
 def test_causes_and_stages_select_the_failures_they_name() -> None:
@@ -123,6 +144,11 @@ def test_the_index_holds_what_the_comparison_holds(shared_run: RunFolder) -> Non
     expected = {row.episode: row for row in compare_run(shared_run).rows}
     found = ReviewIndex.open(refresh(shared_run)).trials(Selection())
     assert {t.episode for t in found} == set(expected)
+    assert [t.episode for t in found] == [t.episode for t in judge(shared_run).rows]
+    assert any(t.distance_m for t in found)
+    again = judge(shared_run).comparison
+    assert again is not None
+    assert {row.episode for row in again.rows} == set(expected)
     for trial in found:
         row = expected[trial.episode]
         for name in ("task", "recorded", "sim_planned", "sim_executed", "verdict", "plan_id"):
