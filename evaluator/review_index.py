@@ -15,6 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from bridge.episode.catalogue_store import printable
 from bridge.episode.provenance import software
 from bridge.episode.run_folder import RunFolder
 from evaluator.cache import FOLDER
@@ -297,16 +298,21 @@ def written_index(
         names = ", ".join((*_COLUMNS, *_FOUND_ONLY))
         db.executemany(
             f"INSERT INTO trials ({names}) VALUES ({marks})",
-            ([*vars(trial).values(), *_found_by(trial, slugs)] for trial, slugs in trials),
+            (_stored([*vars(t).values(), *_found_by(t, slugs)]) for t, slugs in trials),
         )
         marks = ", ".join("?" * len(_FILES))
         db.executemany(
-            f"INSERT INTO files VALUES ({marks})", ([*vars(file).values()] for file in files)
+            f"INSERT INTO files VALUES ({marks})", (_stored(vars(file).values()) for file in files)
         )
         content = json.dumps({**about, "software": software()["version"]}, allow_nan=False)
         db.execute("INSERT INTO documents VALUES ('about', ?)", (content,))
         db.commit()
         return db.serialize()
+
+
+def _stored(values: Iterable[Any]) -> list[Any]:
+    """Spell out what is not valid Unicode, as in names of files."""
+    return [printable(value) if isinstance(value, str) else value for value in values]
 
 
 def _found_by(trial: IndexedTrial, slugs: Mapping[str, str]) -> list[Any]:

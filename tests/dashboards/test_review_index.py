@@ -226,6 +226,12 @@ def test_a_large_run_is_shown_as_it_was_while_another_process_reads_it(
     assert "robot-gst evaluate" in text  # the numbers are older than the label
 
 
+def test_a_name_that_is_not_unicode_is_spelled_out() -> None:
+    trial = replace(PLAIN, episode="trial_\udcff", file="trial_\udcff.mcap", task="\udc80")
+    (found,) = made([trial]).trials(Selection())
+    assert (found.episode, found.task) == ("trial_\\udcff", "\\udc80")
+
+
 def test_a_file_being_written_does_not_make_the_index_old(copy: RunFolder) -> None:
     part = copy.episodes_dir / "trial_0009.mcap.part"
     part.write_bytes(b"1")
