@@ -40,10 +40,10 @@ COLUMNS = (
     ("recorded", "Recorded"),
     ("planned", "Twin, planned"),
     ("executed", "Twin, executed"),
-    ("gate", "Gate, before motion"),
+    ("gate", "Gate"),
     ("agreement", "Agreement"),
     ("distance", "Tool off by"),
-    ("cause", "First failing factor in the twin"),
+    ("cause", "Cause in the twin"),
 )
 LONGEST = 60
 """Characters of a name in a list to choose from."""
