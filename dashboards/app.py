@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, Response
 from starlette.routing import Mount, Route
@@ -17,18 +18,16 @@ from starlette.staticfiles import StaticFiles
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
-from dashboards.comparison import agrees, judge
-from dashboards.episode_page import build_page
+from dashboards.comparison import judge
 from dashboards.errors import NotHereError
-from dashboards.frames import read_frame
 from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path
-from dashboards.overview_page import Selection, build_overview, neighbours
-from dashboards.recording import PageClock, read_recording
-from dashboards.review_routes import review_routes
-from dashboards.twin_page import build_twin, view_image
+from dashboards.overview_page import build_overview, neighbours
+from evaluator.review_index import SHOW, Selection
 
 HERE = Path(__file__).parent
+SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
+"""Text is compressed; images and episodes are already."""
 
 
 def create_app(library: Library, admission: Admission | None = None) -> Starlette:
@@ -40,15 +39,16 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
     """
     pages = Pages(library)
     routes = [
-        Route("/", pages.overview),
-        Route("/episode/{id}", pages.episode),
+        Route("/", pages.overview, middleware=SMALL),
+        Route("/numbers", pages.numbers, middleware=SMALL),
+        Route("/episode/{id}", pages.episode, middleware=SMALL),
         Route("/episode/{id}/frame/{camera}", pages.frame),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
-        Route("/twin", pages.twin),
+        Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
-        Mount("/static", StaticFiles(directory=HERE / "static")),
+        Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
     ]
     return Starlette(
         routes=routes,
@@ -81,11 +81,14 @@ def _environment() -> Environment:
         wording.image_title,
         wording.percent,
         wording.success_share,
-        agrees,
+        wording.answer_tone,
+        wording.length_text,
+        wording.breakable,
     ):
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))
     environment.globals["link"] = link
+    environment.globals["SHOW"] = SHOW
     return environment
 
 
@@ -143,8 +146,15 @@ class Pages:
         selection = Selection.of(request.query_params)
         return self._page("overview.html", request, page=build_overview(run, judge(run), selection))
 
+    def numbers(self, request: Request) -> Response:
+        """``/numbers``: every measurement of the evaluation."""
+        run = self._run(request)
+        return self._page("numbers.html", request, numbers=judge(run).measurements, run=run)
+
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
+        from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
+
         run = self._run(request)
         episode_id = request.path_params["id"]
         judgement = judge(run)
@@ -157,6 +167,9 @@ class Pages:
 
     def frame(self, request: Request) -> Response:
         """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
+        from dashboards.frames import read_frame  # noqa: PLC0415
+        from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
+
         path = episode_path(self._run(request), request.path_params["id"])
         clock = PageClock.of(read_recording(path))
         stamp_ns = clock.stamp_ns(clock.clamp(_seconds(request) or 0.0))
@@ -173,15 +186,21 @@ class Pages:
 
     def reviews(self) -> list[Route]:
         """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
+        from dashboards.review_routes import review_routes  # noqa: PLC0415  # compares runs
+
         return review_routes(self._run, self._page)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
+        from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
+
         run = self._run(request)
         return self._page("twin.html", request, page=build_twin(run, judge(run)))
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
+        from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
+
         run = self._run(request)
         path = derived_path(run, request.path_params["name"])
         stamp = request.query_params.get("stamp", "0")

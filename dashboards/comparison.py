@@ -1,128 +1,229 @@
-"""What the evaluator measured in a run: ``results.json`` where there is one, and the trials."""
+"""What the evaluator measured in a run, from its index; the index is made anew where it is old."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from threading import Lock
+from typing import TYPE_CHECKING, Any
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, PathNotFoundError
 from evaluator.cache import FOLDER, SummaryCache
-from evaluator.compare import Comparison, TrialRow, compare_run
-from evaluator.result import Measurement, Results, load_results
+from evaluator.result import Exclusion, Measurement, Results, load_results
+from evaluator.review_index import (
+    RESULTS,
+    IndexedTrial,
+    ReviewIndex,
+    RunState,
+    Selection,
+    UnusableIndexError,
+    index_path,
+    measurement_of,
+    stamp_of,
+    state_of,
+)
 
-_ASKING = Lock()
-FROM_TRIALS = ("agreement.", "gain.", "rate.")
-"""Numbers that follow from trials, labels and replays, whatever else was asked of an evaluation."""
-DIGITS = 9
-"""Two versions of the program may sum up in another order."""
+if TYPE_CHECKING:
+    from evaluator.compare import Comparison
+
+WAITED_FOR = 3_000
+"""Files of a run that a page waits for; a larger run is brought up to date behind the page."""
+LOOKED_AT_S = 5.0
+"""A larger run's files are looked at again after this; its folders at each page."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """The numbers and rows of one run; parts that are not there are None, with a reason."""
+    """The numbers and trials of one run; what is not there is empty, with a reason."""
 
-    results: Results | None
-    results_reason: str | None
-    comparison: Comparison | None
-    comparison_reason: str | None
+    run: RunFolder
+    index: ReviewIndex | None
+    """None while a large run that nobody evaluated is read for the first time."""
+    is_old: bool = False
+    """Whether files of a large run changed since."""
+    is_being_updated: bool = False
+    """Whether another process reads them now."""
 
     @property
-    def rows(self) -> tuple[TrialRow, ...]:
-        """One row per recorded trial."""
-        return () if self.comparison is None else self.comparison.rows
+    def about(self) -> dict[str, Any]:
+        """What the index says besides trials and files."""
+        return {} if self.index is None else self.index.about
+
+    @property
+    def has_results(self) -> bool:
+        """Whether the run was evaluated and its results can be read."""
+        return self.index is not None and self.about["results_reason"] is None
+
+    @property
+    def rows(self) -> tuple[IndexedTrial, ...]:
+        """All recorded trials, disagreements first."""
+        return () if self.index is None else self.index.trials(Selection())
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``; none before ``robot-gst evaluate``."""
-        return () if self.results is None else self.results.measurements
+        return () if self.index is None else self.index.measurements
+
+    @property
+    def exclusions(self) -> tuple[Exclusion, ...]:
+        """The first of what was left out, and why."""
+        return tuple(Exclusion(**item) for item in self.about.get("exclusions", ()))
+
+    @property
+    def results(self) -> Results | None:
+        """The whole of ``results.json``, with every table."""
+        return _results(self.run, stamp_of(self.run.path / RESULTS)) if self.has_results else None
+
+    @property
+    def comparison(self) -> "Comparison | None":
+        """Everything the evaluator finds now, for pages that ask it more; None where it cannot."""
+        if self.index is None or self.comparison_reason is not None:
+            return None
+        return _comparison(self.run, self.about["state"])
+
+    @property
+    def comparison_reason(self) -> str | None:
+        """Why the trials cannot be compared."""
+        found = self.about.get("comparison_reason")
+        return found if isinstance(found, str) else None
 
     @property
     def stand_in(self) -> bool | None:
         """Whether the recorded side is a simulated laboratory; None when nothing says so."""
-        for source in (self.results, self.comparison):
-            if source is not None and source.stand_in is not None:
-                return source.stand_in
-        return None
+        found = self.about.get("stand_in")
+        return found if isinstance(found, bool) else None
 
     def outdated(self) -> tuple[Measurement | None, Measurement | None] | None:
         """Return the first number that differs between ``results.json`` and the files of the run.
 
         Returns:
             The stored value and the present one; None on a side that does not have it. None when
-            all numbers are up to date, or when there is nothing to compare them with.
+            all numbers are up to date.
         """
-        if self.results is None or self.comparison is None:
+        found = self.about.get("outdated")
+        if found is None:
             return None
-        stored, now = (_from_trials(side.measurements) for side in (self.results, self.comparison))
-        for name in dict.fromkeys((*stored, *now)):
-            if _counts(stored.get(name)) != _counts(now.get(name)):
-                return stored.get(name), now.get(name)
-        return None
+        was, now = (None if side is None else measurement_of(side) for side in found)
+        return was, now
 
-    def row(self, episode_id: str) -> TrialRow | None:
-        """Return the row of one episode."""
-        return next((row for row in self.rows if row.episode == episode_id), None)
-
-    def measurement(self, measurement_id: str) -> Measurement | None:
-        """Return one number, or None when the results do not have it."""
-        return next((m for m in self.measurements if m.id == measurement_id), None)
+    def row(self, episode_id: str) -> IndexedTrial | None:
+        """Return the trial of one episode."""
+        return None if self.index is None else self.index.trial(episode_id)
 
 
-def _from_trials(measurements: Iterable[Measurement]) -> dict[str, Measurement]:
-    return {m.id: m for m in measurements if m.id.startswith(FROM_TRIALS)}
+@lru_cache(maxsize=2)
+def _results(run: RunFolder, _stamp: str) -> Results:
+    return load_results(run.path)
 
 
-def _counts(measurement: Measurement | None) -> tuple[float | None, int | None, int | None]:
-    """What makes a number another one; its interval is a matter of how it was asked for."""
-    if measurement is None:
-        return None, None, None
-    value = measurement.value
-    return None if value is None else round(value, DIGITS), measurement.k, measurement.n
+@lru_cache(maxsize=2)
+def _comparison(run: RunFolder, _state: str) -> "Comparison":
+    from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
+
+    with SummaryCache(run.results_dir / FOLDER) as cache:
+        return compare_run(run, cache=cache)
 
 
-def agrees(row: TrialRow) -> bool | None:
-    """Say whether the planned replay predicted the recorded outcome; None when one is unknown."""
-    if row.sim_planned is None or row.recorded is None:
-        return None
-    return row.sim_planned == row.recorded
+@dataclass
+class _Known:
+    """What this process knows of one run."""
+
+    state: RunState | None = None
+    folders: tuple[str, ...] = ()
+    looked_s: float = 0.0
+    unwritten: bytes | None = None
+    """The index of a run that cannot be written."""
+    tried: str = ""
+    """The state that was last brought up to date."""
+    update: "subprocess.Popen[bytes] | None" = None
+    asking: Lock = field(default_factory=Lock)
+
+
+_KNOWN: dict[RunFolder, _Known] = {}
+_ADDING = Lock()
 
 
 def judge(run: RunFolder) -> Judgement:
-    """Ask the evaluator about a run; asked again only when a file of the run changed."""
-    with _ASKING:  # two pages opened at once wait for one answer instead of asking twice
-        return _judge(run, _state_of(run))
+    """Return what is known of a run; a small one that changed is read again first."""
+    with _ADDING:
+        known = _KNOWN.setdefault(run, _Known())
+    with known.asking:  # two pages opened at once wait for one answer instead of asking twice
+        state = _state(run, known)
+        index = _open(run, known)
+        if index is not None and _holds(index, state, known):
+            return Judgement(run=run, index=index)
+        if state.num_files > WAITED_FOR:
+            is_read = _update_behind(run, known, state)
+            return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
+        from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
+
+        known.unwritten, known.tried = refresh(run), state.digest
+        return Judgement(run=run, index=_open(run, known))
 
 
-def _state_of(run: RunFolder) -> tuple[tuple[str, int, int], ...]:
-    files = [*run.episodes(), *run.derived(), run.results_dir / "results.json"]
-    files += sorted(run.notes_dir.glob("*")) if run.notes_dir.is_dir() else []
-    state = []
-    for path in files:
-        if path.is_file():
-            status = path.stat()
-            state.append((str(path), status.st_mtime_ns, status.st_size))
-    return tuple(state)
+def _holds(index: ReviewIndex, state: RunState, known: _Known) -> bool:
+    if index.about["state"] != state.digest:
+        return False
+    return known.tried == state.digest or not index.about["changed_meanwhile"]
+
+
+def _open(run: RunFolder, known: _Known) -> ReviewIndex | None:
+    path = index_path(run)
+    sources: Sequence[Any] = (path, known.unwritten) if path.is_file() else (known.unwritten,)
+    for source in sources:
+        try:
+            return None if source is None else _opened(source, stamp_of(path))
+        except UnusableIndexError:
+            continue
+    return None
 
 
 @lru_cache(maxsize=8)
-def _judge(run: RunFolder, _state: tuple[tuple[str, int, int], ...]) -> Judgement:
-    results, results_reason = None, None
-    try:
-        results = load_results(run.path)
-    except PathNotFoundError:
-        results_reason = "no results yet"
-    except GstError as error:
-        results_reason = str(error)
-    comparison, comparison_reason = None, None
-    try:
-        with SummaryCache(run.results_dir / FOLDER) as cache:
-            comparison = compare_run(run, cache=cache)
-    except GstError as error:
-        comparison_reason = str(error)
-    return Judgement(
-        results=results,
-        results_reason=results_reason,
-        comparison=comparison,
-        comparison_reason=comparison_reason,
+def _opened(source: Any, _stamp: str) -> ReviewIndex:
+    return ReviewIndex.open(source)
+
+
+def _state(run: RunFolder, known: _Known) -> RunState:
+    """Look at the files; of a large run only at its folders, for a moment after it was looked at.
+
+    A file that comes, goes or is written whole changes its folder.
+    """
+    places = (run.episodes_dir, run.derived_dir, run.notes_dir)
+    folders = tuple(stamp_of(path) for path in (*places, run.path / RESULTS))
+    is_recent = time.monotonic() - known.looked_s < LOOKED_AT_S
+    is_large = known.state is not None and known.state.num_files > WAITED_FOR
+    if known.state is not None and is_large and is_recent and folders == known.folders:
+        return known.state
+    known.state, known.folders = state_of(run), folders
+    known.looked_s = time.monotonic()
+    return known.state
+
+
+def _update_behind(run: RunFolder, known: _Known, state: RunState) -> bool:
+    """Let another process read a large run, once for each state: it takes minutes and memory.
+
+    Returns:
+        Whether one reads it now.
+    """
+    is_reading = known.update is not None and known.update.poll() is None
+    if is_reading or known.tried == state.digest:
+        return is_reading
+    known.tried = state.digest
+    known.update = subprocess.Popen(
+        [sys.executable, "-m", "evaluator.report.review", str(run.path)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )
+    return True
+
+
+def stop_updates() -> None:
+    """End what still reads large runs; what was read so far is kept for the next time."""
+    for known in _KNOWN.values():
+        if known.update is not None and known.update.poll() is None:
+            known.update.terminate()
+            known.update.wait()

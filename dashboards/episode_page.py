@@ -21,7 +21,8 @@ from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.queue_page import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
-from evaluator.compare import TrialRow
+from evaluator.compare.trial import read_tcp_errors
+from evaluator.review_index import IndexedTrial
 
 RECORDED, PLANNED = "recorded", "planned"
 REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
@@ -98,7 +99,7 @@ def main_plots(
     recording: Recording,
     replays: Sequence[Recording],
     sent_plan: Plan | None,
-    row: TrialRow | None,
+    row: IndexedTrial | None,
     clock: PageClock,
 ) -> tuple[TimePlot, ...]:
     """Tool error, tool position, gripper, clearance and objects; only those that have data.
@@ -112,7 +113,7 @@ def main_plots(
     """
     shown = _shown_replays(replays, sent_plan)
     plots = [
-        _error_plot(row, clock),
+        _error_plot(recording, replays, row, clock),
         _clearance_plot(shown, clock),
         *(_tool_plot(recording, shown, axis, clock) for axis in range(3)),
         _width_plot(recording, shown, clock),
@@ -135,10 +136,15 @@ def _shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict
     return dict(sorted(chosen.items(), reverse=True))
 
 
-def _error_plot(row: TrialRow | None, clock: PageClock) -> TimePlot | None:
+def _error_plot(
+    recording: Recording, replays: Sequence[Recording], row: IndexedTrial | None, clock: PageClock
+) -> TimePlot | None:
     start = None if row is None or row.plan_id is None else clock.of_plan_time(row.plan_id, 0)
     if row is None or start is None:
         return None
+    names = {"planned": row.planned_replay, "executed": row.executed_replay}
+    paths = {replay.path.name: replay.path for replay in replays}
+    compared = {against: paths[name] for against, name in names.items() if name in paths}
     signals = [
         Signal(
             name=f"to twin, {series.against}",
@@ -146,7 +152,7 @@ def _error_plot(row: TrialRow | None, clock: PageClock) -> TimePlot | None:
             t_s=series.t_s + start,
             values=MM * series.position_m,
         )
-        for series in row.tcp_errors
+        for series in read_tcp_errors(recording.path, row.plan_id, compared)
     ]
     title, note = "Tool: recorded to replayed distance", "computed by the evaluator"
     return _plot(title, "mm", signals, clock, level=0.0, note=note)
@@ -368,7 +374,7 @@ class EpisodePage:
 
     recording: Recording
     replays: tuple[Recording, ...]
-    row: TrialRow | None
+    row: IndexedTrial | None
     label: Outcome | None
     """How it ended; a label given after the fact counts."""
     verdicts: tuple[VerdictView, ...]
@@ -398,7 +404,7 @@ FACTORS = (
 
 
 def build_page(
-    run: RunFolder, episode_id: str, row: TrialRow | None, t_s: float | None
+    run: RunFolder, episode_id: str, row: IndexedTrial | None, t_s: float | None
 ) -> EpisodePage:
     """Gather the page of one episode.
 

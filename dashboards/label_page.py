@@ -8,14 +8,20 @@ from typing import Any
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.exchange.reviews import UNRATED, Review, SavedReview, save_review, saved_review
+from bridge.exchange.reviews import (
+    OPERATOR,
+    UNRATED,
+    Review,
+    SavedReview,
+    save_review,
+    saved_review,
+)
 from dashboards.comparison import Judgement
 from dashboards.episode_page import CameraView
 from dashboards.frames import RENDERED
 from dashboards.library import episode_path
-from dashboards.queue_page import is_label, main_camera, worst_first
+from dashboards.queue_page import is_label, main_camera, recorded_trials
 from dashboards.recording import PageClock, read_recording
-from evaluator.compare.raters import OPERATOR, with_reviews
 from evaluator.result import Table
 
 CAUSES = (
@@ -119,7 +125,7 @@ def trials_to_label(judgement: Judgement, chosen: str, rater: str) -> list[str]:
         chosen: One of ``SETS``.
         rater: Name of the rater.
     """
-    ids = [row.episode for row in worst_first(judgement)]
+    ids = [row.episode for row in recorded_trials(judgement)]
     if chosen == "worst":
         ids = [*ids[:WORST], *_shuffled(ids[WORST:], "others")[:WORST]]
     return _shuffled(ids, rater)
@@ -267,6 +273,8 @@ def summarise(
     tables: tuple[Table, ...] = ()
     missing: tuple[str, ...] = ()
     if released and judgement.comparison is not None:
+        from evaluator.compare.raters import with_reviews  # noqa: PLC0415  # loads the evaluator
+
         before = judgement.comparison
         after = with_reviews(before, found)
         tables = tuple(table for table in after.tables if table.id in TABLES)

@@ -1,4 +1,4 @@
-"""What the overview shows: headline numbers, success rates of each group, and every trial.
+"""What the first page shows: whether to trust the twin, where it fails, and the trials.
 
 Measurements are chosen by id; nothing is computed. Rates are ``rate.<side>.<group>`` with side
 ``recorded`` or one of the twin's, and group ``<task>.<condition>`` or
@@ -7,19 +7,46 @@ Measurements are chosen by id; nothing is computed. Rates are ``rate.<side>.<gro
 
 import re
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError
 from dashboards import wording
-from dashboards.comparison import Judgement, agrees
+from dashboards.comparison import Judgement
 from dashboards.figures import RateGroup, Scatter, scatter
-from evaluator.compare import TrialRow
-from evaluator.measurements import slug
 from evaluator.result import Exclusion, Measurement
+from evaluator.review_index import (
+    FACETS,
+    NO_RESULTS,
+    IndexedFile,
+    IndexedTrial,
+    Selection,
+)
+
+PAGE = 50
+"""Trials on one screen."""
+MOST_GROUPS = 60
+"""Groups that are drawn and stand in the tables; a selection shows others."""
+MOST_TASKS = 60
+MOST_VALUES = 300
+MOST_FAILURES = 8
+MOST_FILES = 100
+COLUMNS = (
+    ("name", "Episode"),
+    ("task", "Task and condition"),
+    ("start", "Start"),
+    ("recorded", "Recorded"),
+    ("planned", "Twin, planned"),
+    ("executed", "Twin, executed"),
+    ("gate", "Gate"),
+    ("agreement", "Agreement"),
+    ("distance", "Tool off by"),
+    ("cause", "Cause in the twin"),
+)
+LONGEST = 60
+"""Characters of a name in a list to choose from."""
 
 NO_NAME = "-"
 """Stands in an id for an empty name."""
@@ -87,6 +114,7 @@ class RateTable:
 
     sides: tuple[str, ...]
     rows: tuple[RateRow, ...]
+    more_rows: int
     methods: str
 
 
@@ -98,7 +126,7 @@ def headline_cards(judgement: Judgement) -> tuple[Card, ...]:
 def _card(title: str, pattern: str, below: Sequence[str], judgement: Judgement) -> Card:
     found = _find(pattern, judgement.measurements)
     if found is None:
-        why = "not in results.json" if judgement.results else "no results yet"
+        why = "not in results.json" if judgement.has_results else NO_RESULTS
         return Card(title=title, value="missing", detail=why, state="missing")
     more = [_find(other, judgement.measurements) for other in below]
     return Card(
@@ -146,8 +174,13 @@ def _names_of(group: str) -> tuple[str, str, str]:
     return task, condition, policy
 
 
-def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
-    """Arrange all rates by group and side; None when there are none."""
+def rate_table(measurements: Sequence[Measurement], selection: Selection) -> RateTable | None:
+    """Arrange rates by group and side; None when there are none.
+
+    Args:
+        measurements: Everything that was measured.
+        selection: Its groups come first where there are too many for one table.
+    """
     rates = _rates(measurements)
     if not rates:
         return None
@@ -155,8 +188,12 @@ def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
     known = [side for side in SIDE_WORDS if side in present]
     sides = [*known, *(side for side in present if side not in known)]
     rows = []
-    for group, by_side in rates.items():
-        task, condition, policy = _names_of(group)
+    names = {group: _names_of(group) for group in rates}
+    if len(rates) > MOST_GROUPS:
+        names = dict(sorted(names.items(), key=lambda item: not selection.takes_group(*item[1])))
+    for group in list(names)[:MOST_GROUPS]:
+        by_side = rates[group]
+        task, condition, policy = names[group]
         rows.append(
             RateRow(
                 task=task,
@@ -168,6 +205,7 @@ def rate_table(measurements: Sequence[Measurement]) -> RateTable | None:
     return RateTable(
         sides=tuple(SIDE_WORDS.get(side, side.replace("_", " ")) for side in sides),
         rows=tuple(rows),
+        more_rows=len(rates) - len(rows),
         methods=methods(measurements, "rate."),
     )
 
@@ -200,7 +238,7 @@ def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
     found: dict[tuple[str, str], dict[str, Measurement]] = {}
     for measurement in measurements:
         parts = measurement.id.split(".", 3)
-        if len(parts) == 4 and parts[0] == "gain":
+        if len(parts) == 4 and parts[0] == "gain" and parts[1] in ("pp", "relative"):
             found.setdefault((parts[3], parts[2]), {})[parts[1]] = measurement
     rows = []
     for (name, side), kinds in found.items():
@@ -232,68 +270,6 @@ def methods(measurements: Sequence[Measurement], start: str) -> str:
     return "; ".join(dict.fromkeys(named))
 
 
-def other_measurements(
-    measurements: Sequence[Measurement], shown: Sequence[Card]
-) -> tuple[Measurement, ...]:
-    """Whatever is in the results and not already on the page.
-
-    Args:
-        measurements: Everything that was measured.
-        shown: Headline numbers of the page; what they stand for is left out.
-    """
-    ids = {name for card in shown for name in card.ids}
-    return tuple(
-        m
-        for m in measurements
-        if m.id not in ids and not m.id.startswith(("rate.", "rate_common.", "gain"))
-    )
-
-
-SHOW = {"": "all", "disagree": "disagreements", "failure": "recorded failures"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """What the address asks to look at; empty means all."""
-
-    task: str = ""
-    condition: str = ""
-    policy: str = ""
-    show: str = ""
-
-    @staticmethod
-    def of(query: Mapping[str, str]) -> "Selection":
-        """Read the query of an address; unknown values simply select nothing."""
-        return Selection(**{name: query.get(name, "") for name in Selection.__dataclass_fields__})
-
-    def query(self, **changes: str) -> dict[str, str]:
-        """Return this selection as a query, with some fields changed."""
-        names = Selection.__dataclass_fields__
-        return {name: changes.get(name, getattr(self, name)) for name in names}
-
-    def takes_group(self, task: str, condition: str, policy: str) -> bool:
-        """Say whether a group is selected.
-
-        Args:
-            task: Task of the group, as recorded; all three are compared as slugs.
-            condition: Its condition.
-            policy: Its policy.
-        """
-        return (
-            self.task in ("", slug(task))
-            and self.condition in ("", slug(condition))
-            and self.policy in ("", slug(policy))
-        )
-
-    def takes(self, row: TrialRow) -> bool:
-        """Say whether a trial is selected."""
-        if not self.takes_group(row.task, row.condition, row.policy):
-            return False
-        if self.show == "disagree":
-            return agrees(row) is False
-        return self.show != "failure" or row.recorded is False
-
-
 @dataclass(frozen=True, kw_only=True)
 class Facet:
     """One thing to filter by, with its values."""
@@ -304,53 +280,96 @@ class Facet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OtherFile:
-    """A recording that is not a trial: a scan, a probe, an import."""
+class TrialList:
+    """One screen of the trials of a selection."""
 
-    id: str
-    info: EpisodeInfo
-    duration_s: float
+    trials: tuple[IndexedTrial, ...]
+    selected: int
+    """How many the selection holds."""
+    of: int
+    """How many the run holds."""
+    page: int
+    pages: int
+    facets: tuple[Facet, ...]
+
+    @property
+    def columns(self) -> tuple[tuple[str, str], ...]:
+        """Order and title of the columns in which any trial of the screen has something."""
+        shown = {
+            "planned": any(t.planned_replay or t.sim_planned is not None for t in self.trials),
+            "executed": any(t.executed_replay or t.sim_executed is not None for t in self.trials),
+            "gate": any(t.verdict is not None for t in self.trials),
+            "distance": any(t.distance_m is not None for t in self.trials),
+            "cause": any(t.first_failing for t in self.trials),
+        }
+        shown["agreement"] = shown["planned"]
+        return tuple((name, title) for name, title in COLUMNS if shown.get(name, True))
 
 
 @dataclass(frozen=True, kw_only=True)
-class BrokenFile:
-    """A file that cannot be read, and why."""
+class Failure:
+    """One way to fail: how often, and which selection lists its trials."""
 
-    name: str
+    words: str
+    count: int
+    share: float
+    """Of the most frequent one on its side, for a bar."""
+    query: Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undefined:
+    """Why numbers have no value, and which."""
+
     reason: str
+    ids: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overview:
-    """Everything the overview template needs."""
+    """Everything the first page needs."""
 
     selection: Selection
     stand_in: bool | None
+    summary: str
+    unseen: str
+    notes: tuple[tuple[str, str], ...]
+    tasks: tuple[Mapping[str, str], ...]
+    """Task, its slug, answer and sentence."""
+    more_tasks: int
+    close_pp: float
+    next_trials: str
     cards: tuple[Card, ...]
     has_headline: bool
     """Whether at least one card has a value or a reason."""
     scatter: Scatter | None
+    more_groups: int
+    """Groups that are not drawn."""
     rates: RateTable | None
     gains: tuple[GainRow, ...]
     gain_methods: str
-    trials: tuple[TrialRow, ...]
-    num_trials: int
-    facets: tuple[Facet, ...]
-    others: tuple[OtherFile, ...]
-    broken: tuple[BrokenFile, ...]
-    rest: tuple[Measurement, ...]
+    twin_failures: tuple[Failure, ...]
+    recorded_failures: tuple[Failure, ...]
+    list: TrialList
+    others: tuple[IndexedFile, ...]
+    num_others: int
+    kinds: tuple[tuple[str, int], ...]
+    broken: tuple[IndexedFile, ...]
+    num_broken: int
+    tables: tuple[Mapping[str, Any], ...]
+    """Of a run without trials: what the evaluator says of it."""
+    undefined: tuple[Undefined, ...]
+    num_undefined: int
+    num_numbers: int
     exclusions: tuple[Exclusion, ...]
+    num_exclusions: int
     missing: tuple[str, ...]
     notices: tuple[str, ...]
     outdated: str | None
     """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
-
-
-def ordered(rows: Sequence[TrialRow]) -> list[TrialRow]:
-    """Put disagreements first, then what is undecided, then the rest, each by name."""
-    rank = {False: 0, None: 1, True: 2}
-    return sorted(rows, key=lambda row: (rank[agrees(row)], row.episode))
+    is_old: bool
+    is_being_read: bool
 
 
 def neighbours(
@@ -363,52 +382,156 @@ def neighbours(
         selection: Which trials the list holds.
         episode_id: The trial in question; outside the list it has no neighbours.
     """
-    ids = [row.episode for row in ordered(judgement.rows) if selection.takes(row)]
-    if episode_id not in ids:
+    if judgement.index is None:
         return None, None
-    at = ids.index(episode_id)
-    return (ids[at - 1] if at else None), (ids[at + 1] if at + 1 < len(ids) else None)
+    return judgement.index.neighbours(selection, episode_id)
 
 
 def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -> Overview:
-    """Gather the overview of one run.
+    """Gather the first page of one run.
 
     Args:
         run: The run folder.
         judgement: Its numbers and trials.
         selection: Which trials are listed; the numbers are of all.
     """
-    rows = ordered(judgement.rows)
-    others, broken = _files(run, {row.episode for row in rows})
+    about = judgement.about
+    numbers = judgement.measurements
     cards = headline_cards(judgement)
-    gains = gain_rows(judgement.measurements)
+    groups = [g for g in rate_groups(numbers) if _is_drawable(g)]
+    drawn = sorted(groups, key=lambda g: not _takes(selection, g))[:MOST_GROUPS]
+    others, num_others, kinds = _others(judgement)
+    broken, num_broken = _broken(judgement)
+    tasks = about.get("tasks", [])
+    failures = about.get("failures", [])
     return Overview(
         selection=selection,
         stand_in=judgement.stand_in,
+        summary=about.get("summary", ""),
+        unseen=about.get("unseen", ""),
+        notes=tuple((name, text) for name, text in about.get("notes", [])),
+        tasks=tuple(tasks[:MOST_TASKS]),
+        more_tasks=max(0, len(tasks) - MOST_TASKS),
+        close_pp=about.get("close_pp", 0.0),
+        next_trials=about.get("next_trials", ""),
         cards=cards,
         has_headline=any(card.state != "missing" for card in cards),
-        scatter=scatter(rate_groups(judgement.measurements)),
-        rates=rate_table(judgement.measurements),
-        gains=gains,
-        gain_methods=methods(judgement.measurements, "gain."),
-        trials=tuple(row for row in rows if selection.takes(row)),
-        num_trials=len(rows),
-        facets=_facets(rows),
+        scatter=scatter([g for g in groups if g in drawn]),
+        more_groups=len(groups) - len(drawn),
+        rates=rate_table(numbers, selection),
+        gains=gain_rows(numbers)[:MOST_GROUPS],
+        gain_methods=methods(numbers, "gain."),
+        twin_failures=_failures(failures, twin=True),
+        recorded_failures=_failures(failures, twin=False),
+        list=trial_list(judgement, selection),
         others=others,
+        num_others=num_others,
+        kinds=kinds,
         broken=broken,
-        rest=other_measurements(judgement.measurements, cards),
-        exclusions=judgement.results.exclusions if judgement.results else (),
-        missing=judgement.results.missing if judgement.results else (),
+        num_broken=num_broken,
+        tables=tuple(about.get("tables", [])),
+        undefined=undefined(numbers),
+        num_undefined=sum(number.value is None for number in numbers),
+        num_numbers=len(numbers),
+        exclusions=judgement.exclusions,
+        num_exclusions=about.get("num_exclusions", 0),
+        missing=tuple(about.get("missing", ())),
         notices=_notices(judgement),
         outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
+        is_old=judgement.is_old,
+        is_being_read=judgement.is_being_updated,
     )
+
+
+def _is_drawable(group: RateGroup) -> bool:
+    return group.replayed.value is not None and group.recorded.value is not None
+
+
+def _takes(selection: Selection, group: RateGroup) -> bool:
+    return selection.takes_group(group.task, group.condition, group.policy)
+
+
+def _failures(table: Sequence[Sequence[Any]], *, twin: bool) -> tuple[Failure, ...]:
+    """Lay out one side of the evaluator's table of what failed first."""
+    lines = [line for line in table if (line[0] == "sim planned") == twin][:MOST_FAILURES]
+    most = max((int(line[3]) for line in lines), default=1)
+    return tuple(
+        Failure(
+            words=": ".join(str(word).replace("_", " ") for word in (where, cause) if word),
+            count=int(count),
+            share=int(count) / most,
+            query={"clause": str(where), "cause": str(cause)} if twin else {"stage": str(where)},
+        )
+        for _, where, cause, count in lines
+    )
+
+
+def trial_list(judgement: Judgement, selection: Selection) -> TrialList:
+    """Return the screen of trials that a selection asks for; beyond the last it is the last.
+
+    Args:
+        judgement: Numbers and trials of the run.
+        selection: Which trials, in which order, which screen.
+    """
+    index = judgement.index
+    if index is None:
+        return TrialList(trials=(), selected=0, of=0, page=1, pages=1, facets=())
+    selected, of = index.count(selection), index.count(Selection())
+    pages = max(1, -(-selected // PAGE))
+    page = min(selection.page_number, pages)
+    facets = []
+    for name in FACETS:
+        found = index.values(name) if of else ()
+        if len(found) > 1:
+            labelled = [(value, f"{_words(label)} ({count})") for value, label, count in found]
+            facets.append(Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES])))
+    return TrialList(
+        trials=index.trials(selection, limit=PAGE, offset=PAGE * (page - 1)),
+        selected=selected,
+        of=of,
+        page=page,
+        pages=pages,
+        facets=tuple(facets),
+    )
+
+
+def _words(label: str) -> str:
+    text = label.replace("_", " ")
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def undefined(measurements: Sequence[Measurement]) -> tuple[Undefined, ...]:
+    """Group the numbers without a value by their reason, the commonest first."""
+    found: dict[str, list[str]] = {}
+    for measurement in measurements:
+        if measurement.reason_if_undefined:
+            found.setdefault(measurement.reason_if_undefined, []).append(measurement.id)
+    ordered = sorted(found.items(), key=lambda item: -len(item[1]))
+    return tuple(Undefined(reason=reason, ids=tuple(ids)) for reason, ids in ordered)
+
+
+def _others(
+    judgement: Judgement,
+) -> tuple[tuple[IndexedFile, ...], int, tuple[tuple[str, int], ...]]:
+    if judgement.index is None:
+        return (), 0, ()
+    files, number = judgement.index.files(broken=False)
+    kinds = Counter(" · ".join(filter(None, (f.kind, f.task, f.source))) for f in files)
+    return files[:MOST_FILES], number, tuple(kinds.most_common(MOST_FAILURES))
+
+
+def _broken(judgement: Judgement) -> tuple[tuple[IndexedFile, ...], int]:
+    if judgement.index is None:
+        return (), 0
+    return judgement.index.files(broken=True, limit=MOST_FILES)
 
 
 def _notices(judgement: Judgement) -> tuple[str, ...]:
     notices = []
-    if judgement.results is None and judgement.results_reason != "no results yet":
-        notices.append(f"The results cannot be shown: {judgement.results_reason}")
+    about = judgement.about
+    if about.get("results_reason") not in (None, NO_RESULTS):
+        notices.append(f"The results cannot be shown: {about['results_reason']}")
     if judgement.comparison_reason is not None:
         notices.append(f"The trials cannot be compared: {judgement.comparison_reason}")
     return tuple(notices)
@@ -428,41 +551,13 @@ def _outdated(judgement: Judgement) -> str | None:
 
 def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
     path = shlex.quote(str(run.path))
-    if not run.episodes():
+    if judgement.index is None:
+        return f"robot-gst evaluate {path}"
+    trials, recorded, replayed = judgement.index.totals()
+    if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
         return f"robot-gst record {path}"
-    if not (run.scene_dir / "scene.json").is_file() and not run.derived():
-        return f"robot-gst rebuild {path}"
-    if not run.derived("*.replay.*"):
-        return f"robot-gst replay {path}"
-    is_due = judgement.results is None or judgement.outdated() is not None
+    if recorded and not replayed:
+        has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))
+        return f"robot-gst {'replay' if has_scene else 'rebuild'} {path}"
+    is_due = not judgement.has_results or judgement.outdated() is not None
     return f"robot-gst evaluate {path}" if is_due else None
-
-
-def _facets(rows: Sequence[TrialRow]) -> tuple[Facet, ...]:
-    facets = []
-    for name in ("task", "condition", "policy"):
-        values = sorted({getattr(row, name) for row in rows} - {""})
-        if len(values) > 1:
-            labelled = tuple((slug(value), value.replace("_", " ")) for value in values)
-            facets.append(Facet(name=name, values=(("", "all"), *labelled)))
-    if rows:
-        facets.append(Facet(name="show", values=tuple(SHOW.items())))
-    return tuple(facets)
-
-
-def _files(run: RunFolder, known: set[str]) -> tuple[tuple[OtherFile, ...], tuple[BrokenFile, ...]]:
-    others, broken = [], []
-    for path in [*run.episodes(), *run.derived()]:
-        try:
-            episode = Episode.open(path)
-            if path.parent == run.episodes_dir and path.stem not in known:
-                others.append(
-                    OtherFile(id=path.stem, info=episode.info, duration_s=episode.duration_s)
-                )
-        except GstError as error:
-            broken.append(BrokenFile(name=str(path.relative_to(run.path)), reason=str(error)))
-    reason = "not finished: still being recorded, or its recorder was stopped"
-    for folder in (run.episodes_dir, run.derived_dir):
-        parts = sorted(folder.glob("*.mcap.part"))
-        broken += [BrokenFile(name=str(p.relative_to(run.path)), reason=reason) for p in parts]
-    return tuple(others), tuple(broken)

@@ -17,11 +17,11 @@ from bridge.exchange.reviews import Review
 from bridge.media.color import open_image
 from bridge.task.record import parse_record
 from bridge.whole_file import write_whole
-from dashboards.comparison import Judgement, agrees
+from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, CameraTrack, camera_tracks, read_frame
 from dashboards.library import episode_path
-from evaluator.compare import TrialRow
+from evaluator.review_index import IndexedTrial
 
 PER_PAGE = 24
 SHOW = {
@@ -65,7 +65,7 @@ class Moment:
 class QueueItem:
     """One trial of the queue."""
 
-    row: TrialRow
+    row: IndexedTrial
     reason: str
     distance_m: float | None
     """Largest distance of the recorded tool from the planned replay's, where it was measured."""
@@ -88,32 +88,21 @@ class QueuePage:
     problems: tuple[str, ...]
 
 
-def rank(row: TrialRow) -> int:
+def rank(row: IndexedTrial) -> int:
     """Place a trial among ``REASONS``, 0 first."""
-    agreed = agrees(row)
-    if agreed is None:
+    if row.agrees is None:
         return 2
-    if agreed:
+    if row.agrees:
         return 3
     return 0 if row.sim_planned else 1
 
 
-def distances_m(judgement: Judgement) -> dict[str, float]:
-    """How far each trial's tool was from its planned replay at most, as the evaluator measured."""
-    motions = () if judgement.comparison is None else judgement.comparison.motions
-    return {
-        motion.episode: motion.position_max_m
-        for motion in motions
-        if (motion.side, motion.against) == ("recorded", "planned")
-    }
+def recorded_trials(judgement: Judgement) -> list[IndexedTrial]:
+    """Return the trials that have a recording to look at: wrong yes, wrong no, undecided, the rest.
 
-
-def worst_first(judgement: Judgement) -> list[TrialRow]:
-    """Order trials: wrong yes, wrong no, undecided, the rest; within each the farthest first."""
-    far = distances_m(judgement)
-    return sorted(
-        judgement.rows, key=lambda row: (rank(row), -far.get(row.episode, 0.0), row.episode)
-    )
+    Within each the one whose tool went farthest from its planned replay comes first.
+    """
+    return [row for row in judgement.rows if row.file]
 
 
 def build_queue(
@@ -134,15 +123,15 @@ def build_queue(
         page: Which page, from 1; one that is not there shows the nearest.
     """
     found, problems = reviews
-    far = distances_m(judgement)
     flagged = {review.trial_id for review in found if review.flag}
-    rows = worst_first(judgement)
+    rows = recorded_trials(judgement)
     chosen = {
         "": rows,
         "wrong_yes": [row for row in rows if rank(row) == 0],
-        "disagree": [row for row in rows if agrees(row) is False],
+        "disagree": [row for row in rows if row.agrees is False],
         "diverged": sorted(
-            (row for row in rows if row.episode in far), key=lambda row: -far[row.episode]
+            (row for row in rows if row.distance_m is not None),
+            key=lambda row: -(row.distance_m or 0.0),
         ),
         "flagged": [row for row in rows if row.episode in flagged],
     }
@@ -159,7 +148,7 @@ def build_queue(
             QueueItem(
                 row=row,
                 reason=REASONS[rank(row)],
-                distance_m=far.get(row.episode),
+                distance_m=row.distance_m,
                 moment=moment_of(run, row),
                 num_labels=labels.get(row.episode, 0),
                 flagged=row.episode in flagged,
@@ -179,7 +168,7 @@ def is_label(review: Review) -> bool:
     return review.result in ("success", "failure", "unknown")
 
 
-def moment_of(run: RunFolder, row: TrialRow) -> Moment | None:
+def moment_of(run: RunFolder, row: IndexedTrial) -> Moment | None:
     """Find the first divergence that the replays of a trial tell, or the first failing factor.
 
     Args:
@@ -219,7 +208,7 @@ def _moment(path: Path, _mtime_ns: int, _size: int) -> Moment | None:
     return None
 
 
-def thumbnail(run: RunFolder, row: TrialRow) -> bytes:
+def thumbnail(run: RunFolder, row: IndexedTrial) -> bytes:
     """Draw a trial at the moment of its divergence, as JPEG; drawn once, and kept in the run.
 
     Without such a moment it shows the last picture.

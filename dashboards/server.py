@@ -17,7 +17,7 @@ import uvicorn
 
 from bridge.terminal import Output
 from dashboards.app import create_app
-from dashboards.comparison import judge
+from dashboards.comparison import judge, stop_updates
 from dashboards.config import DashboardConfig
 from dashboards.errors import AddressTakenError
 from dashboards.guard import Admission, is_loopback
@@ -106,6 +106,7 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     with listener, _ending_on_signals(server):
         output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
         server.run(sockets=[listener])
+    stop_updates()
     if _are_at_work(set(threading.enumerate()) - others):
         # Python waits for threads that make a page, a minute for a large run, and ends others by
         # unwinding them, which aborts the process inside native code. What the evaluator keeps is

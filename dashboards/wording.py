@@ -1,9 +1,12 @@
 """Numbers and outcomes as words: what a page prints, and nothing it computes."""
 
+import re
 from collections.abc import Mapping
 
+from markupsafe import Markup, escape
+
 from bridge.task.verdict import Factor
-from evaluator.report.wording import noun
+from evaluator.quantity import noun
 from evaluator.result import Interval, Measurement
 
 MISSING = "missing"
@@ -27,6 +30,22 @@ def factor_word(factor: Factor) -> str:
 def tone(value: bool | None) -> str:
     """Return the CSS class that goes with a yes, a no or a neither."""
     return {True: "good", False: "bad", None: "unknown"}[value]
+
+
+def answer_tone(answer: str) -> str:
+    """Return the CSS class of an answer on whether the twin can stand for the recordings."""
+    return {"yes": "good", "not for this": "bad"}.get(answer, "unknown")
+
+
+SHORT = 24
+"""Characters of a name that fits any column."""
+
+
+def breakable(text: str) -> Markup:
+    """Let a long name break behind its joints, so that it never widens a page."""
+    if len(text) <= SHORT:
+        return escape(text)
+    return Markup("<wbr>").join(re.split(r"(?<=[_./-])(?=\w)", text))
 
 
 NARROW = "\u00a0"
@@ -61,6 +80,11 @@ def _figure(value: float, unit: str) -> tuple[str, str]:
     if value != 0 and float(text) == 0:
         text = f"{factor * value:.1g}"  # small is not nothing
     return text.replace("-", "−"), shown
+
+
+def length_text(length_m: float | None) -> str:
+    """Print a length [m] in millimetres, or that it is missing."""
+    return MISSING if length_m is None else number(length_m, "m")
 
 
 SHARES = ("average.", "rate.", "rate_common.")

@@ -1,5 +1,6 @@
 """Commands of ``evaluator``; imports stay late so that --help is quick."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from evaluator.design.config import StudyOptions, Wanted
 from evaluator.live.config import LiveConfig
 from evaluator.memory import without_collecting
 from evaluator.metrics.image_protocol import ImageOptions
+from evaluator.review_index import RESULTS
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
@@ -77,6 +79,7 @@ def evaluate(
         message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
     source = sources[0] if sources else None
+    began_ns = time.time_ns()
     if live.live:
         return _follow(sources, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
@@ -102,6 +105,11 @@ def evaluate(
     with without_collecting():
         written = write_report(comparison, out or folder, second)
     results = written.content
+    if len(sources) == 1 and written.results == sources[0] / RESULTS:
+        from bridge.episode.run_folder import RunFolder
+        from evaluator.report.review import index_run
+
+        index_run(RunFolder(sources[0]), comparison, results, began_ns)
     record = results.to_record() if output.json else {}  # of a large run it takes a second
     output.result(record, summary_text(results, written))
     failed = [_missed_text(item) for item in missed(thresholds, results)]

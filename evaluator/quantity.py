@@ -20,6 +20,14 @@ def slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_+-]+", "_", plain) or "-"
 
 
+PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
+
+
+def noun(name: str, count: int) -> str:
+    """Write what was counted, in the plural but for one."""
+    return name if count == 1 else PLURALS.get(name, f"{name}s")
+
+
 def _code(letter: str) -> str:
     return f"+{ord(letter):04x}"
 

@@ -23,6 +23,8 @@ from bridge.whole_file import write_whole
 FOLDER = "reviews"
 SCHEMA_VERSION = 1
 RESULTS = {True: "success", False: "failure", None: "unknown"}
+OPERATOR = "recorded label"
+"""Not a rater's name: how tables call the outcome that the recording was labelled with."""
 UNRATED = "unrated"
 """The result of a review that holds only a flag or a note."""
 UNSAVED = ""

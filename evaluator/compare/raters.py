@@ -8,13 +8,12 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from bridge.exchange.reviews import Review
+from bridge.exchange.reviews import OPERATOR, Review
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Cell, Table
 from evaluator.statistics.gate import Confusion, kappa
 
-OPERATOR = "recorded label"
 SEED, DRAWS = 0, 2000
 FEWEST = 8
 """Trials rated twice below which an interval of kappa says nothing."""

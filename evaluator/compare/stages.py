@@ -173,7 +173,7 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
         if row.sim_planned is False
     )
     recorded = failure_taxonomy(
-        (_first_failed(row), "", row.count) for row in rows if row.recorded is False
+        (first_failed_stage(row), "", row.count) for row in rows if row.recorded is False
     )
     lines = [("sim planned", kind.clause, kind.cause, kind.count) for kind in twin]
     lines += [(word, kind.clause, kind.cause, kind.count) for kind in recorded]
@@ -191,7 +191,8 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
     )
 
 
-def _first_failed(row: TrialRow) -> str:
+def first_failed_stage(row: TrialRow) -> str:
+    """Name the first stage labelled a failure, or say that none was."""
     stages = stages_of(row)
     if not stages:
         return "stage not labelled"

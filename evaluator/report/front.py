@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from evaluator.compare.conclusions import direction
-from evaluator.report.wording import noun
+from evaluator.quantity import noun
 from evaluator.result import Cell, Measurement, Results, Table
 
 SHOWN_TASKS = 8
@@ -14,6 +14,8 @@ SHOWN_MISSING = 6
 LONGEST = 150
 """Characters of one reason; the whole stands further down."""
 LONGEST_NOTE = 260
+CLOSE_PP = 10.0
+"""A bias smaller than this does not change what one does with a rate [percentage points]."""
 FIGURES = ("tasks", "scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -38,8 +40,7 @@ class Front:
 
 def front(results: Results) -> Front:
     """Write the first page of some results."""
-    table = next((t for t in results.tables if t.id == "conclusions"), None)
-    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    rows = conclusions(results)
     notes = next((t for t in results.tables if t.id == "notes"), None)
     about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
     missing = [text for text in results.missing if not text.startswith("figures without data")]
@@ -54,6 +55,12 @@ def front(results: Results) -> Front:
     )
 
 
+def conclusions(results: Results) -> list[Row]:
+    """Return the rows of the table of conclusions; none where there is no such table."""
+    table = next((t for t in results.tables if t.id == "conclusions"), None)
+    return [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+
+
 def sentence(row: Row) -> str:
     """Write what one task's numbers mean.
 
@@ -65,6 +72,34 @@ def sentence(row: Row) -> str:
     if isinstance(yes, int) and isinstance(right, int):
         parts.append(f"a yes was right in {right} of {yes}")
     return "; ".join(filter(None, [*parts, _ranking_words(row)])) + "."
+
+
+def answer(row: Row) -> str:
+    """Say whether the twin's rate may stand for the recorded one: yes, not yet, not for this.
+
+    Yes where the whole interval of the bias lies within ``CLOSE_PP``; not for this where it leaves
+    zero out; not yet where it is too wide for either, or is not known.
+
+    Args:
+        row: A row of the table of conclusions.
+    """
+    low, high = _number(row["low"]), _number(row["high"])
+    if low is None or high is None:
+        return "not yet"
+    if max(-low, high) <= CLOSE_PP:
+        return "yes"
+    return "not for this" if direction(low, high) else "not yet"
+
+
+def next_trials(rows: Sequence[Row]) -> str:
+    """Name the task that the fewest further trials would settle; empty where none would."""
+    open_ = [(row["more trials"], str(row["task"])) for row in rows if row["ranked"] == "no"]
+    wanted = [(more, task) for more, task in open_ if isinstance(more, int) and more > 0]
+    if not wanted:
+        return ""
+    more, task = min(wanted)
+    trials = f"{more} more {noun('trial', more)}"
+    return f"{task.replace('_', ' ')}: {trials} would settle which candidate is best."
 
 
 def _bias_words(row: Row) -> str:

@@ -3,6 +3,7 @@
 import math
 
 from evaluator.compare.tables import METHOD_NAMES
+from evaluator.quantity import noun
 from evaluator.report.views import Shown
 from evaluator.result import Measurement, Results
 
@@ -55,7 +56,6 @@ UNSIGNED = (
     "decision.regret_pp",
 )
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
-PLURALS = {"pair of runs": "pairs of runs", "policy": "policies"}
 HUGE = 1e7
 """Nobody reads more digits before the point; evidence may have hundreds."""
 
@@ -106,11 +106,6 @@ def count_text(measurement: Measurement) -> str:
     if measurement.k is not None and measurement.value is not None:
         return f"{measurement.k}/{measurement.n}{named}"
     return f"{measurement.n}{named}"
-
-
-def noun(name: str, count: int) -> str:
-    """Write what was counted, in the plural but for one."""
-    return name if count == 1 else PLURALS.get(name, f"{name}s")
 
 
 def ends_text(measurement: Measurement) -> str:

@@ -1,45 +1,50 @@
 """What the page of held-out views holds, without a browser."""
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from bridge.episode.run_folder import RunFolder
-from dashboards.comparison import Judgement, judge
+from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.twin_page import VIEWS_TITLE, build_twin, view_image
-from evaluator.result import Table
+from evaluator.result import Table, load_results, write_results
 
 COLUMNS = ("camera", "stamp_ns", "PSNR (dB)", "SSIM")
 
 
-def rated(run: RunFolder, psnr_db: list[float | None]) -> Judgement:
+@pytest.fixture
+def copy(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+    return RunFolder(shutil.copytree(shared_run.path, tmp_path / "copy"))
+
+
+def rate(run: RunFolder, psnr_db: list[float | None]) -> None:
     """Let the results rate the first views, in the order in which they were recorded."""
-    judgement = judge(run)
-    assert judgement.results is not None
+    results = load_results(run.path)
     (path,) = run.derived("*.views.*")
-    views = sorted(build_twin(run, judgement).views, key=lambda view: view.stamp_ns)
+    views = sorted(build_twin(run, judge(run)).views, key=lambda view: view.stamp_ns)
     rows = tuple((v.camera_id, v.stamp_ns, db, 0.8) for v, db in zip(views, psnr_db, strict=False))
-    (first, *_) = judgement.results.tables
-    table = replace(first, title=VIEWS_TITLE + path.stem, columns=COLUMNS, rows=rows)
-    assert isinstance(table, Table)
-    return replace(judgement, results=replace(judgement.results, tables=(table,)))
+    title = VIEWS_TITLE + path.stem
+    table = Table(id="views_0", title=title, columns=COLUMNS, rows=rows)
+    tables = (table,) if psnr_db else ()
+    write_results(replace(results, tables=tables), run.results_dir / "results.json")
 
 
-def test_rated_views_come_worst_first_and_unrated_ones_last(shared_run: RunFolder) -> None:
-    page = build_twin(shared_run, rated(shared_run, [25.0, 18.0]))
+def test_rated_views_come_worst_first_and_unrated_ones_last(copy: RunFolder) -> None:
+    rate(copy, [25.0, 18.0])
+    page = build_twin(copy, judge(copy))
     assert [view.psnr_db for view in page.views] == [18.0, 25.0, None]
     assert [view.ssim for view in page.views] == [0.8, 0.8, None]
     assert page.rated
     assert page.stand_in is True
 
 
-def test_views_without_scores_are_shown_in_recorded_order(shared_run: RunFolder) -> None:
-    judgement = judge(shared_run)
-    assert judgement.results is not None
-    bare = replace(judgement, results=replace(judgement.results, tables=()))
-    page = build_twin(shared_run, bare)
+def test_views_without_scores_are_shown_in_recorded_order(copy: RunFolder) -> None:
+    rate(copy, [])
+    page = build_twin(copy, judge(copy))
     assert not page.rated
     stamps_ns = [view.stamp_ns for view in page.views]
     assert stamps_ns == sorted(stamps_ns)

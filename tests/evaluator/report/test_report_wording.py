@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from evaluator.compare import compare_csv
-from evaluator.report.front import front, sentence
+from evaluator.report.front import answer, front, next_trials, sentence
 from evaluator.report.methods import methods
 from evaluator.report.page import page
 from evaluator.report.wording import measurement_text
@@ -115,3 +115,31 @@ def test_methods_cite_what_was_used_and_nothing_else() -> None:
     assert "mcnemar1947" not in cited  # no starts are paired in a table of rates
     assert "6 groups" in text
     assert bib.count("{") == bib.count("}")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (-4.0, 4.0, "yes"),
+        (1.0, 10.0, "yes"),  # a bias that is there and small
+        (1.0, 11.0, "not for this"),
+        (-30.0, -2.0, "not for this"),
+        (-30.0, 4.0, "not yet"),
+        (None, None, "not yet"),
+    ],
+)
+def test_a_rate_is_trusted_where_the_whole_interval_of_the_bias_is_small(
+    low: float | None, high: float | None, expected: str
+) -> None:
+    assert answer(row(low=low, high=high)) == expected
+
+
+def test_the_task_that_the_fewest_trials_settle_is_worth_running_next() -> None:
+    rows = [
+        row(task="pour", ranked="no") | {"more trials": 40},
+        row(task="cube_into_box", ranked="no") | {"more trials": 1},
+        row(task="stack", ranked="yes") | {"more trials": 0},
+        row(task="sort", ranked="no"),
+    ]
+    assert next_trials(rows).startswith("cube into box: 1 more trial would settle")
+    assert next_trials(rows[2:]) == ""

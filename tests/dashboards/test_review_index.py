@@ -1,0 +1,270 @@
+"""The index says what the evaluation says, in any order, page and filter, and is never old."""
+
+import os
+import random
+import shutil
+import sqlite3
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from visible import words
+
+from bridge.episode.catalogue import label_episode
+from bridge.episode.metadata import Outcome
+from bridge.episode.run_folder import RunFolder
+from dashboards import comparison
+from dashboards.comparison import judge
+from evaluator.compare import compare_run
+from evaluator.quantity import slug
+from evaluator.report.review import index_run, refresh
+from evaluator.review_index import (
+    FACETS,
+    SORT,
+    IndexedTrial,
+    ReviewIndex,
+    Selection,
+    UnusableIndexError,
+    index_path,
+    severity,
+    state_of,
+    written_index,
+)
+
+HOSTILE = '<script>alert("x")</script>' + "long_name" * 45 + "\n'\";--%_ü"
+PLAIN = IndexedTrial(
+    episode="", file="", task="pour", condition="with_replanning", policy="act", start_id=None,
+    recorded=None, unit="trial", k=None, n=None, plan_id=None, num_plans=0, num_plans_sent=0,
+    sim_planned=None, sim_executed=None, verdict=None, p_success=None, first_failing=None,
+    failing_detail=None, failing_cause=None, failed_stage="", planned_replay=None,
+    executed_replay=None, began_ns=0, distance_m=None,
+)  # fmt: skip
+ANSWERS = (True, False, None)
+
+
+def made(trials: list[IndexedTrial], **about: Any) -> ReviewIndex:
+    slugs = [{name: slug(getattr(trial, name)) for name in FACETS} for trial in trials]
+    return ReviewIndex.open(written_index(zip(trials, slugs, strict=True), (), about))
+
+
+def many() -> list[IndexedTrial]:
+    """Every combination of outcomes in several tasks, and a name that nobody should choose."""
+    tasks = ("pour", "Über den Tisch", HOSTILE)
+    return [
+        replace(
+            PLAIN,
+            episode=f"trial_{number:04}",
+            file=f"trial_{number:04}.mcap",
+            task=tasks[number % 3],
+            condition=("without_replanning", "with_replanning")[number // 3 % 2],
+            recorded=ANSWERS[number // 6 % 3],
+            sim_planned=ANSWERS[number // 18 % 3],
+            failing_cause="collision" if number % 5 else None,
+            first_failing="clearance" if number % 5 else None,
+            failed_stage="grasp" if number % 7 else "",
+            start_id=f"s{number % 11}",
+            began_ns=10**18 - number,
+            distance_m=number % 13 / 1000 if number % 4 else None,
+        )
+        for number in range(120)
+    ]
+
+
+@pytest.mark.parametrize("show", ["", "disagree", "wrong_yes", "failure", "undecided", "nonsense"])
+def test_a_filter_takes_what_its_name_says(show: str) -> None:
+    trials = many()
+    wanted = {
+        "": lambda t: True,
+        "disagree": lambda t: t.agrees is False,
+        "wrong_yes": lambda t: t.sim_planned is True and t.recorded is False,
+        "failure": lambda t: t.recorded is False,
+        "undecided": lambda t: t.agrees is None,
+        "nonsense": lambda t: False,
+    }[show]
+    for task in ("", "pour", slug(HOSTILE)):
+        selection = Selection(show=show, task=task)
+        expected = [t for t in trials if wanted(t) and task in ("", slug(t.task))]
+        index = made(trials)
+        assert list(index.trials(selection)) == expected
+        assert index.count(selection) == len(expected)
+
+
+@pytest.mark.parametrize("sort", [name for known in SORT for name in (known, f"-{known}")])
+def test_every_order_pages_through_every_trial_once(sort: str) -> None:
+    index = made(many())
+    selection = Selection(sort=sort)
+    pages = [index.trials(selection, limit=7, offset=at) for at in range(0, 126, 7)]
+    names = [trial.episode for page in pages for trial in page]
+    assert sorted(names) == [trial.episode for trial in many()]
+    steps = [index.neighbours(selection, name) for name in names]
+    assert steps == list(zip([None, *names], [*names[1:], None], strict=False))
+
+
+def test_the_farthest_come_first_and_what_was_not_measured_last() -> None:
+    found = [trial.distance_m for trial in made(many()).trials(Selection(sort="distance"))]
+    known = [far for far in found if far is not None]
+    assert known == sorted(known, reverse=True)
+    assert found[: len(known)] == known
+
+
+@pytest.mark.parametrize("text", ["TRIAL_0007", "tisch über", "grasp pour", "%", "' OR 1=1 --"])
+def test_words_are_found_in_whatever_case_and_order_and_mean_nothing_to_sql(text: str) -> None:
+    trials = many()
+    found = made(trials).trials(Selection(q=text))
+
+    def has(trial: IndexedTrial) -> bool:
+        held = f"{trial.episode} {trial.task} {trial.failing_cause} {trial.failed_stage}"
+        return all(word in held.casefold() for word in text.casefold().split())
+
+    assert list(found) == [trial for trial in trials if has(trial)]
+
+
+def test_a_wrong_yes_comes_first_and_in_each_kind_the_farthest() -> None:
+    kinds = [(True, False), (False, True), (None, True), (True, True)]
+    trials = [
+        replace(PLAIN, episode=f"{number}", sim_planned=sim, recorded=real, distance_m=far)
+        for number, ((sim, real), far) in enumerate(product(kinds, (0.02, 0.01, None)))
+    ]
+    shuffled = random.Random(1).sample(trials, len(trials))
+    assert sorted(shuffled, key=severity) == trials
+
+
+def test_causes_and_stages_select_the_failures_they_name() -> None:
+    index = made(many())
+    found = index.trials(Selection(clause="clearance", cause="collision"))
+    assert found
+    assert all(t.sim_planned is False and t.failing_cause == "collision" for t in found)
+    assert {t.failed_stage for t in index.trials(Selection(stage="grasp"))} == {"grasp"}
+
+
+def test_the_index_holds_what_the_comparison_holds(shared_run: RunFolder) -> None:
+    expected = {row.episode: row for row in compare_run(shared_run).rows}
+    found = ReviewIndex.open(refresh(shared_run)).trials(Selection())
+    assert {t.episode for t in found} == set(expected)
+    assert [t.episode for t in found] == [t.episode for t in judge(shared_run).rows]
+    assert any(t.distance_m for t in found)
+    again = judge(shared_run).comparison
+    assert again is not None
+    assert {row.episode for row in again.rows} == set(expected)
+    for trial in found:
+        row = expected[trial.episode]
+        for name in ("task", "recorded", "sim_planned", "sim_executed", "verdict", "plan_id"):
+            assert getattr(trial, name) == getattr(row, name), name
+        assert trial.file == f"{trial.episode}.mcap"
+
+
+@pytest.fixture
+def copy(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
+    return RunFolder(shutil.copytree(shared_run.path, tmp_path / "run"))
+
+
+def test_an_unchanged_run_is_not_compared_again(
+    copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge(copy)
+    comparison._KNOWN.clear()  # as another process would see it
+    (index_path(copy)).touch()
+    old_ns = 10**18
+    for path in (*copy.episodes(), *copy.derived()):
+        os.utime(path, ns=(old_ns, old_ns))
+    refresh(copy)
+    monkeypatch.setattr("evaluator.report.review.refresh", lambda _: pytest.fail("read again"))
+    assert len(judge(copy).rows) == 4
+
+
+def test_a_changed_label_is_seen_at_the_next_page(copy: RunFolder) -> None:
+    assert judge(copy).rows[0].episode == "trial_0002"
+    label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
+    row = judge(copy).row("trial_0003")
+    assert row is not None
+    assert row.agrees is False
+
+
+@pytest.mark.parametrize("damage", [b"", b"nonsense", None])
+def test_a_damaged_or_foreign_index_is_made_anew(copy: RunFolder, damage: bytes | None) -> None:
+    judge(copy)
+    path = index_path(copy)
+    if damage is None:
+        with sqlite3.connect(path) as db:
+            db.execute("PRAGMA user_version = 999")
+        db.close()
+    else:
+        path.write_bytes(damage)
+    with pytest.raises(UnusableIndexError):
+        ReviewIndex.open(path)
+    comparison._KNOWN.clear()
+    assert len(judge(copy).rows) == 4
+    assert ReviewIndex.open(path).count(Selection()) == 4
+
+
+def test_what_changes_while_an_evaluation_reads_is_read_again(copy: RunFolder) -> None:
+    compared = compare_run(copy)
+    index_run(copy, compared, compared.results(), began_ns=1)  # every file is younger
+    comparison._KNOWN.clear()
+    (copy.episodes_dir / "trial_0001.mcap").unlink()
+    assert judge(copy).row("trial_0001") is None
+
+
+def test_a_large_run_is_shown_as_it_was_while_another_process_reads_it(
+    copy: RunFolder, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge(copy)
+    label_episode(copy, "trial_0003", Outcome(result="failure", by="reviewer"))
+    monkeypatch.setattr(comparison, "WAITED_FOR", 0)
+    comparison._KNOWN.clear()
+    text = words(synthetic.browser_of(copy).get("/").text)
+    assert "It is being read now" in text
+    assert "trial_0003" in text
+    update = comparison._KNOWN[copy].update
+    assert update is not None
+    assert update.wait(120) == 0
+    text = words(synthetic.browser_of(copy).get("/").text)
+    assert "It is being read now" not in text
+    assert "robot-gst evaluate" in text  # the numbers are older than the label
+
+
+def test_a_name_that_is_not_unicode_is_spelled_out() -> None:
+    trial = replace(PLAIN, episode="trial_\udcff", file="trial_\udcff.mcap", task="\udc80")
+    (found,) = made([trial]).trials(Selection())
+    assert (found.episode, found.task) == ("trial_\\udcff", "\\udc80")
+
+
+def test_a_file_being_written_does_not_make_the_index_old(copy: RunFolder) -> None:
+    part = copy.episodes_dir / "trial_0009.mcap.part"
+    part.write_bytes(b"1")
+    before = state_of(copy).digest
+    part.write_bytes(b"12")
+    assert state_of(copy).digest == before
+    part.unlink()
+    assert state_of(copy).digest != before
+
+
+def test_a_page_of_hostile_names_holds_no_markup_of_theirs(
+    copy: RunFolder, synthetic: ModuleType
+) -> None:
+    judge(copy)
+    comparison._KNOWN.clear()
+    state = state_of(copy).digest
+    about = {
+        "state": state, "changed_meanwhile": False, "results_reason": None, "outdated": None,
+        "comparison_reason": None, "measurements": [], "missing": [HOSTILE],
+        "tasks": [
+            {"task": HOSTILE, "slug": slug(HOSTILE), "answer": "not yet", "sentence": HOSTILE}
+        ],
+        "failures": [["sim planned", HOSTILE, HOSTILE, 3]],
+    }  # fmt: skip
+    trials = [replace(trial, start_id=HOSTILE, policy=HOSTILE) for trial in many()]
+    slugs = [{name: slug(getattr(trial, name)) for name in FACETS} for trial in trials]
+    index_path(copy).write_bytes(written_index(zip(trials, slugs, strict=True), (), about))
+    page = synthetic.browser_of(copy).get("/?q=%3Cscript%3E&sort=%22%3E&page=%27").text
+    assert "<script>alert" not in page
+    page = synthetic.browser_of(copy).get("/?page=999999999999").text
+    assert "<script>alert" not in page
+    assert "Page 3 of 3" in page
+    assert "trial_0119" in page
+    page = synthetic.browser_of(copy).get("/?page=2&sort=-name").text
+    assert page.index("trial_0069") < page.index("trial_0020")
+    assert "page=3" in page
