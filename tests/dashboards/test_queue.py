@@ -5,7 +5,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,8 @@ from bridge.exchange.reviews import Review
 from bridge.media.color import decode_color
 from dashboards import queue_page
 from dashboards.comparison import judge
-from dashboards.queue_page import build_queue, moment_of, rank, thumbnail, worst_first
+from dashboards.queue_page import build_queue, moment_of, rank, recorded_trials, thumbnail
+from evaluator.review_index import severity
 
 CARRIED_NS = 2_800_000_000
 """Into the plan: when the twin drops the cube in the synthetic refusals."""
@@ -36,10 +37,7 @@ def disagreement(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
 
 
 def test_a_wrong_yes_comes_before_a_wrong_no_and_far_before_near(shared_run: RunFolder) -> None:
-    judgement = judge(shared_run)
-    (row, *_) = judgement.rows
-    assert judgement.comparison is not None
-    (motion, *_) = judgement.comparison.motions
+    (row, *_) = judge(shared_run).rows
     answers = {  # recorded, twin, distance
         "near": (True, True, 0.01),
         "far": (True, True, 0.03),
@@ -47,16 +45,16 @@ def test_a_wrong_yes_comes_before_a_wrong_no_and_far_before_near(shared_run: Run
         "wrong_no": (True, False, 0.02),
         "wrong_yes": (False, True, 0.01),
     }
-    rows, motions = [], []
-    for name, (recorded, twin, far) in answers.items():
-        rows.append(replace(row, episode=name, recorded=recorded, sim_planned=twin))
-        move = {"episode": name, "side": "recorded", "against": "planned", "position_max_m": far}
-        motions.append(replace(motion, **move))
-    known = replace(judgement.comparison, rows=tuple(rows), motions=tuple(motions))
-    found = replace(judgement, comparison=known)
-    names = [each.episode for each in worst_first(found)]
-    assert names == ["wrong_yes", "wrong_no", "nobody", "far", "near"]
-    assert [rank(each) for each in worst_first(found)] == [0, 1, 2, 3, 3]
+    rows = [
+        replace(row, episode=name, recorded=recorded, sim_planned=twin, distance_m=far)
+        for name, (recorded, twin, far) in answers.items()
+    ]
+    of_a_table = replace(rows[0], episode="no recording", file="")
+    found: Any = SimpleNamespace(rows=tuple(sorted([of_a_table, *rows], key=severity)))
+    assert [each.episode for each in recorded_trials(found)] == [
+        *("wrong_yes", "wrong_no", "nobody", "far", "near")
+    ]
+    assert [rank(each) for each in recorded_trials(found)] == [0, 1, 2, 3, 3]
     flag = [Review(trial_id="near", rater="Ann", result="unrated", flag=True)]
     shown = {
         show: [
