@@ -154,7 +154,8 @@ def evidence(measurement: Measurement | None) -> str:
         parts.append(f"n = {counted(measurement)}")
     if measurement.interval is not None:
         ends = bounds(measurement.interval, shown_unit(measurement))
-        parts.append(f"{ends} ({method(measurement.interval)})")
+        lies = "without the noise of counting " if measurement.is_beyond else ""
+        parts.append(f"{lies}{ends} ({method(measurement.interval)})")
     elif measurement.reason_without_interval:
         parts.append(f"no interval: {measurement.reason_without_interval}")
     return ", ".join(parts)

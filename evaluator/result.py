@@ -82,6 +82,13 @@ class Measurement:
             message = f"measurement {self.id} needs a value or a reason, and not both"
             raise ValueError(message)
 
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the value is outside its interval: that of r is without the noise of counting."""
+        if self.value is None or self.interval is None:
+            return False
+        return not self.interval.low <= self.value <= self.interval.high
+
 
 @dataclass(frozen=True, kw_only=True)
 class Table:

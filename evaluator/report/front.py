@@ -157,10 +157,9 @@ def _summary(results: Results) -> str:
         parts.append(f"Over {bias.n} groups the twin lies {size} the recorded rates{ends}.")
     r = by_id.get("agreement.pearson_r")
     if r is not None and r.value is not None:
-        inside = r.interval is None or r.interval.low <= r.value <= r.interval.high
         parts.append(
             f"Its rates follow them with r = {r.value:.2f}{_ends(r, '.2f')}."
-            if inside
+            if not r.is_beyond
             else f"Measured r = {r.value:.2f}; without the noise of counting r lies"
             f" in{_ends(r, '.2f')}."
         )

@@ -146,9 +146,7 @@ def measurement_text(measurement: Measurement) -> str:
         text += f" (n = {count_text(measurement)})"
     if measurement.interval is None:
         return text
-    # The model's r is without the noise of counting: what was counted may lie outside.
-    inside = measurement.interval.low <= measurement.value <= measurement.interval.high
-    beyond = "" if inside else "; without the noise of counting it lies in"
+    beyond = "; without the noise of counting it lies in" if measurement.is_beyond else ""
     return f"{text}{beyond} {ends_text(measurement)} ({method_text(measurement)})"
 
 
