@@ -21,7 +21,7 @@ from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, CameraTrack, camera_tracks, read_frame
 from dashboards.library import episode_path
-from evaluator.review_index import IndexedTrial
+from evaluator.review_index import IndexedTrial, severity
 
 PER_PAGE = 24
 SHOW = {
@@ -90,11 +90,7 @@ class QueuePage:
 
 def rank(row: IndexedTrial) -> int:
     """Place a trial among ``REASONS``, 0 first."""
-    if row.agrees is None:
-        return 2
-    if row.agrees:
-        return 3
-    return 0 if row.sim_planned else 1
+    return severity(row)[0]
 
 
 def recorded_trials(judgement: Judgement) -> list[IndexedTrial]:
