@@ -22,7 +22,9 @@ from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path
+from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview, neighbours
+from dashboards.review_routes import review_routes
 from evaluator.review_index import SHOW, Selection
 
 HERE = Path(__file__).parent
@@ -153,7 +155,8 @@ class Pages:
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
-        from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         episode_id = request.path_params["id"]
@@ -167,8 +170,9 @@ class Pages:
 
     def frame(self, request: Request) -> Response:
         """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
-        from dashboards.frames import read_frame  # noqa: PLC0415
-        from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
+        with LOADING:
+            from dashboards.frames import read_frame  # noqa: PLC0415
+            from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
 
         path = episode_path(self._run(request), request.path_params["id"])
         clock = PageClock.of(read_recording(path))
@@ -186,20 +190,20 @@ class Pages:
 
     def reviews(self) -> list[Route]:
         """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
-        from dashboards.review_routes import review_routes  # noqa: PLC0415  # compares runs
-
         return review_routes(self._run, self._page)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
-        from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         return self._page("twin.html", request, page=build_twin(run, judge(run)))
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
-        from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         path = derived_path(run, request.path_params["name"])

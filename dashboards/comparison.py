@@ -10,6 +10,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from bridge.episode.run_folder import RunFolder
+from dashboards.loading import LOADING
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.result import Exclusion, Measurement, Results, load_results
 from evaluator.review_index import (
@@ -120,7 +121,8 @@ def _results(run: RunFolder, _stamp: str) -> Results:
 
 @lru_cache(maxsize=2)
 def _comparison(run: RunFolder, _state: str) -> "Comparison":
-    from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
+    with LOADING:
+        from evaluator.compare import compare_run  # noqa: PLC0415  # loads the evaluator
 
     with SummaryCache(run.results_dir / FOLDER) as cache:
         return compare_run(run, cache=cache)
@@ -157,7 +159,8 @@ def judge(run: RunFolder) -> Judgement:
         if state.num_files > WAITED_FOR:
             is_read = _update_behind(run, known, state)
             return Judgement(run=run, index=index, is_old=True, is_being_updated=is_read)
-        from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
+        with LOADING:
+            from evaluator.report.review import refresh  # noqa: PLC0415  # loads the evaluator
 
         known.unwritten, known.tried = refresh(run), state.digest
         return Judgement(run=run, index=_open(run, known))

@@ -20,6 +20,7 @@ from dashboards.comparison import Judgement
 from dashboards.episode_page import CameraView
 from dashboards.frames import RENDERED
 from dashboards.library import episode_path
+from dashboards.loading import LOADING
 from dashboards.queue_page import is_label, main_camera, recorded_trials
 from dashboards.recording import PageClock, read_recording
 from evaluator.result import Table
@@ -273,7 +274,8 @@ def summarise(
     tables: tuple[Table, ...] = ()
     missing: tuple[str, ...] = ()
     if released and judgement.comparison is not None:
-        from evaluator.compare.raters import with_reviews  # noqa: PLC0415  # loads the evaluator
+        with LOADING:
+            from evaluator.compare.raters import with_reviews  # noqa: PLC0415  # loads the evaluator
 
         before = judgement.comparison
         after = with_reviews(before, found)

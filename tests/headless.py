@@ -49,7 +49,10 @@ class Browser:
     """Every address that was requested since the page was opened."""
     complaints: list[str] = field(default_factory=list)
     _number: int = 0
-    _seen: list[str] = field(default_factory=list)
+    _frame: str = ""
+    """Of the tab itself; pages in pages have their own."""
+    _loaded: list[str] = field(default_factory=list)
+    """Documents that have been loaded. A load event alone does not say of which document it is."""
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
         """Give one command and wait for its answer."""
@@ -76,8 +79,13 @@ class Browser:
         return answer
 
     def _note(self, method: str, params: dict[str, Any]) -> None:
-        self._seen.append(method)
-        if method == "Network.requestWillBeSent":
+        if (
+            method == "Page.lifecycleEvent"
+            and params["name"] == "load"
+            and params["frameId"] == self._frame
+        ):
+            self._loaded.append(params["loaderId"])
+        elif method == "Network.requestWillBeSent":
             self.asked.append(params["request"]["url"])
         elif method == "Runtime.consoleAPICalled":
             self.complaints.append(str(params["args"]))
@@ -101,9 +109,9 @@ class Browser:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
-        self._seen.clear()
-        self.call("Page.navigate", url=address)
-        self.await_load()
+        to = self.call("Page.navigate", url=address)
+        while "loaderId" in to and to["loaderId"] not in self._loaded:
+            self._read()
 
     def ask(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; the page's own policy does not bind it."""
@@ -121,16 +129,25 @@ class Browser:
 
     def press(self, key: str, *, loads: bool = False) -> None:
         """Press a key as a person would; ``loads``: and wait for the page that it leads to."""
-        self._seen.clear()
+        before = self.num_loaded
         told = KEYS.get(key, {"text": key} if len(key) == 1 else {})
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **told)
         if loads:
-            self.await_load()
+            self.await_load(before)
 
-    def await_load(self) -> None:
-        """Wait for the page that the last key led to, unless it is there already."""
-        while "Page.loadEventFired" not in self._seen:
+    @property
+    def num_loaded(self) -> int:
+        """How many documents were loaded so far."""
+        return len(self._loaded)
+
+    def await_load(self, before: int) -> None:
+        """Wait for the document that an action led to.
+
+        Args:
+            before: ``num_loaded`` before that action.
+        """
+        while self.num_loaded == before:
             self._read()
 
     def picture(self) -> bytes:
@@ -166,6 +183,8 @@ def chromium(home: Path) -> Iterator[Browser]:
             tab.session = attached["sessionId"]
             for domain in ("Page", "Network", "Runtime", "Log", "Audits"):
                 tab.call(f"{domain}.enable")
+            tab.call("Page.setLifecycleEventsEnabled", enabled=True)
+            tab._frame = tab.call("Page.getFrameTree")["frameTree"]["frame"]["id"]
             yield tab
             tab.session = None
             tab.call("Browser.close")

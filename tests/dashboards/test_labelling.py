@@ -361,9 +361,10 @@ def test_a_hundred_trials_by_keyboard_and_a_server_that_is_killed(
         assert acknowledged
         assert {name: kept[name].note for name in acknowledged} == acknowledged
         here = tab.ask("document.getElementById('label').dataset.trial")
+        before = tab.num_loaded
         tab.press(key_for(here))
         with dashboard(hundred, port):
-            tab.await_load()  # the page asked again until it was heard
+            tab.await_load(before)  # the page asked again until it was heard
             label_by_keyboard(tab, NUM_TRIALS - 42)
             # The last one wrongly, with undo.
             here = tab.ask("document.getElementById('label').dataset.trial")

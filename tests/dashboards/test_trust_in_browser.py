@@ -85,13 +85,12 @@ def test_a_choice_and_a_text_select_together_and_stand_in_the_address(
     tab, url = page
     tab.show(f"{url}?sort=-name", width=1440, dark=False)
     tab.ask("document.querySelector('[name=q]').value = 'S3'")
-    tab._seen.clear()
+    before = tab.num_loaded
     tab.ask(
         "(() => { const choice = document.querySelector('[name=task]'); choice.value = 'pour';"
         "choice.dispatchEvent(new Event('change')); })()"
     )
-    while "Page.loadEventFired" not in tab._seen:
-        tab._read()
+    tab.await_load(before)
     address = tab.ask("location.search")
     assert "q=S3" in address
     assert "task=pour" in address
