@@ -25,7 +25,7 @@ from evaluator.compare.prediction_powered import assisted_rates, sequences, stop
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
 from evaluator.compare.sensitivity import sensitivity_table
 from evaluator.compare.session_order import session_order
-from evaluator.compare.stages import failures_table, stage_results
+from evaluator.compare.stages import divergence_table, failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
     WITH,
@@ -173,6 +173,7 @@ def _tables(
         *found.gate_tables,
         *found.stage_tables,
         *failures_table(rows, word),
+        *divergence_table(rows),
         *found.decision_tables,
         *axis_tables(rows, word),
         *progress_table(rows, word),

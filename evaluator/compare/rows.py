@@ -14,6 +14,7 @@ from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
 from evaluator.result import Exclusion, Measurement, Results, Table
+from evaluator.run_reader.episodes import FirstDivergence
 
 RECORDED_WORDS = {True: "stand-in", False: "real", None: "recorded"}
 """What the recorded side is called."""
@@ -80,6 +81,8 @@ class TrialRow:
     executed_replay: str | None = None
     failing_cause: str | None = None
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
+    divergence: FirstDivergence | None = None
+    """Where planned, executed and recorded part first, of the executed replay."""
     study_arm: str = ""
     """without, with or control; empty outside a study."""
     why_unknown: str = ""

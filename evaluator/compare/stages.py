@@ -1,5 +1,6 @@
 """Where trials are lost: the stage funnel, success over control steps, kinds of failure."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from bridge.episode.reader import Episode
@@ -187,6 +188,34 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
             rows=tuple(lines),
             note="In the twin: the first clause of the acceptance indicator that is false. "
             "Recorded: the first stage labelled a failure.",
+        ),
+    )
+
+
+def divergence_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
+    """Count where planned, executed and recorded part first, by task, control step and cause.
+
+    Args:
+        rows: Trials; those whose executed motion was not compared are passed over.
+    """
+    counts: Counter[tuple[str, ...]] = Counter()
+    for row in rows:
+        if (apart := row.divergence) is not None:
+            step = apart.stage or "outside the steps"
+            where = (row.task, step, apart.attribution, apart.quantity, apart.body, apart.between)
+            counts[where] += row.count
+    if not counts:
+        return ()
+    lines = sorted(counts.items(), key=lambda item: (item[0][0], -item[1], item[0]))
+    return (
+        Table(
+            id="divergences",
+            title="Where planned, executed and recorded part first",
+            columns=("task", "control step", "cause", "quantity", "body", "between", "trials"),
+            rows=tuple((*where, count) for where, count in lines),
+            note=f"Of {sum(row.executed_replay is not None for row in rows)} trials with an "
+            f"executed replay {counts.total()} part, whatever their outcome. Only the first "
+            "quantity beyond its limit is counted: what follows may come from it.",
         ),
     )
 

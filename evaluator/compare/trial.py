@@ -175,6 +175,7 @@ def _row(
         gate_clauses=() if verdict is None else verdict.clauses,
         stages=_stages(outcome),
         planned_replay=replays["planned"].path.name if "planned" in replays else None,
+        divergence=replays["executed"].facts.divergence if "executed" in replays else None,
         executed_replay=replays["executed"].path.name if "executed" in replays else None,
         began_ns=facts.began_ns,
         path=file.path,

@@ -161,7 +161,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
         numbers=(),
-        tables=("funnel", "success_curve", "failures", "sensitivity"),
+        tables=("funnel", "success_curve", "failures", "divergences", "sensitivity"),
         figures=("funnel",),
     ),
     Section(
