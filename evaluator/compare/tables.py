@@ -17,6 +17,8 @@ from evaluator.measurements import (
 from evaluator.result import Cell, Measurement, Table
 
 MEAN_OF_TASKS = "mean of tasks"
+AVERAGES = {kind: f"average, {kind}" for kind in ("macro", "pooled")}
+"""What lines of averages say in the column of tasks."""
 
 
 SIM_NOTE = (
@@ -166,7 +168,7 @@ def layout_table(
             for side in ("sim_planned", "recorded")
         ]
         if all(name in by_id for name in ids):
-            rows.append((f"average, {kind}", "", *(by_id[name].value for name in ids)))
+            rows.append((AVERAGES[kind], "", *(by_id[name].value for name in ids)))
     columns = [
         f"{side}, {condition.replace('_', ' ')}"
         for condition in conditions

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from evaluator.compare.tables import METHOD_NAMES
+from evaluator.compare.tables import AVERAGES, MEAN_OF_TASKS, METHOD_NAMES
 from evaluator.report.views import Shown, View, is_number, used_columns, view
 from evaluator.report.wording import cell_text
 from evaluator.result import Table
@@ -249,6 +249,10 @@ def as_latex(table: Table) -> str:
     return "\n".join(filter(None, lines)) + "\n"
 
 
+NO_NAMES = {"", None, MEAN_OF_TASKS, *AVERAGES.values()}
+"""What stands in a column of names and names nothing."""
+
+
 def caption_of(table: Table) -> str:
     """Return a caption that can stand alone: the title, over what, and which intervals.
 
@@ -258,7 +262,7 @@ def caption_of(table: Table) -> str:
     counts = []
     for name, many in (("task", "tasks"), ("policy", "policies"), ("condition", "conditions")):
         if name in table.columns:
-            values = {row[table.columns.index(name)] for row in table.rows} - {"", None}
+            values = {row[table.columns.index(name)] for row in table.rows} - NO_NAMES
             if len(values) > 1:
                 counts.append(f"{len(values)} {many}")
     over = f" over {' and '.join(counts)}" if counts else ""

@@ -212,6 +212,32 @@ def _clauses(frame: "pd.DataFrame") -> "pd.DataFrame":
     return shown
 
 
+def _conclusions(frame: "pd.DataFrame") -> "pd.DataFrame":
+    """Put the bias and its interval into one cell, and a yes beside those that were right."""
+
+    def right(row: Record) -> Shown:
+        if not row["yes"]:
+            return None
+        return Figures(f"{row['yes and right']} of {row['yes']}")
+
+    def points(name: str) -> list[Shown]:
+        return [Figures(f"{value:.0f}") if _known(value) else None for value in frame[name]]
+
+    shown = frame[["task", "groups"]].copy()
+    shown["bias"] = [
+        _points(value, row) if _known(value) else None
+        for value, row in zip(frame["bias (pp)"], frame.to_dict("records"), strict=True)
+    ]
+    shown["interval"] = frame["interval"]
+    shown["yes and right"] = _each(frame, right)
+    for name in ("candidates", "best recorded", "ranked", "more trials"):
+        shown[name] = frame[name]
+    shown["trials each"] = frame["recorded trials per candidate"]
+    for name in ("smallest difference (pp)", "smallest bias (pp)"):
+        shown[name] = points(name)
+    return shown
+
+
 def _baselines(frame: "pd.DataFrame") -> "pd.DataFrame":
     def share(k: str, n: str) -> list[Shown]:
         def write(row: Record) -> Shown:
@@ -333,6 +359,7 @@ def _progress(frame: "pd.DataFrame") -> "pd.DataFrame":
 
 
 _VIEWS: dict[str, Callable[["pd.DataFrame"], "pd.DataFrame"]] = {
+    "conclusions": _conclusions,
     "success": _success,
     "axes": _axes,
     "progress": _progress,

@@ -154,6 +154,20 @@ def test_a_caption_says_over_what_and_which_intervals() -> None:
     )
 
 
+def test_a_caption_counts_tasks_and_no_averages() -> None:
+    tables = {table.id: table for table in compare_csv(PAPER).tables}
+    assert "over 3 tasks." in caption_of(tables["layout"])
+    for name in ("gains", "conclusions"):
+        assert "over 3 tasks" in caption_of(tables[name])
+
+
+def test_points_are_printed_to_a_tenth_with_their_interval() -> None:
+    (table,) = (table for table in compare_csv(PAPER).tables if table.id == "conclusions")
+    made = as_latex(table)
+    assert re.search(r" pp", made)
+    assert not re.search(r"\d\.\d{2}", made), made
+
+
 def test_hyphens_stay_hyphens_and_a_minus_is_one() -> None:
     assert latex("--goal 0.8") == r"-{}-goal 0.8"
     assert latex("a---b") == "a-{}-{}-b"
