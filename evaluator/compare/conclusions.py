@@ -44,10 +44,11 @@ def conclusions_table(
     lines = [_line(task, usable, rows) for task in tasks]
     note = (
         "Bias: sim minus recorded, mean of the task's groups. A yes: trials in which sim said "
-        "success, and those that then succeeded. Ranked: whether the recorded trials settle which "
-        "candidate is best; more trials, of the best and the next together, that would with 80 % "
-        "power if the rates are as they look. Smallest: the difference of two candidates, and of "
-        "sim and recorded, that so many trials would show with 80 % power (unpaired)."
+        "success, and those that then succeeded; beside it what succeeded whatever sim said. "
+        "Ranked: whether the recorded trials settle which candidate is best; more trials, of the "
+        "best and the next together, that would with 80 % power if the rates are as they look. "
+        "Smallest: the difference of two candidates, and of sim and recorded, that so many trials "
+        "would show with 80 % power (unpaired)."
     )
     return (Table.of(lines, id="conclusions", title="What it means, task by task", note=note),)
 
@@ -55,7 +56,8 @@ def conclusions_table(
 def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> dict[str, Cell]:
     members = [group for group in usable if group.task == task]
     bias, interval = _bias(task, members, usable)
-    accepted = [r for r in rows if r.task == task and r.sim_planned and r.recorded is not None]
+    judged = [r for r in rows if r.task == task and None not in (r.sim_planned, r.recorded)]
+    accepted = [row for row in judged if row.sim_planned]
     best, ranked, more = _ranking(members)
     n = [group.recorded.n for group in members if group.recorded.n]
     sim_n = [group.sim.n for group in members if group.sim.n]
@@ -67,6 +69,8 @@ def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> d
         "interval": None if interval is None else interval.method,
         "yes": trials_in(accepted) or None,
         "yes and right": trials_in(r for r in accepted if r.recorded) if accepted else None,
+        "succeeded": trials_in(r for r in judged if r.recorded) if accepted else None,
+        "trials": trials_in(judged) if accepted else None,
         "candidates": len(members),
         "best recorded": best,
         "ranked": ranked,

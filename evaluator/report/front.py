@@ -70,8 +70,16 @@ def sentence(row: Row) -> str:
     parts = [_bias_words(row)]
     yes, right = row["yes"], row["yes and right"]
     if isinstance(yes, int) and isinstance(right, int):
-        parts.append(f"a yes was right in {right} of {yes}")
+        parts.append(f"a yes was right in {right} of {yes}{_whatever_words(row)}")
     return "; ".join(filter(None, [*parts, _ranking_words(row)])) + "."
+
+
+def _whatever_words(row: Row) -> str:
+    """Say what a yes has to be held against; nothing for results written before it was counted."""
+    succeeded, trials = row.get("succeeded"), row.get("trials")
+    if not isinstance(succeeded, int) or not isinstance(trials, int):
+        return ""
+    return f", where {succeeded} of all {trials} succeeded"
 
 
 def answer(row: Row) -> str:
@@ -186,6 +194,13 @@ def _unseen(rows: Sequence[Row]) -> str:
             span = f"{low}" if low == high else f"{low} to {high}"
             words.append(f"{what} of less than {span} points")
     none = sum(_number(row["smallest bias (pp)"]) is None for row in rows)
+    counts = [n for row in rows if (n := _number(row["recorded trials per candidate"])) is not None]
+    if not words and counts:
+        most = round(max(counts))
+        return (
+            f"With {most} {noun('trial', most)} of a candidate, hardly any difference, however "
+            "large, would have been seen: no test reaches 80 % power."
+        )
     if not words:
         return "Without counts of trials nobody can say what would have been seen." if rows else ""
     rest = f" In {none} of {len(rows)} tasks nothing could have been seen." if none else ""

@@ -129,6 +129,8 @@ def _success(frame: "pd.DataFrame") -> "pd.DataFrame":
     groups = frame[frame["side"] == sides[0]].reset_index(drop=True)
     shown = groups[["task", "condition", "policy", "unit"]].copy()
     shown["condition"] = _words(shown["condition"])
+    if set(shown["unit"]) == {"trial"}:
+        shown["unit"] = None  # as everybody counts
     for side in sides:
         shown[side] = _each(frame[frame["side"] == side], _rate)
     shown[gap] = groups[gap]
@@ -220,6 +222,9 @@ def _conclusions(frame: "pd.DataFrame") -> "pd.DataFrame":
             return None
         return Figures(f"{row['yes and right']} of {row['yes']}")
 
+    def succeeded(row: Record) -> Shown:
+        return Figures(f"{row['succeeded']} of {row['trials']}") if row["yes"] else None
+
     def points(name: str) -> list[Shown]:
         return [Figures(f"{value:.0f}") if _known(value) else None for value in frame[name]]
 
@@ -230,6 +235,7 @@ def _conclusions(frame: "pd.DataFrame") -> "pd.DataFrame":
     ]
     shown["interval"] = frame["interval"]
     shown["yes and right"] = _each(frame, right)
+    shown["succeeded at all"] = _each(frame, succeeded)
     for name in ("candidates", "best recorded", "ranked", "more trials"):
         shown[name] = frame[name]
     shown["trials each"] = frame["recorded trials per candidate"]

@@ -27,6 +27,8 @@ MAX_PANELS = 12
 ACROSS = 3
 SIDE_IN = (COLUMN_IN - 0.55 - 0.16 * (ACROSS - 1)) / ACROSS
 ABOVE_IN, BELOW_IN, STEP_IN = 0.2, 0.42, 0.17
+LONGEST_BESIDE = 24
+"""Characters of a name that has room beside another in the legend."""
 LONGEST_TITLE = 18
 
 
@@ -48,7 +50,8 @@ def tasks(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
     shown = dict(list(chosen.items())[:MAX_PANELS])
     candidates = list(dict.fromkeys(_candidate(g) for members in shown.values() for g in members))
     rows = math.ceil(len(shown) / ACROSS)
-    legend_lines = math.ceil(min(len(candidates), len(MARKERS)) / 2)
+    across = 1 if any(len(name) > LONGEST_BESIDE for name in candidates) else 2
+    legend_lines = math.ceil(min(len(candidates), len(MARKERS)) / across)
     legend_lines += len(candidates) > len(MARKERS)
     foot_in = BELOW_IN + STEP_IN * legend_lines
     height_in = foot_in + rows * (SIDE_IN + ABOVE_IN) + 0.05
@@ -63,7 +66,7 @@ def tasks(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
             axes.tick_params(labelleft=column == 0, labelbottom=place + ACROSS >= len(shown))
         figure.text(0.5, (foot_in - 0.36) / height_in, "success rate in the twin (%)", ha="center")
         figure.text(0.012, 0.5 + foot_in / height_in / 2, f"{word} (%)", va="center", rotation=90)
-        _legend(figure, candidates, foot_in - 0.42, height_in)
+        _legend(figure, candidates, across, (foot_in - 0.42, height_in))
 
     more = f" The first {MAX_PANELS} of {len(chosen)} tasks." if len(chosen) > MAX_PANELS else ""
     drawn = [group for members in shown.values() for group in members]
@@ -118,14 +121,17 @@ def _panel(
         )  # fmt: skip
 
 
-def _legend(figure: "Figure", candidates: Sequence[str], top_in: float, height_in: float) -> None:
-    """Name the marks below the panels, two beside each other."""
+def _legend(
+    figure: "Figure", candidates: Sequence[str], across: int, size_in: tuple[float, float]
+) -> None:
+    """Name the marks below the panels, so many beside each other."""
+    top_in, height_in = size_in
     axes = figure.add_axes((0.0, 0.0, 1.0, top_in / height_in))
     axes.set_axis_off()
     axes.set_xlim(0, 2)
     axes.set_ylim(top_in, 0)
     for place, name in enumerate(candidates[: len(MARKERS)]):
-        x, y = 0.27 + place % 2, STEP_IN * (place // 2 + 0.5)
+        x, y = 0.27 + place % across, STEP_IN * (place // across + 0.5)
         axes.plot(
             [x], [y], linestyle="", marker=MARKERS[place], markersize=4.5,
             markerfacecolor=LIGHT["paper"], markeredgecolor=LIGHT["sim"], markeredgewidth=1.1,
