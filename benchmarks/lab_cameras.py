@@ -21,25 +21,27 @@ PART = "cameras"
 def judge_again(session: LabSession) -> list[dict[str, Any]]:
     """Rows of the later trials as ``LabSession.rows_file`` has them; kept once they are made."""
     from bridge.episode.run_folder import RunFolder
-    from bridge.task.task_file import load_task
+    from bridge.task.find import chosen_task_file
     from bridge.terminal import Output
     from twin.gate.config import GateConfig
+    from twin.gate.gate import JudgedTasks
     from twin.gate.twin_process import TwinProcess
 
     kept = session.run / f"verdicts_{PART}.json"
     if kept.is_file():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
-    run, task = RunFolder.open(calibrated_copy(session)), load_task(session.task)
+    run, file = RunFolder.open(calibrated_copy(session)), chosen_task_file(session.task)
+    task, tasks = file.task(), JudgedTasks(only=file)
     settings = GateConfig(cell=CELL, task=session.task, samples=SAMPLES, min_p_success=MIN_P)
     rows = []
-    with TwinProcess(run.path, task, settings, Output(quiet=True)) as twin:
+    with TwinProcess(run.path, settings, Output(quiet=True)) as twin:
         for path in sorted((session.run / "episodes").glob("trial_*.mcap")):
             before = row_of(path, task)
             start = before.pop("start_seed") % 1000
             if not BEFORE <= start < BEFORE + AFTER or not before["planned"]:
                 continue
-            row = {**before, **said_of(ask(path, settings, run, task, twin))}
+            row = {**before, **said_of(ask(path, settings, run, tasks, twin))}
             about = {"task": task.name, "seed": session.seed, "start": start, "part": PART}
             rows.append({**about, **row})
     kept.write_text(json.dumps(rows, indent=1) + "\n")
@@ -66,7 +68,7 @@ def calibrated_copy(session: LabSession) -> Path:
     return path
 
 
-def ask(path: Path, settings: Any, run: Any, task: Any, twin: Any) -> Any:
+def ask(path: Path, settings: Any, run: Any, tasks: Any, twin: Any) -> Any:
     """Let a gate see what was recorded before the plan, and judge it."""
     from bridge.episode import streams
     from bridge.episode.reader import Episode
@@ -88,7 +90,7 @@ def ask(path: Path, settings: Any, run: Any, task: Any, twin: Any) -> Any:
         if seen and not is_truth(message.topic):
             sent_ns = message.publish_time_ns
             view.take(message.topic, message.data, sent_ns, message.type_name)
-    gate = make_gate(task, settings, view, lambda: stamp_ns, twin)
+    gate = make_gate(tasks, settings, view, lambda: stamp_ns, twin)
     return gate.judge(plan.to_json())
 
 

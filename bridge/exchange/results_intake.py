@@ -36,6 +36,7 @@ from bridge.exchange.trials_csv import (
     TrialRecord,
     json_rows,
     open_trials,
+    read_trials_by_side,
     read_trials_json,
     trials_of,
 )
@@ -45,6 +46,8 @@ from bridge.exchange.trials_rates import RateRecord, rates_of
 PUBLISHED, SIMPLER, POLARIS, LEROBOT = "a published table", "SIMPLER", "PolaRiS", "LeRobot"
 ROLLOUTS = (SIMPLER, POLARIS, LEROBOT)
 """Benchmarks whose files hold the sim side alone."""
+FIGURES = ("k", "n", "rate", "rate_percent")
+"""A table with a column side and one of these is one of rates."""
 READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".mp4")
 STREAM_ABOVE_BYTES = 4 * 2**20
 """A larger trials CSV is read row by row and only counted: about 50,000 trials, whose single rows
@@ -107,6 +110,10 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     header = table.header
     if "statistic" in header:
         return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
+    if "side" in header and not set(FIGURES) & set(header):
+        trials = read_trials_by_side(path, options)
+        understood = table.understood("trials of either side, without pairs", len(trials))
+        return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
     if "side" in header:
         rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
         return _taken_rates(path, rates_of(rows), options)

@@ -9,7 +9,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
@@ -17,6 +17,7 @@ from bridge.errors import UsageError
 from bridge.exchange.table_text import (
     AS_SAVED,
     SourceRow,
+    TableError,
     TableOptions,
     TableText,
     open_table,
@@ -58,6 +59,10 @@ class TrialRecord:
 
 
 COLUMNS = tuple(field.name for field in fields(TrialRecord))
+SIDES = ("sim", "real", "stand-in")
+"""Where a rollout, or the trials behind a rate, took place."""
+OUTCOME = "recorded"
+"""The column ``--map "outcome=..."`` is about."""
 SIDES_OF_TRIAL = ("recorded", "sim_planned", "sim_executed", "verdict", "k")
 """A table of tasks with one of these columns is one of trials, numbered where they have no id."""
 
@@ -89,6 +94,46 @@ def read_trials(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecor
         TableError: For a doubled trial id, an impossible count, or two units in one task.
     """
     return trials_of(rows_of(open_trials(path, options)))
+
+
+def read_trials_by_side(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
+    """Read a table with one rollout per row, here on the robot, there in the twin, without pairs.
+
+    Its column ``side`` says sim, real or stand-in; how the rollout ended is the outcome.
+
+    Args:
+        path: The file.
+        options: Columns whose names differ from ours; ``outcome`` is one of them, as a rule.
+
+    Raises:
+        TableError: For an unknown side, and as ``read_trials``.
+    """
+    table = require(open_table(path, (*COLUMNS, "side"), options), ("task", "side"), COLUMNS)
+    if OUTCOME not in table.header:
+        raise TableError(
+            path=path,
+            row=table.header_row,
+            found="a column side, but neither rates (k and n, or rate) nor outcomes of trials",
+            hint='Say which column is the outcome of a trial, --map "outcome=...": '
+            f"{', '.join(table.left) or 'there is no other column'}",
+        )
+    rows = rows_of(table)
+    sides = {row.text("side").lower() for row in rows}
+    marked = str("stand-in" in sides).lower() if sides & {"real", "stand-in"} else ""
+    return trials_of([_on_its_side(row, marked) for row in rows])
+
+
+def _on_its_side(row: SourceRow, stand_in: str) -> SourceRow:
+    """Put the outcome of a rollout where a paired table has it."""
+    side = row.text("side").lower()
+    if side not in SIDES:
+        raise row.refuse(f"side is {side!r}", f"Sides: {', '.join(SIDES)}")
+    values = {name: text for name, text in row.values.items() if name != "side"}
+    if side == "sim":
+        values["sim_planned"] = values.pop(OUTCOME)
+    if not row.text("stand_in"):
+        values["stand_in"] = stand_in
+    return replace(row, values=values)
 
 
 def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[TrialRecord]:

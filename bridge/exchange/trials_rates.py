@@ -11,10 +11,9 @@ from fractions import Fraction
 from pathlib import Path
 
 from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
-from bridge.exchange.trials_csv import UNITS
+from bridge.exchange.trials_csv import SIDES, UNITS
 
 COLUMNS = ("task", "condition", "policy", "side", "unit", "k", "n", "rate", "rate_percent")
-SIDES = ("sim", "real", "stand-in")
 MOST_DIGITS = 30
 """Before or behind the point of a printed figure; more would take forever to compare."""
 

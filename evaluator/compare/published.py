@@ -11,9 +11,9 @@ from fractions import Fraction
 from pathlib import Path
 
 from bridge.exchange.table_text import AS_SAVED, SourceRow, TableError, TableOptions, read_rows
+from bridge.exchange.trials_csv import SIDES
 from bridge.exchange.trials_rates import (
     COLUMNS,
-    SIDES,
     AmbiguousRateError,
     ImpossibleRateError,
     RateRecord,

@@ -246,3 +246,28 @@ def test_agreement_along_axes_and_of_progress(write_table: Callable[[str], Path]
     line = dict(zip(progress.columns, progress.rows[0], strict=True))
     assert line["sim - recorded"] == pytest.approx(0.1)
     assert line["r of pairs"] == pytest.approx(1)
+
+
+def test_a_table_of_single_rollouts_on_either_side_is_an_unpaired_study(
+    write_table: Callable[[str], Path],
+) -> None:
+    """Twenty on the robot and two hundred in the twin, as studies are published."""
+    lines = ["Task,Policy,Side,Result"]
+    for policy, real, sim in (("A", 14, 160), ("B", 8, 90)):
+        lines += [f"place,{policy},real,{'success' if i < real else 'failure'}" for i in range(20)]
+        lines += [f"place,{policy},Sim,{'success' if i < sim else 'failure'}" for i in range(200)]
+    table = write_table("\n".join(lines) + "\n")
+    with pytest.raises(TableError, match=r'neither rates .* --map "outcome=...": Result'):
+        compare_csv(table)
+    comparison = compare_csv(table, options=TableOptions(map="outcome=Result"))
+    assert comparison.stand_in is False
+    groups = {group.policy: group for group in comparison.groups}
+    assert (groups["A"].recorded.k, groups["A"].recorded.n) == (14, 20)
+    assert (groups["A"].sim.k, groups["A"].sim.n) == (160, 200)
+    assert (groups["B"].recorded.k, groups["B"].sim.k) == (8, 90)
+
+
+def test_a_rollout_on_no_known_side_is_refused(write_table: Callable[[str], Path]) -> None:
+    table = write_table("task,side,recorded\nplace,real,success\nplace,mars,success\n")
+    with pytest.raises(TableError, match=r"row 3: side is 'mars'. Sides: sim, real, stand-in"):
+        compare_csv(table)
