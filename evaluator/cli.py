@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.design.config import StudyOptions, Wanted
+from evaluator.errors import EvaluatorError
 from evaluator.live.config import LiveConfig
 from evaluator.memory import without_collecting
 from evaluator.metrics.image_protocol import ImageOptions
@@ -19,6 +20,7 @@ from evaluator.review_index import RESULTS
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
     from evaluator.compare.published import Finding
+    from evaluator.result import Results
     from evaluator.thresholds import Missed
 
 LIVE = LiveConfig()
@@ -116,7 +118,23 @@ def evaluate(
     failed += [_finding_text(item) for item in (published.failed if published else ())]
     for text in failed:
         output.say(text)
+    _refuse_only_broken(results)
     return THRESHOLD_NOT_MET if failed else 0
+
+
+def _refuse_only_broken(results: "Results") -> None:
+    """End with an error, after the report, where no episode can be read and nothing else is there.
+
+    Raises:
+        EvaluatorError: Naming them.
+    """
+    unread = [item.episode for item in results.exclusions if item.scope == "everything"]
+    if not unread or any(one.value is not None for one in results.measurements):
+        return
+    raise EvaluatorError(
+        f"nothing could be measured: {', '.join(unread[:3])}{' ...' if len(unread) > 3 else ''} "
+        "cannot be read, and there is nothing else. The reasons stand above."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,9 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import PathNotFoundError
 from bridge.media.color import encode_jpeg
+from evaluator.cli import evaluate
 from evaluator.compare import Comparison, TrialRow, compare_run
+from evaluator.errors import EvaluatorError
 
 
 def row_of(comparison: Comparison, name: str) -> TrialRow:
@@ -326,3 +328,15 @@ def test_rows_can_be_turned_into_plain_records(six_trials: Any) -> None:
     row = compare_run(six_trials.run).rows[0]
     assert asdict(row)["episode"] == "a1"
     assert row.recorded_word == "stand-in"
+
+
+def test_a_run_of_which_nothing_can_be_read_ends_with_an_error_after_its_report(maker: Any) -> None:
+    """Beside one episode that can be read, a broken one is left out and named."""
+    maker.trial("t1")
+    path = maker.run.episodes_dir / "t1.mcap"
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(EvaluatorError, match=r"nothing could be measured: t1\.mcap cannot be read"):
+        evaluate(maker.run.path)
+    assert (maker.run.results_dir / "report.html").is_file()
+    maker.trial("t2")
+    assert evaluate(maker.run.path) == 0
