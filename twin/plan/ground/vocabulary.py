@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.task.relations import SIDES, WAYS
-from bridge.task.task_file import BASKET, Task
+from bridge.task.task_file import BASKET, ObjectModel, Task
 from twin.errors import TwinError
 from twin.scene.semantics.colour import COLOUR_NAMES, colour_name
 from twin.scene.semantics.language import (
@@ -197,10 +197,10 @@ def vocabulary_of(
         about = seen.get(key, {})
         is_container = model.shape == "open_box" or model.mesh == BASKET
         colour = colour_name(np.array(model.color_srgb) / 255)
-        label = str(about.get("label") or label_of(key, colour, is_open=is_container))
-        if about.get("color_srgb"):
-            named = [word for word in words_of(label) if colour_of(word)]
-            colour = colour_of(named[0]) or colour if named else colour
+        by_task = label_of(key, colour, is_open=is_container, shape=_shape_word(model))
+        label = str(about.get("label") or by_task)
+        said = next(filter(None, map(colour_of, words_of(label))), None)
+        colour = said or colour  # what it is called, whatever its colour looks like
         things[key] = Thing(
             id=key,
             label=label,
@@ -212,3 +212,14 @@ def vocabulary_of(
             size_m=model.size_m,
         )
     return Vocabulary(things=things, cameras=cameras or {})
+
+
+ALIKE = 1.15
+"""A box whose sides differ by less is a cube."""
+
+
+def _shape_word(model: ObjectModel) -> str:
+    """What the shape of a task's box is called; nothing for what has no such name."""
+    if model.shape != "box" or model.size_m is None:
+        return ""
+    return "cube" if max(model.size_m) < ALIKE * min(model.size_m) else "box"

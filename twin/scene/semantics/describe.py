@@ -243,7 +243,8 @@ def describe(
     measured = measure_shape(xyh, CELL_M)
     color = np.clip(np.rint(np.median(cloud.colors[ids], axis=0) * 255), 0, 255)
     if key:
-        label = label_of(key, colour_name(color / 255), is_open=measured.cavity is not None)
+        is_open = measured.cavity is not None
+        label = label_of(key, colour_name(color / 255), is_open=is_open, shape=measured.word)
     is_nameless_container = kind_of(label) == "other" and measured.word == CONTAINER
     called = CONTAINER if is_nameless_container else label
     parts = _parts_of(xyh, called, None if surface_m is None else surface_m - up)

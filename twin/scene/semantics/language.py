@@ -205,18 +205,23 @@ def numbered(
     return Numbered(labels=joined, keys=keys, others=others)
 
 
-def label_of(key: str, colour: str, *, is_open: bool) -> str:
+def label_of(key: str, colour: str, *, is_open: bool, shape: str = "") -> str:
     """What a known object is called: its name in the task, with its colour.
 
-    A box that is open says so, because "box" alone may be either.
+    A box that is open says so, because "box" alone may be either. A name that is nothing but a
+    colour gets its shape: "red" is a red cube.
 
     Args:
         key: Its id in the task file.
         colour: Name of its colour.
         is_open: Whether it has a cavity that opens upwards.
+        shape: One of ``SHAPE_WORDS``; empty where nobody knows.
     """
     name = spoken_name(key)
     words = words_of(name)
+    if shape and words and all(colour_of(word) is not None for word in words):
+        name = f"{name} {shape}"
+        words = words_of(name)
     either = (
         bool(words)
         and words[-1] in SHAPE_WORDS["box"]

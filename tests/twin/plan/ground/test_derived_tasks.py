@@ -35,6 +35,9 @@ DUCKS = TaskFile.read(datasets_folder() / "tasks" / "five_ducks_into_basket.toml
 STACK = TaskFile.read(datasets_folder() / "tasks" / "stack_two_cubes.toml")
 
 
+SORT = TaskFile.read(datasets_folder() / "tasks" / "sort_by_colour.toml")
+
+
 def derived(text: str, *base: TaskFile) -> Task:
     words = vocabulary_of(base[0].task())
     return derive_task(ground(text, words), base).task()
@@ -42,6 +45,16 @@ def derived(text: str, *base: TaskFile) -> Task:
 
 def pairs(task: Task, number: int) -> set[frozenset[str]]:
     return {frozenset(pair) for pair in task.stages[number]["allowed_contacts"]}
+
+
+def test_cubes_that_are_named_by_their_colour_alone_are_cubes() -> None:
+    one = derived("Put the red cube into the pink box.", SORT)
+    assert one.manipulated == ("red",)
+    assert {(spec["kind"], spec["object"]) for spec in one.success} >= {("inside", "red")}
+    whole = derived(SORT.task().instruction, SORT)
+    assert set(whole.manipulated) == {"red", "yellow", "blue", "green"}
+    with pytest.raises(GroundingError, match="cube"):
+        derived("Put the cube into the pink box.", SORT)
 
 
 def test_an_instruction_becomes_the_task_that_ships() -> None:
