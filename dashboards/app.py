@@ -46,6 +46,7 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
+        *pages.trial(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
@@ -189,6 +190,12 @@ class Pages:
         from dashboards.review_routes import review_routes  # noqa: PLC0415  # compares runs
 
         return review_routes(self._run, self._page)
+
+    def trial(self) -> list[Route]:
+        """``/episode/<id>/scene``: what is behind a trial's page."""
+        from dashboards.trial_routes import trial_routes  # noqa: PLC0415  # reads episodes
+
+        return trial_routes(self._run, SMALL)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -121,6 +121,7 @@ function setTime(t, { remember = true } = {}) {
   for (const frame of frames) showFrame(frame, bounded);
   showDifferences();
   showCharts(bounded);
+  document.dispatchEvent(new CustomEvent("page-time", { detail: bounded }));
   if (remember) keepInAddress(bounded);
 }
 

@@ -1,0 +1,118 @@
+"""Addresses behind a trial's page: its 3D scene."""
+
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from bridge.episode.run_folder import RunFolder
+from bridge.whole_file import write_whole
+from dashboards.episode_page import read_replays, sent_plan_of
+from dashboards.library import derived_paths, episode_path
+from dashboards.recording import Problems, read_recording
+from dashboards.trial_plots import shown_replays
+
+if TYPE_CHECKING:  # loads the twin
+    from dashboards.trial_scene import TrialScene
+
+RunOf = Callable[[Request], RunFolder]
+PICTURES = "scene_pictures"
+"""Folder in the run's ``results/``."""
+_GATHERING = threading.Lock()
+"""Robot models keep scratch memory: one answer at a time uses them."""
+
+
+def trial_routes(run_of: RunOf, small: Sequence[Middleware]) -> list[Route]:
+    """Return the addresses.
+
+    Args:
+        run_of: The run that a request is about.
+        small: Compresses answers.
+    """
+    pages = _TrialPages(run_of)
+    return [
+        Route("/episode/{id}/scene", pages.scene, middleware=small),
+        Route("/episode/{id}/scene.jpg", pages.picture),
+    ]
+
+
+class _TrialPages:
+    def __init__(self, run_of: RunOf) -> None:
+        self._run = run_of
+
+    def scene(self, request: Request) -> Response:
+        """``/episode/<id>/scene``: Gaussians, poses and ways for the 3D view."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        with _GATHERING:
+            data = _packed(path, run.path, _stamps(run, path))
+        return Response(data, media_type="application/octet-stream")
+
+    def picture(self, request: Request) -> Response:
+        """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        try:
+            t_s = round(float(request.query_params.get("t", "0")), 2)
+        except ValueError:
+            t_s = 0.0
+        what = repr((path.stem, _stamps(run, path), t_s))
+        name = hashlib.sha256(path.stem.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        key = hashlib.sha256(what.encode(errors="surrogatepass")).hexdigest()[:16]
+        kept = run.results_dir / PICTURES / f"{name}-{key}.jpg"
+        headers = {"Cache-Control": "private, max-age=600"}
+        with _GATHERING:
+            if kept.is_file():
+                return Response(kept.read_bytes(), media_type="image/jpeg", headers=headers)
+            data = _drawn(path, run.path, t_s)
+            try:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                for old in kept.parent.glob(f"{name}-*.jpg"):
+                    old.unlink()
+                write_whole(kept, data)
+            except OSError:  # a run that only can be read is drawn anew each time
+                pass
+        return Response(data, media_type="image/jpeg", headers=headers)
+
+
+Stamps = tuple[tuple[str, int, int], ...]
+
+
+def _stamps(run: RunFolder, path: Path) -> Stamps:
+    """Names, times of writing and sizes of all that a trial's scene is made of."""
+    files = [path, run.scene_dir / "scene.json", run.scene_dir / "calibration.json"]
+    for kind in ("replay", "localised"):
+        files += derived_paths(run, path.stem, kind)
+    found = [(file.name, file.stat()) for file in files if file.is_file()]
+    return tuple((name, status.st_mtime_ns, status.st_size) for name, status in found)
+
+
+@lru_cache(maxsize=2)
+def _packed(path: Path, run_path: Path, _stamps: Stamps) -> bytes:
+    from dashboards.scene_file import pack_scene  # noqa: PLC0415  # loads the twin
+
+    return pack_scene(_gathered(path, run_path))
+
+
+def _drawn(path: Path, run_path: Path, t_s: float) -> bytes:
+    from dashboards.scene_file import draw_picture  # noqa: PLC0415  # loads the twin
+
+    return draw_picture(_gathered(path, run_path), t_s)
+
+
+def _gathered(path: Path, run_path: Path) -> "TrialScene":
+    from dashboards.trial_scene import gather_scene  # noqa: PLC0415  # loads the twin
+
+    run = RunFolder(run_path)
+    recording = read_recording(path)
+    problems = Problems()
+    replays = read_replays(derived_paths(run, path.stem, "replay"), recording, problems)
+    sent_plan = sent_plan_of(recording)
+    return gather_scene(run, recording, shown_replays(replays, sent_plan), sent_plan)
