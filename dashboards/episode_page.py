@@ -16,7 +16,8 @@ from dashboards.frames import RENDERED, CameraTrack
 from dashboards.library import derived_paths, episode_path
 from dashboards.queue_page import Moment, moment_of
 from dashboards.recording import PageClock, Problems, Recording, read_recording
-from dashboards.trial_plots import PLANNED, episode_stages, main_plots, plots_of_joints
+from dashboards.trial_lanes import Replanned, replans, trial_lanes
+from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays
 from evaluator.review_index import IndexedTrial
 
 
@@ -91,6 +92,7 @@ class EpisodePage:
     gated: bool
     """The plan that was sent had a verdict before motion."""
     stages: StageChart | None
+    replans: tuple[Replanned, ...]
     plots: tuple[TimePlot, ...]
     joint_plots: tuple[TimePlot, ...]
     cameras: tuple[CameraView, ...]
@@ -150,7 +152,8 @@ def build_page(
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
-        stages=episode_stages(recording, clock, failure_t_s),
+        stages=trial_lanes(recording, shown_replays(replays, sent_plan), clock, failure_t_s),
+        replans=replans(recording, clock),
         plots=main_plots(recording, replays, sent_plan, row, clock),
         joint_plots=plots_of_joints(recording, clock),
         cameras=tuple(

@@ -25,6 +25,8 @@ from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import sized_camera
 
 MAGIC, VERSION = b"GS3D", 1
+HEAD = 16
+"""Bytes before the header."""
 MAX_SPLATS = 60_000
 """What software WebGL draws in time; the largest and most opaque are kept."""
 OBJECTS = 10.0
@@ -99,9 +101,13 @@ def draw_picture(scene: TrialScene, t_s: float) -> bytes:
     if parts is None:
         return encode_jpeg(np.zeros((camera.height, camera.width, 3), dtype=np.uint8))
     at = scene.nearest(t_s)
-    objects = {name: Ts[at] for name, Ts in scene.sides[0].Ts_base_object.items()}
+    recorded = scene.sides[0].Ts_base_object
     clouds = [parts.background]
-    clouds += [moved_cloud(parts.objects[k].cloud, T) for k, T in objects.items() if k in parts.objects]
+    for name, item in parts.objects.items():
+        if name in recorded:
+            clouds.append(moved_cloud(item.cloud, recorded[name][at]))
+        elif name not in scene.absent:
+            clouds.append(moved_cloud(item.cloud, item.T_base_object))
     clouds += [moved_cloud(parts.links[k], Ts[at]) for k, Ts in scene.Ts_root_link.items()]
     drawn = open_rasteriser().view(concatenate(clouds), camera, view.T_root_camera)
     return encode_jpeg(drawn.image_u8())
@@ -194,7 +200,9 @@ def reduced_clouds(parts: MovableScene, scene: TrialScene) -> dict[str, Gaussian
     total = sum(len(each) for each in weights.values())
     if total <= MAX_SPLATS:
         return clouds
-    least = np.partition(np.concatenate([*weights.values()]), total - MAX_SPLATS)[total - MAX_SPLATS]
+    least = np.partition(np.concatenate([*weights.values()]), total - MAX_SPLATS)[
+        total - MAX_SPLATS
+    ]
     return {name: cloud.take(weights[name] >= least) for name, cloud in clouds.items()}
 
 
@@ -241,9 +249,8 @@ def _parts(
             if f"object {name}" in ranges:
                 track = blocks.track(Ts)
                 found.append({"splats": f"object {name}", "side": side.name, "track": track})
-    known = {name for side in scene.sides for name in side.Ts_base_object}
     for name, item in scene.parts.objects.items():
-        if name not in known:  # no object of the task, or nobody looked for it
+        if name not in scene.sides[0].Ts_base_object and name not in scene.absent:
             track = blocks.track(item.T_base_object[None])
             found.append({"splats": f"object {name}", "side": "", "track": track})
     for name, Ts in scene.Ts_root_link.items():

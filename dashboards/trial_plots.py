@@ -1,4 +1,4 @@
-"""Plots of a trial on the page's clock: stages, tool, gripper, clearance, objects, joints."""
+"""Plots of a trial on the page's clock: tool, gripper, clearance, objects, joints."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,7 +9,7 @@ import numpy as np
 from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
-from dashboards.figures import Signal, Span, StageChart, TimePlot, stage_chart, time_plot
+from dashboards.figures import Signal, TimePlot, time_plot
 from dashboards.recording import PageClock, Recording
 from evaluator.compare.trial import read_tcp_errors
 from evaluator.review_index import IndexedTrial
@@ -25,64 +25,6 @@ MM = 1000.0
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps [ns] and values."""
-
-
-def episode_stages(
-    recording: Recording, clock: PageClock, failure_t_s: float | None
-) -> StageChart | None:
-    """Draw planned stages, recorded stages, and marks for failure, replanning and gripper.
-
-    Args:
-        recording: The recorded episode.
-        clock: Converts its stamps to the page's time.
-        failure_t_s: Page time of the first failure in the twin [s]; None marks none.
-    """
-    marks = [
-        (clock.seconds(event["stamp_ns"]), "replan", "replan")
-        for event in recording.events
-        if event["type"] == "replan"
-    ]
-    if failure_t_s is not None:
-        marks.append((failure_t_s, "first failure in the twin", "failure"))
-    return stage_chart(
-        [
-            ("planned", _planned_stages(recording, clock)),
-            ("recorded", _recorded_stages(recording, clock)),
-        ],
-        marks,
-        span_s=clock.span_s,
-    )
-
-
-def _planned_stages(recording: Recording, clock: PageClock) -> list[Span]:
-    spans = []
-    for _, plan in recording.plans:
-        for index, stage in enumerate(plan.stages):
-            start = clock.of_plan_time(plan.id, stage.t_start_ns)
-            end = clock.of_plan_time(plan.id, stage.t_end_ns)
-            if start is None or end is None:
-                continue
-            title = f"{stage.id}: {stage.text} ({start:.2f} s to {end:.2f} s, plan {plan.id})"
-            style = f"stage-{index % 4}"
-            spans.append(Span(start_s=start, end_s=end, label=stage.id, style=style, title=title))
-    return spans
-
-
-def _recorded_stages(recording: Recording, clock: PageClock) -> list[Span]:
-    order = {
-        stage.id: index for _, plan in recording.plans for index, stage in enumerate(plan.stages)
-    }
-    spans = []
-    begun: dict[str, float] = {}
-    for event in recording.events:
-        stage_id = str(event.get("stage_id"))
-        if event["type"] == "stage_started":
-            begun[stage_id] = clock.seconds(event["stamp_ns"])
-        elif event["type"] == "stage_ended" and stage_id in begun:
-            start, end = begun.pop(stage_id), clock.seconds(event["stamp_ns"])
-            style = f"stage-{order.get(stage_id, 0) % 4}"
-            spans.append(Span(start_s=start, end_s=end, label=stage_id, style=style))
-    return spans
 
 
 def main_plots(

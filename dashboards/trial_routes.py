@@ -1,4 +1,4 @@
-"""Addresses behind a trial's page: its 3D scene."""
+"""Addresses behind a trial's page: its 3D scene, and all pictures of a camera at once."""
 
 import hashlib
 import threading
@@ -15,7 +15,8 @@ from starlette.routing import Route
 from bridge.episode.run_folder import RunFolder
 from bridge.whole_file import write_whole
 from dashboards.episode_page import read_replays, sent_plan_of
-from dashboards.library import derived_paths, episode_path
+from dashboards.frames import RENDERED, pack_frames
+from dashboards.library import derived_path, derived_paths, episode_path
 from dashboards.recording import Problems, read_recording
 from dashboards.trial_plots import shown_replays
 
@@ -40,6 +41,7 @@ def trial_routes(run_of: RunOf, small: Sequence[Middleware]) -> list[Route]:
     return [
         Route("/episode/{id}/scene", pages.scene, middleware=small),
         Route("/episode/{id}/scene.jpg", pages.picture),
+        Route("/episode/{id}/frames/{camera}", pages.frames),
     ]
 
 
@@ -54,6 +56,17 @@ class _TrialPages:
         with _GATHERING:
             data = _packed(path, run.path, _stamps(run, path))
         return Response(data, media_type="application/octet-stream")
+
+    def frames(self, request: Request) -> Response:
+        """``/episode/<id>/frames/<camera>?file=``: all pictures of a camera, or of the twin's."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        camera_id, name = request.path_params["camera"], request.query_params.get("file")
+        if name:
+            path, camera_id = derived_path(run, name), RENDERED + camera_id
+        headers = {"Cache-Control": "private, max-age=600"}
+        data = pack_frames(path, camera_id)
+        return Response(data, media_type="application/octet-stream", headers=headers)
 
     def picture(self, request: Request) -> Response:
         """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""

@@ -6,7 +6,7 @@ where the replay has them, taken back to where cameras see them. Nothing is loca
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -88,7 +88,10 @@ class TrialScene:
     cameras: tuple[SceneCamera, ...]
     boxes_m: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
     """By object: centre and half extents of the box around it, in its own frame."""
-    notes: tuple[str, ...] = field(default=())
+    absent: frozenset[str]
+    """Objects that were looked for and not found: as recorded they are not drawn. What nobody
+    looked for stands where it was scanned."""
+    notes: tuple[str, ...]
 
     def nearest(self, t_s: float) -> int:
         """Index of the sample nearest to a page time."""
@@ -153,7 +156,9 @@ def gather_scene(
     )
     postures = problems.attempt(lambda: posture_track(episode), None)
     robot = None if postures is None else problems.attempt(lambda: load_robot(postures.urdf), None)
-    sides = [_recorded_side(gathering, postures, robot)]
+    tracks = problems.attempt(lambda: _localised(gathering, postures), ObjectTracks())
+    problems.texts.extend(tracks.notes)
+    sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():
         side = _replayed_side(gathering, trajectory, replay, robot)
         if side is not None:
@@ -167,17 +172,17 @@ def gather_scene(
         paths=tuple(_paths(gathering, replays, sent_plan)),
         cameras=tuple(_cameras(gathering, scene)),
         boxes_m=_boxes(gathering, sides),
+        absent=tracks.absent,
         notes=tuple(problems.texts),
     )
 
 
 def _recorded_side(
-    gathering: _Gathering, postures: PostureTrack | None, robot: RobotModel | None
+    gathering: _Gathering,
+    tracks: ObjectTracks,
+    postures: PostureTrack | None,
+    robot: RobotModel | None,
 ) -> Side:
-    tracks = gathering.problems.attempt(
-        lambda: _localised(gathering, postures), ObjectTracks(notes=("objects: not localised",))
-    )
-    gathering.problems.texts.extend(tracks.notes)
     rows: dict[str, list[Float[np.ndarray, "4 4"]]] = {}
     skeletons = []
     for stamp_ns in gathering.stamps_ns.tolist():
@@ -198,7 +203,7 @@ def _localised(gathering: _Gathering, postures: PostureTrack | None) -> ObjectTr
     run, recording = gathering.run, gathering.recording
     found = derived_paths(run, recording.path.stem, "localised")
     if not found or gathering.task is None:
-        note = "objects were not localised: robot-gst replay RUN does it"
+        note = "objects stand where they were scanned: robot-gst replay RUN localises them"
         return ObjectTracks(notes=(note,))
     newest = max(found, key=lambda path: path.stat().st_mtime_ns)
     records = streams.localisations(Episode.open(newest))
