@@ -155,6 +155,7 @@ class Pages:
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
         from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
+        from dashboards.what_if import QUANTITIES  # noqa: PLC0415
 
         run = self._run(request)
         episode_id = request.path_params["id"]
@@ -163,7 +164,13 @@ class Pages:
         selection = Selection.of(request.query_params)
         before, after = neighbours(judgement, selection, episode_id)
         return self._page(
-            "episode.html", request, page=page, selection=selection, before=before, after=after
+            "episode.html",
+            request,
+            page=page,
+            selection=selection,
+            before=before,
+            after=after,
+            quantities=QUANTITIES,
         )
 
     def frame(self, request: Request) -> Response:

@@ -1,29 +1,36 @@
-"""Addresses behind a trial's page: its 3D scene, and all pictures of a camera at once."""
+"""Addresses behind a trial's page: its 3D scene, pictures of a camera, and what-if."""
 
 import hashlib
+import json
 import threading
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
 from bridge.whole_file import write_whole
 from dashboards.episode_page import read_replays, sent_plan_of
+from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, pack_frames
 from dashboards.library import derived_path, derived_paths, episode_path
 from dashboards.recording import Problems, read_recording
 from dashboards.trial_plots import shown_replays
+from dashboards.what_if import QUANTITIES, BusyError, Question, WhatIfJobs, read_change
 
 if TYPE_CHECKING:  # loads the twin
     from dashboards.trial_scene import TrialScene
 
 RunOf = Callable[[Request], RunFolder]
+MAX_BODY = 4_000
+"""Bytes of one question, with a wide margin."""
 PICTURES = "scene_pictures"
 """Folder in the run's ``results/``."""
 _GATHERING = threading.Lock()
@@ -42,12 +49,16 @@ def trial_routes(run_of: RunOf, small: Sequence[Middleware]) -> list[Route]:
         Route("/episode/{id}/scene", pages.scene, middleware=small),
         Route("/episode/{id}/scene.jpg", pages.picture),
         Route("/episode/{id}/frames/{camera}", pages.frames),
+        Route("/episode/{id}/what_if", pages.what_if),
+        Route("/episode/{id}/what_if", pages.ask, methods=["POST"]),
+        Route("/episode/{id}/what_if/cancel", pages.cancel, methods=["POST"]),
     ]
 
 
 class _TrialPages:
     def __init__(self, run_of: RunOf) -> None:
         self._run = run_of
+        self._jobs = WhatIfJobs()
 
     def scene(self, request: Request) -> Response:
         """``/episode/<id>/scene``: Gaussians, poses and ways for the 3D view."""
@@ -67,6 +78,60 @@ class _TrialPages:
         headers = {"Cache-Control": "private, max-age=600"}
         data = pack_frames(path, camera_id)
         return Response(data, media_type="application/octet-stream", headers=headers)
+
+    def what_if(self, request: Request) -> Response:
+        """``/episode/<id>/what_if``: what was answered, and whether a job runs."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        return JSONResponse(self._jobs.state(run.path, path.stem))
+
+    async def ask(self, request: Request) -> Response:
+        """``POST /episode/<id>/what_if``: replay the plan otherwise."""
+        body = bytearray()
+        async for part in request.stream():
+            body += part
+            if len(body) > MAX_BODY:
+                return _refused(413, "a question has at most 4 kB.")
+        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
+            return _refused(415, "a question is sent as application/json.")
+        try:
+            record = json.loads(body)
+        except (ValueError, RecursionError):
+            return _refused(400, "a question is a JSON object.")
+        if not isinstance(record, dict) or not set(record) <= {"change", "sweep", "plan"}:
+            return _refused(400, "a question has change, sweep and plan.")
+        return await run_in_threadpool(self._ask, request, record)
+
+    def _ask(self, request: Request, record: dict[str, Any]) -> Response:
+        try:
+            run = self._run(request)
+            path = episode_path(run, request.path_params["id"])
+            sweep, plan_id = record.get("sweep", ""), record.get("plan")
+            if sweep not in ("", *QUANTITIES):
+                message = f"no quantity {sweep!r}. There are: {', '.join(QUANTITIES)}."
+                raise UsageError(message)
+            if plan_id not in [plan.id for _, plan in read_recording(path).plans]:
+                raise UsageError("the trial has no such plan.")
+            question = Question(
+                run_path=run.path,
+                episode_id=path.stem,
+                plan_id=plan_id,
+                change=read_change(record.get("change", {})),
+                sweep=sweep,
+            )
+            return JSONResponse(self._jobs.start(question), status_code=202)
+        except BusyError as error:
+            return _refused(409, str(error))
+        except NotHereError as error:
+            return _refused(404, str(error))
+        except GstError as error:
+            return _refused(400, str(error))
+
+    def cancel(self, request: Request) -> Response:
+        """``POST /episode/<id>/what_if/cancel``: end the job, whichever it is."""
+        episode_path(self._run(request), request.path_params["id"])
+        self._jobs.cancel()
+        return JSONResponse({})
 
     def picture(self, request: Request) -> Response:
         """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
@@ -93,6 +158,10 @@ class _TrialPages:
             except OSError:  # a run that only can be read is drawn anew each time
                 pass
         return Response(data, media_type="image/jpeg", headers=headers)
+
+
+def _refused(status: int, message: str) -> Response:
+    return JSONResponse({"message": message}, status_code=status)
 
 
 Stamps = tuple[tuple[str, int, int], ...]

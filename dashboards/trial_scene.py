@@ -257,6 +257,7 @@ def _links(
 def _paths(
     gathering: _Gathering, replays: Mapping[str, Recording], sent_plan: Plan | None
 ) -> list[ToolPath]:
+    """The recorded way last, so that it is drawn over the others."""
     clock = gathering.clock
     paths = []
 
@@ -265,6 +266,11 @@ def _paths(
             p_root_m = se3.apply(gathering.T_root_base, p_m)
             paths.append(ToolPath(name=name, style=style, t_s=t_s, p_m=p_root_m))
 
+    for trajectory, replay in replays.items():
+        if replay.tcp is not None:
+            thin = _thinned(replay.tcp)
+            t_s = clock.replay_seconds(replay, thin.stamps_ns)
+            add(f"twin, {trajectory}", f"twin-{trajectory}", t_s, thin.p_m)
     start_s = None if sent_plan is None else clock.of_plan_time(sent_plan.id, 0)
     if sent_plan is not None and start_s is not None:
         add("planned", "planned", sent_plan.times_ns() * 1e-9 + start_s, sent_plan.positions_m())
@@ -272,11 +278,6 @@ def _paths(
     if tcp is not None:
         thin = _thinned(tcp)
         add("recorded", "recorded", clock.all_seconds(thin.stamps_ns), thin.p_m)
-    for trajectory, replay in replays.items():
-        if replay.tcp is not None:
-            thin = _thinned(replay.tcp)
-            t_s = clock.replay_seconds(replay, thin.stamps_ns)
-            add(f"twin, {trajectory}", f"twin-{trajectory}", t_s, thin.p_m)
     return paths
 
 
