@@ -121,6 +121,9 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
             return None
         return problems.attempt(lambda: streams.pose_track(episode, topic), None)
 
+    divergences: list[dict[str, Any]] = problems.attempt(
+        lambda: _records(episode, schema.DIVERGENCE), []
+    )
     tracked = {name: poses(topic) for name, topic in streams.object_pose_topics(episode).items()}
     return Recording(
         path=path,
@@ -137,9 +140,7 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
         events=tuple(problems.attempt(lambda: streams.events(episode), [])),
         contacts=tuple(problems.attempt(lambda: _records(episode, schema.CONTACT), [])),
-        divergence=next(
-            iter(problems.attempt(lambda: _records(episode, schema.DIVERGENCE), [])[-1:]), None
-        ),
+        divergence=divergences[-1] if divergences else None,
         joints=joints(JOINT_STATES),
         widths=joints(GRIPPER_STATE),
         clearance=joints(CLEARANCE),

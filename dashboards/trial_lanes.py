@@ -118,24 +118,18 @@ def _merged(times_s: Sequence[tuple[float, float]]) -> list[tuple[float, float]]
 
 def _apart(replays: Mapping[str, Recording], clock: PageClock) -> list[tuple[str, list[Span]]]:
     """One lane for each quantity in which trajectories differ, from its first instant on."""
-    lanes: dict[str, list[dict[str, Any]]] = {}
-    plan_id = None
+    lanes: dict[str, list[tuple[float, Mapping[str, Any]]]] = {}
     for replay in replays.values():
-        if replay.divergence is not None:
-            plan_id = replay.divergence["plan_id"]
-            for each in replay.divergence["quantities"]:
-                lane = APART.get(each["quantity"], each["quantity"].replace("_", " "))
-                lanes.setdefault(lane, []).append(each)
+        told = replay.divergence or {"plan_id": "", "quantities": []}
+        for each in told["quantities"]:
+            lane = APART.get(each["quantity"], each["quantity"].replace("_", " "))
+            start_s = clock.of_plan_time(told["plan_id"], each["first_t_ns"])
+            if start_s is not None:
+                lanes.setdefault(lane, []).append((start_s, each))
     drawn = []
-    for lane, quantities in lanes.items():
-        first = min(quantities, key=lambda each: int(each["first_t_ns"]))
-        start_s = None if plan_id is None else clock.of_plan_time(plan_id, first["first_t_ns"])
-        if start_s is None:
-            continue
-        title = "; ".join(
-            f"{each['detail']}, from {clock.of_plan_time(plan_id, each['first_t_ns']):.2f} s on"
-            for each in quantities
-        )
+    for lane, found in lanes.items():
+        start_s, first = min(found, key=lambda item: item[0])
+        title = "; ".join(f"{each['detail']}, from {t_s:.2f} s on" for t_s, each in found)
         span = Span(
             start_s=start_s, end_s=clock.end_s, label=_size(first), style="apart", title=title
         )

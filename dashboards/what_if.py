@@ -9,7 +9,7 @@ import json
 import math
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -315,7 +315,7 @@ class WhatIfJobs:
         question = answer.question
         change = question.change
         if value is not None:
-            change = replace(change, **{question.sweep: value})
+            change = read_change(asdict(change) | {question.sweep: value})
         row = self._do(question, change)
         outcome = {
             "value": value,

@@ -17,7 +17,9 @@ const frames = [...document.querySelectorAll("img.frame")].map((img) => ({
 }));
 const groups = [...Map.groupBy(frames, ({ img }) => img.closest(".camera") || img.closest("figure"))]
   .map(([element, members]) => ({ element, members, loading: false }));
-const packs = new Map(); // address of a camera's pictures -> their blobs by index
+const packs = new Map(); // address of a camera's pictures -> their files by index
+const decoded = new Map(); // and as bitmaps, as far as memory allows: these are drawn at once
+let pixelsLeft = 24e6; // 96 MB of bitmaps
 
 function nearest(times, t) {
   let best = 0;
@@ -63,10 +65,11 @@ async function showGroup(group) {
   while (differs()) {
     const wanted = group.members.map((frame) => frame.wanted);
     try {
-      const bitmaps = await Promise.all(group.members.map(
-        async (frame, at) => createImageBitmap(await blobOf(frame, wanted[at]))));
+      const ready = group.members.map((frame, at) => decoded.get(frame.img.dataset.pack)?.get(wanted[at]));
+      const bitmaps = ready.every(Boolean) ? ready : await Promise.all(group.members.map(
+        async (frame, at) => ready[at] || createImageBitmap(await blobOf(frame, wanted[at]))));
       group.members.forEach((frame, at) => draw(frame, bitmaps[at]));
-      for (const bitmap of bitmaps) bitmap.close();
+      bitmaps.forEach((bitmap, at) => { if (!ready[at]) bitmap.close(); });
     } catch {
       // A picture that cannot be read leaves the one before; the time says which that is.
       group.members.forEach((frame, at) => { frame.shown = wanted[at]; });
@@ -106,6 +109,15 @@ async function fetchPack(address) {
     start += head.sizes[at];
   });
   packs.set(address, found);
+  const bitmaps = new Map();
+  decoded.set(address, bitmaps);
+  for (const [index, file] of found) {
+    if (pixelsLeft <= 0) break;
+    const bitmap = await createImageBitmap(file).catch(() => null);
+    if (!bitmap) continue;
+    pixelsLeft -= bitmap.width * bitmap.height;
+    bitmaps.set(index, bitmap);
+  }
 }
 
 async function fetchPacks() {

@@ -375,6 +375,7 @@ async function open() {
     const answer = await fetch(panel.dataset.source);
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
     const view = new View(panel, read(await answer.arrayBuffer()));
+    await view.painter.compiled();
     document.addEventListener("page-time", ({ detail }) => { view.t = detail; view.changed(); });
     steer(view);
     buttons(panel, view);

@@ -124,15 +124,22 @@ function program(gl, vertices, colors) {
     gl.attachShader(made, shader);
   }
   gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
-    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
-    throw new Error("the graphics driver refuses a shader: " + logs.join(" "));
-  }
   const places = new Map();
   return { made, place: (name) => {
     if (!places.has(name)) places.set(name, gl.getUniformLocation(made, name));
     return places.get(name);
   } };
+}
+
+// Wait for the driver without holding the page up, and see that it took the program.
+async function compiled(gl, made) {
+  const parallel = gl.getExtension("KHR_parallel_shader_compile");
+  while (parallel && !gl.getProgramParameter(made, parallel.COMPLETION_STATUS_KHR)) {
+    await new Promise((done) => { setTimeout(done, 10); });
+  }
+  if (gl.getProgramParameter(made, gl.LINK_STATUS)) return;
+  const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
+  throw new Error("the graphics driver refuses a shader: " + logs.join(" "));
 }
 
 function texture(gl, unit) {
@@ -180,6 +187,10 @@ export class Painter {
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  async compiled() {
+    for (const { made } of [this.splats, this.lines]) await compiled(this.gl, made);
   }
 
   inputs(describe) {

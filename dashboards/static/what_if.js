@@ -21,7 +21,7 @@ function setSlider(slider, value) {
 function text(slider, value) {
   const { unit } = slider.dataset;
   if (unit === "x") return `× ${value.toPrecision(2)}`;
-  if (unit === "m") return `${value > 0 ? "+" : ""}${(1000 * value).toFixed(0)} mm`.replace("-", "\u2212");
+  if (unit === "m") return `${value > 0 ? "+" : ""}${Number((1000 * value).toFixed(1))} mm`.replace("-", "\u2212");
   return `${value > 0 ? "+" : ""}${value.toFixed(2)} ${unit}`.replace("-", "\u2212");
 }
 function tell(slider) {
