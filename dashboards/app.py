@@ -1,4 +1,4 @@
-"""The application: addresses to pages. All state is in the address; only labels are written."""
+"""The application: addresses to pages. All state is in the address but labels and what-ifs."""
 
 import shlex
 from pathlib import Path

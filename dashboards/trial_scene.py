@@ -158,6 +158,9 @@ def gather_scene(
     robot = None if postures is None else problems.attempt(lambda: load_robot(postures.urdf), None)
     tracks = problems.attempt(lambda: _localised(gathering, postures), ObjectTracks())
     problems.texts.extend(tracks.notes)
+    soft = [] if gathering.task is None else list(gathering.task.soft_objects)
+    if soft and replays:
+        problems.texts.append(f"{', '.join(soft)}: as replayed drawn without being bent")
     sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():
         side = _replayed_side(gathering, trajectory, replay, robot)

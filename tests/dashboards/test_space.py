@@ -184,6 +184,29 @@ def test_the_file_holds_the_strongest_gaussians_and_poses_on_the_pages_clock(
     assert header["spans_s"]["planned"][0] == pytest.approx(1.0)  # the plan starts after a second
 
 
+def test_without_a_scene_the_ways_are_shown_and_why_there_is_no_more(
+    own_run: RunFolder, synthetic: ModuleType
+) -> None:
+    browser = synthetic.browser_of(own_run)
+    found = unpack(browser.get(f"/episode/{ID}/scene").content)
+    assert len(found.splats) == 0
+    assert found.header["parts"] == []
+    assert any("robot-gst rebuild" in note for note in found.header["notes"])
+    paths = {path["name"]: path["points"] for path in found.header["paths"]}
+    assert sorted(paths) == ["planned", "recorded"]
+    first, count = paths["recorded"]
+    t_s = found.points[first : first + count, 3]
+    assert t_s[0] == 0
+    assert np.all(np.diff(t_s) > 0)
+    picture = browser.get(f"/episode/{ID}/scene.jpg?t=soon")
+    assert picture.headers["content-type"] == "image/jpeg"
+    kept = list((own_run.results_dir / "scene_pictures").iterdir())
+    assert browser.get(f"/episode/{ID}/scene.jpg?t=1").content
+    assert len(kept) == len(list((own_run.results_dir / "scene_pictures").iterdir())) == 1
+    for path in ("scene", "scene.jpg"):
+        assert browser.get(f"/episode/nobody/{path}").status_code == 404
+
+
 def canvas(tab: Browser) -> np.ndarray:
     """Take the canvas as it is seen, without its rounded corners."""
     tab.ask_when("document.querySelector('.space canvas').dataset.settled === '1'")
