@@ -33,6 +33,8 @@ MAX_BODY = 4_000
 """Bytes of one question, with a wide margin."""
 PICTURES = "scene_pictures"
 """Folder in the run's ``results/``."""
+SHOWN = ("replay", "localised")
+"""Derived episodes that the 3D view shows."""
 _GATHERING = threading.Lock()
 """Robot models keep scratch memory: one answer at a time uses them."""
 
@@ -65,7 +67,7 @@ class _TrialPages:
         run = self._run(request)
         path = episode_path(run, request.path_params["id"])
         with _GATHERING:
-            data = _packed(path, run.path, _stamps(run, path))
+            data = _packed(path, run.path, _stamps(run, path, *SHOWN))
         return Response(data, media_type="application/octet-stream")
 
     def frames(self, request: Request) -> Response:
@@ -83,7 +85,7 @@ class _TrialPages:
         """``/episode/<id>/what_if``: what was answered, and whether a job runs."""
         run = self._run(request)
         path = episode_path(run, request.path_params["id"])
-        return JSONResponse(self._jobs.state(run.path, path.stem))
+        return JSONResponse(self._jobs.state(run.path, path.stem, _basis(run, path)))
 
     async def ask(self, request: Request) -> Response:
         """``POST /episode/<id>/what_if``: replay the plan otherwise."""
@@ -116,6 +118,7 @@ class _TrialPages:
                 run_path=run.path,
                 episode_id=path.stem,
                 plan_id=plan_id,
+                basis=_basis(run, path),
                 change=read_change(record.get("change", {})),
                 sweep=sweep,
             )
@@ -141,7 +144,7 @@ class _TrialPages:
             t_s = round(float(request.query_params.get("t", "0")), 2)
         except ValueError:
             t_s = 0.0
-        what = repr((path.stem, _stamps(run, path), t_s))
+        what = repr((path.stem, _stamps(run, path, *SHOWN), t_s))
         name = hashlib.sha256(path.stem.encode("utf-8", "surrogatepass")).hexdigest()[:16]
         key = hashlib.sha256(what.encode(errors="surrogatepass")).hexdigest()[:16]
         kept = run.results_dir / PICTURES / f"{name}-{key}.jpg"
@@ -167,10 +170,21 @@ def _refused(status: int, message: str) -> Response:
 Stamps = tuple[tuple[str, int, int], ...]
 
 
-def _stamps(run: RunFolder, path: Path) -> Stamps:
-    """Names, times of writing and sizes of all that a trial's scene is made of."""
+def _basis(run: RunFolder, path: Path) -> str:
+    """Name what a replay of a trial is made of: recording, scene and calibration."""
+    return hashlib.sha256(repr(_stamps(run, path)).encode()).hexdigest()[:16]
+
+
+def _stamps(run: RunFolder, path: Path, *kinds: str) -> Stamps:
+    """Names, times of writing and sizes of what a trial's scene is made of.
+
+    Args:
+        run: The run folder.
+        path: The recorded episode.
+        kinds: Of derived episodes that count too.
+    """
     files = [path, run.scene_dir / "scene.json", run.scene_dir / "calibration.json"]
-    for kind in ("replay", "localised"):
+    for kind in kinds:
         files += derived_paths(run, path.stem, kind)
     found = [(file.name, file.stat()) for file in files if file.is_file()]
     return tuple((name, status.st_mtime_ns, status.st_size) for name, status in found)

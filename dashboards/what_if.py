@@ -92,6 +92,8 @@ class Question:
     episode_id: str
     plan_id: str
     change: ChangeConfig
+    basis: str = ""
+    """Names what the replay is made of; answers that were made of something else are not shown."""
     sweep: str = ""
     """Quantity that goes through its values, the others staying as set; empty: none does."""
 
@@ -159,6 +161,7 @@ class Answer:
         return {
             "episode": question.episode_id,
             "plan": question.plan_id,
+            "basis": question.basis,
             "change": asdict(question.change),
             "sweep": question.sweep,
             "state": self.state,
@@ -224,12 +227,13 @@ class WhatIfJobs:
         threading.Thread(target=self._work, args=(answer,), daemon=True).start()
         return record
 
-    def state(self, run_path: Path, episode_id: str) -> dict[str, Any]:
+    def state(self, run_path: Path, episode_id: str, basis: str = "") -> dict[str, Any]:
         """What is answered of a trial, and whether a job runs, for this trial or another.
 
         Args:
             run_path: The run folder.
             episode_id: Of the trial.
+            basis: Only answers that were made of this are told.
         """
         with self._lock:
             answer = self._answer
@@ -241,7 +245,11 @@ class WhatIfJobs:
         return {
             "busy": busy,
             "current": current,
-            "answers": read_answers(answers_path(run_path, episode_id)),
+            "answers": [
+                each
+                for each in read_answers(answers_path(run_path, episode_id))
+                if each.get("basis") == basis
+            ],
         }
 
     def cancel(self) -> None:
@@ -362,7 +370,7 @@ def keep_answer(question: Question, record: Mapping[str, Any]) -> None:
         record: As ``Answer.to_record`` makes it.
     """
     path = answers_path(question.run_path, question.episode_id)
-    same = ("plan", "change", "sweep")
+    same = ("plan", "basis", "change", "sweep")
     with _KEEPING:
         others = [
             each

@@ -15,11 +15,15 @@ const frames = [...document.querySelectorAll("img.frame")].map((img) => ({
   shown: null,
   wanted: null,
 }));
-const groups = [...Map.groupBy(frames, ({ img }) => img.closest(".camera") || img.closest("figure"))]
-  .map(([element, members]) => ({ element, members, loading: false }));
+const groups = [...new Set(frames.map(placeOf))].map((element) => (
+  { element, members: frames.filter((frame) => placeOf(frame) === element), loading: false }));
 const packs = new Map(); // address of a camera's pictures -> their files by index
 const decoded = new Map(); // and as bitmaps, as far as memory allows: these are drawn at once
 let pixelsLeft = 24e6; // 96 MB of bitmaps
+
+function placeOf({ img }) {
+  return img.closest(".camera") || img.closest("figure");
+}
 
 function nearest(times, t) {
   let best = 0;

@@ -143,11 +143,17 @@ class View {
     this.frameMs = 0;
     this.worker = new Worker("/static/splat_sort.js");
     this.worker.onmessage = ({ data }) => this.ordered(data);
-    this.worker.onerror = () => { this.worker.terminate(); };
+    this.worker.onerror = () => this.fail("the sorting thread ended");
     this.worker.postMessage({ points: file.positions, refs: new Uint32Array(0) });
     new ResizeObserver(() => this.changed()).observe(this.canvas);
     this.lost = false;
-    this.canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
+    this.canvas.addEventListener("webglcontextlost", () => this.fail("the graphics driver gave up"));
+  }
+
+  fail(why) {
+    this.lost = true;
+    this.worker.terminate();
+    refuse(why);
   }
 
   isShown(side) {
@@ -170,6 +176,7 @@ class View {
   }
 
   changed() {
+    if (this.lost || !panel.open) return;
     this.moved = performance.now();
     this.number += 1;
     this.canvas.dataset.settled = "";
@@ -367,6 +374,11 @@ function buttons(panel, view) {
 const panel = document.querySelector("details.space");
 const clock = document.getElementById("clock");
 let opened = false;
+function refuse(why) {
+  panel.querySelector(".space-state").textContent = `The picture stays as it is: ${why}.`;
+  panel.classList.remove("drawn");
+  panel.classList.add("refused");
+}
 async function open() {
   const state = panel.querySelector(".space-state");
   try {
@@ -380,6 +392,7 @@ async function open() {
     steer(view);
     buttons(panel, view);
     const ready = () => {
+      if (view.lost) return;
       if (!view.canvas.dataset.ready) { setTimeout(ready, 20); return; }
       panel.classList.add("drawn");
       view.canvas.dataset.firstMs = String(Math.round(performance.now() - began));
@@ -387,8 +400,7 @@ async function open() {
     };
     ready();
   } catch (error) {
-    state.textContent = `The picture stays as it is: ${error.message}.`;
-    panel.classList.add("refused");
+    refuse(error.message);
   }
 }
 function toggled() {

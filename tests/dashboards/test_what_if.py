@@ -17,6 +17,7 @@ from serving import dashboard
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
+from dashboards import trial_routes
 from dashboards.what_if import (
     BETWEEN,
     QUANTITIES,
@@ -82,6 +83,7 @@ def test_the_smallest_change_that_flips_the_verdict_is_narrowed_down(question: Q
     assert newest["flip"]["value"] <= 0.6 < newest["flip"]["kept"]
     jobs.start(replace(question, sweep=""))
     assert [each["value"] for each in ended(jobs, question)["answers"][0]["outcomes"]] == [None]
+    assert jobs.state(question.run_path, ID, "rebuilt since")["answers"] == []
     jobs.start(question)  # asked again: replaced, not added
     assert [each["sweep"] for each in ended(jobs, question)["answers"]] == ["x_m", "", "grip_force"]
 
@@ -174,7 +176,7 @@ def test_only_a_page_of_this_server_may_ask_and_only_for_what_is_there(
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 def test_the_page_shows_the_strip_and_why_a_plan_cannot_be_replayed(
-    own_run: RunFolder, tmp_path: Path
+    own_run: RunFolder, tmp_path: Path, synthetic: ModuleType
 ) -> None:
     outcomes = [{"value": v, "accepted": v > LIMIT_M, "why": "<b>", "file": ""} for v in (-0.01, 0)]
     change = {name: each.nominal for name, each in QUANTITIES.items()} | {"object": ""}
@@ -183,7 +185,11 @@ def test_the_page_shows_the_strip_and_why_a_plan_cannot_be_replayed(
     question = Question(
         run_path=own_run.path, episode_id=ID, plan_id=PLAN, change=ChangeConfig(), sweep="x_m"
     )
-    keep_answer(question, kept | {"total": 2, "outcomes": outcomes, "flip": flip})
+    browser = synthetic.browser_of(own_run)
+    basis = trial_routes._basis(own_run, own_run.episodes_dir / f"{ID}.mcap")
+    kept |= {"basis": basis, "total": 2, "outcomes": outcomes, "flip": flip}
+    keep_answer(question, kept)
+    assert browser.get(f"/episode/{ID}/what_if").json()["answers"] == [kept]
     answers = "document.querySelector('.what-if .answers').textContent"
     with dashboard(own_run) as (_, url), chromium(tmp_path) as tab:
         tab.show(f"{url}episode/{ID}", width=1280, dark=False)
@@ -191,5 +197,6 @@ def test_the_page_shows_the_strip_and_why_a_plan_cannot_be_replayed(
         assert "✗ failure" in tab.ask(answers)
         tab.ask("document.querySelector('.what-if .as-set').click()")
         tab.ask_when(f"{answers}.includes('robot description')")
-        assert tab.ask("document.querySelector('.what-if').dataset.state") == "idle"
+        tab.ask_when("document.querySelector('.what-if').dataset.state === 'idle'")
+        assert "robot description" in tab.ask(answers)  # kept
         assert not tab.complaints
