@@ -275,7 +275,13 @@ def test_the_page_draws_what_the_rasteriser_draws_and_follows_clock_and_hand(
 def test_without_webgl_the_picture_stays_and_the_page_says_so(
     run: RunFolder, tmp_path: Path
 ) -> None:
+    without = (
+        "const given = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        " return kind === 'webgl2' ? null : given.call(this, kind, ...more); };"
+    )
     with dashboard(run) as (_, url), chromium(tmp_path) as tab:
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source=without)
         tab.show(f"{url}episode/{ID}?space=1", width=1280, dark=False)
         tab.ask_when("document.querySelector('.space.refused .space-view img')?.naturalWidth > 0")
         said = tab.ask("document.querySelector('.space-state').textContent")
