@@ -1,4 +1,4 @@
-"""The application: addresses to pages. All state is in the address; only labels are written."""
+"""The application: addresses to pages. All state is in the address but labels and what-ifs."""
 
 import shlex
 from pathlib import Path
@@ -48,6 +48,7 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
+        *pages.trial(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
@@ -157,6 +158,7 @@ class Pages:
         """``/episode/<id>``: one trial and its replays."""
         with LOADING:
             from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
+            from dashboards.what_if import QUANTITIES  # noqa: PLC0415
 
         run = self._run(request)
         episode_id = request.path_params["id"]
@@ -165,7 +167,13 @@ class Pages:
         selection = Selection.of(request.query_params)
         before, after = neighbours(judgement, selection, episode_id)
         return self._page(
-            "episode.html", request, page=page, selection=selection, before=before, after=after
+            "episode.html",
+            request,
+            page=page,
+            selection=selection,
+            before=before,
+            after=after,
+            quantities=QUANTITIES,
         )
 
     def frame(self, request: Request) -> Response:
@@ -191,6 +199,12 @@ class Pages:
     def reviews(self) -> list[Route]:
         """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
         return review_routes(self._run, self._page)
+
+    def trial(self) -> list[Route]:
+        """``/episode/<id>/scene``: what is behind a trial's page."""
+        from dashboards.trial_routes import trial_routes  # noqa: PLC0415  # reads episodes
+
+        return trial_routes(self._run, SMALL)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -270,7 +270,7 @@ def time_plot(
     )
 
 
-LANE_HEIGHT = 30
+LANE_HEIGHT = 23
 LANE_LABEL_WIDTH = 92
 
 

@@ -1,5 +1,6 @@
 """Camera frames of an episode: when they were taken, and their bytes as recorded."""
 
+import json
 import sys
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -94,18 +95,58 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
         camera_id: Id of the camera, without the parts of its topic.
         stamp_ns: Source time of the wanted instant [ns].
     """
-    tracks = camera_tracks(path)
-    if camera_id not in tracks:
-        found = ", ".join(tracks) or "none"
-        text = f"{path.name} has no frames of camera {camera_id!r}. Cameras: {found}."
-        raise NotHereError(text)
-    track = tracks[camera_id]
+    track = _track_of(path, camera_id)
     message = _find(Episode.open(path), track, track.nearest(stamp_ns))
     if message is None:
         text = f"{path.name} changed while it was read; reload the page."
         raise NotHereError(text)
     data = color_file_from_message(message.type_name, message.data).data
     return data, media_type(data, path)
+
+
+MAX_PACKED, MAX_PACKED_BYTES = 600, 48_000_000
+"""Of the pictures that a page gets at once; a longer recording is thinned out evenly, and what is
+between them is asked for one by one."""
+
+
+def pack_frames(path: Path, camera_id: str) -> bytes:
+    """All pictures of a camera in one answer, so that a page can go through them at once.
+
+    The length of the header (uint32, little-endian), the header in JSON with each picture's place
+    in the track, size and media type, then the files one after another.
+
+    Args:
+        path: The episode file.
+        camera_id: Id of the camera, without the parts of its topic.
+    """
+    track = _track_of(path, camera_id)
+    episode = Episode.open(path)
+    places = {stamp_ns: index for index, stamp_ns in enumerate(track.stamps_ns)}
+    step = -(-len(places) // MAX_PACKED)
+    files: dict[int, bytes] = {}
+    for message in image_messages(episode, [track.topic]):
+        index = places.get(message.publish_time_ns)
+        if index is None or index in files or index % step:
+            continue
+        files[index] = color_file_from_message(message.type_name, message.data).data
+        if len(files) == 1:
+            step = max(step, -(-len(places) * len(files[index]) // MAX_PACKED_BYTES))
+    head = {
+        "indices": list(files),
+        "sizes": [len(data) for data in files.values()],
+        "types": [media_type(data, path) for data in files.values()],
+    }
+    text = json.dumps(head).encode()
+    return len(text).to_bytes(4, "little") + text + b"".join(files.values())
+
+
+def _track_of(path: Path, camera_id: str) -> CameraTrack:
+    tracks = camera_tracks(path)
+    if camera_id not in tracks:
+        found = ", ".join(tracks) or "none"
+        text = f"{path.name} has no frames of camera {camera_id!r}. Cameras: {found}."
+        raise NotHereError(text)
+    return tracks[camera_id]
 
 
 def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:

@@ -70,6 +70,8 @@ class QueueItem:
     distance_m: float | None
     """Largest distance of the recorded tool from the planned replay's, where it was measured."""
     moment: Moment | None
+    moment_t_s: float | None
+    """When that is on the trial's own page; None where its plan was never executed."""
     num_labels: int
     """How many raters labelled it; what they said is not shown here."""
     flagged: bool
@@ -145,7 +147,8 @@ def build_queue(
                 row=row,
                 reason=REASONS[rank(row)],
                 distance_m=row.distance_m,
-                moment=moment_of(run, row),
+                moment=(moment := moment_of(run, row)),
+                moment_t_s=None if moment is None else _page_t_s(run, row, moment),
                 num_labels=labels.get(row.episode, 0),
                 flagged=row.episode in flagged,
             )
@@ -180,6 +183,33 @@ def moment_of(run: RunFolder, row: IndexedTrial) -> Moment | None:
         if moment is not None:
             return moment
     return None
+
+
+def _page_t_s(run: RunFolder, row: IndexedTrial, moment: Moment) -> float | None:
+    """Seconds since the recording's first sample, from where its page counts."""
+    try:
+        path = episode_path(run, row.episode)
+        status = path.stat()
+        starts_s = _starts_s(path, status.st_mtime_ns, status.st_size)
+    except (GstError, OSError):
+        return None
+    start_s = starts_s.get(moment.plan_id)
+    return None if start_s is None else start_s + moment.t_s
+
+
+@lru_cache(maxsize=4096)
+def _starts_s(path: Path, _mtime_ns: int, _size: int) -> dict[str, float]:
+    """When each executed plan started on the page's clock."""
+    episode = Episode.open(path)
+    events = streams.events(episode)
+    zero_ns = streams.first_stamp_ns(episode) or 0
+    plan_ids = {str(event.get("plan_id")) for event in events}
+    starts_ns = {plan_id: streams.execution_ns(events, plan_id)[0] for plan_id in plan_ids}
+    return {
+        plan_id: (start_ns - zero_ns) / NS_PER_S
+        for plan_id, start_ns in starts_ns.items()
+        if start_ns is not None
+    }
 
 
 @lru_cache(maxsize=4096)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.episode import streams
+from bridge.episode import schema, streams
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
@@ -17,6 +17,7 @@ from bridge.episode.topics import CLEARANCE, GRIPPER_STATE, JOINT_STATES, TCP_PO
 from bridge.errors import GstError
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
+from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from dashboards.frames import CameraTrack, camera_tracks
 
@@ -61,6 +62,10 @@ class Recording:
     plans: tuple[tuple[int, Plan], ...]
     verdicts: tuple[tuple[int, Verdict], ...]
     events: tuple[dict[str, Any], ...]
+    contacts: tuple[dict[str, Any], ...]
+    """What touched what in a replay, on its own clock."""
+    divergence: dict[str, Any] | None
+    """What a replay says of where planned, executed and recorded part."""
     joints: JointTrack | None
     widths: JointTrack | None
     clearance: JointTrack | None
@@ -116,6 +121,9 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
             return None
         return problems.attempt(lambda: streams.pose_track(episode, topic), None)
 
+    divergences: list[dict[str, Any]] = problems.attempt(
+        lambda: _records(episode, schema.DIVERGENCE), []
+    )
     tracked = {name: poses(topic) for name, topic in streams.object_pose_topics(episode).items()}
     return Recording(
         path=path,
@@ -131,6 +139,8 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         plans=tuple(problems.attempt(lambda: streams.plans(episode), [])),
         verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
         events=tuple(problems.attempt(lambda: streams.events(episode), [])),
+        contacts=tuple(problems.attempt(lambda: _records(episode, schema.CONTACT), [])),
+        divergence=divergences[-1] if divergences else None,
         joints=joints(JOINT_STATES),
         widths=joints(GRIPPER_STATE),
         clearance=joints(CLEARANCE),
@@ -139,6 +149,14 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         cameras=problems.attempt(lambda: camera_tracks(path), {}),
         problems=tuple(problems.texts),
     )
+
+
+def _records(episode: Episode, kind: str) -> list[dict[str, Any]]:
+    """All records of one kind, in log order."""
+    return [
+        parse_record(message.data, name=kind.rpartition("/")[2].lower())
+        for message in episode.messages(episode.topics_of_type(kind))
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,6 @@ NO_CHROMIUM = "no chromium on this machine (Debian: chromium)"
 FLAGS = (
     "--headless",
     "--no-sandbox",
-    "--disable-gpu",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -31,6 +30,8 @@ FLAGS = (
 )
 """It draws on the processor, asks nobody for anything, and may be run as root."""
 
+SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Instead of --disable-gpu, without which there is no WebGL on a machine without a GPU."""
 
 KEYS: dict[str, dict[str, Any]] = {
     "Tab": {"windowsVirtualKeyCode": 9},
@@ -159,15 +160,17 @@ class Browser:
 
 
 @contextmanager
-def chromium(home: Path) -> Iterator[Browser]:
+def chromium(home: Path, *, webgl: bool = False) -> Iterator[Browser]:
     """Start Chromium with its own home folder; end it with the block."""
     assert CHROMIUM is not None
+    drawing = SOFTWARE_WEBGL if webgl else ("--disable-gpu",)
     to_read, commands = os.pipe()
     answers, to_write = os.pipe()
     # Chromium reads commands from 3 and answers on 4.
+    command = [CHROMIUM, *FLAGS, *drawing, f"--user-data-dir={home / 'profile'}"]
     shell = f'exec "$@" 3<&{to_read} 4>&{to_write}'
     process = subprocess.Popen(
-        ["bash", "-c", shell, "bash", CHROMIUM, *FLAGS, f"--user-data-dir={home / 'profile'}"],
+        ["bash", "-c", shell, "bash", *command],
         pass_fds=(to_read, to_write),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

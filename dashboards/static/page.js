@@ -1,16 +1,8 @@
 "use strict";
-// One time for the whole page: slider, cameras, cursors in every plot, and the address.
+// One time for the whole page: slider, cursors in every plot, and the address. Whatever else shows
+// an instant listens to "page-time".
 
 const clock = document.getElementById("clock");
-const frames = [...document.querySelectorAll("img.frame")].map((img) => ({
-  img,
-  times: img.dataset.times.split(" ").map(Number),
-  // What names a frame in its address: its time, or the stamp of a picture of the twin.
-  stamps: img.dataset.stamps ? img.dataset.stamps.split(" ") : null,
-  label: img.closest("figure").querySelector(".frame-time"),
-  shown: null,
-  wanted: null,
-}));
 const charts = [...document.querySelectorAll("svg.timed")].map((svg) => ({
   svg,
   cursor: svg.querySelector(".cursor"),
@@ -38,49 +30,6 @@ function heightAt(pieces, x) {
     return x1 === x0 ? y0 : y0 + ((x - x0) / (x1 - x0)) * (y1 - y0);
   }
   return null;
-}
-
-function nearest(times, t) {
-  let best = 0;
-  for (let index = 1; index < times.length; index += 1) {
-    if (Math.abs(times[index] - t) < Math.abs(times[best] - t)) best = index;
-  }
-  return times[best];
-}
-
-// Fetch one image at a time per camera, always the newest wanted one.
-function showFrame(frame, t) {
-  frame.wanted = nearest(frame.times, t);
-  if (frame.img.closest("[hidden]")) return;
-  if (frame.loading || frame.wanted === frame.shown) return;
-  frame.loading = true;
-  const at = frame.wanted;
-  const next = new Image();
-  const done = () => {
-    frame.loading = false;
-    frame.shown = at;
-    if (frame.wanted !== at) showFrame(frame, frame.wanted);
-  };
-  next.onload = () => {
-    frame.img.src = next.src;
-    if (frame.label) frame.label.textContent = at.toFixed(2);
-    done();
-  };
-  next.onerror = done;
-  const source = frame.img.dataset.source;
-  const name = frame.stamps ? "stamp=" + frame.stamps[frame.times.indexOf(at)] : "t=" + at;
-  next.src = source + (source.includes("?") ? "&" : "?") + name;
-}
-
-// A difference means something only where both pictures are of one instant.
-const SAME_INSTANT_S = 0.02;
-function showDifferences() {
-  for (const figure of document.querySelectorAll(".beside")) {
-    const [recorded, twin] = frames.filter(({ img }) => figure.contains(img));
-    const apart = Math.abs(recorded.wanted - twin.wanted) > SAME_INSTANT_S;
-    figure.classList.toggle("apart", apart);
-    figure.querySelector(".apart").hidden = !apart;
-  }
 }
 
 function showCharts(t) {
@@ -118,9 +67,8 @@ function setTime(t, { remember = true } = {}) {
   const bounded = Math.min(Math.max(t, 0), Number(clock.max));
   clock.value = bounded;
   document.getElementById("clock-text").textContent = bounded.toFixed(2) + " s";
-  for (const frame of frames) showFrame(frame, bounded);
-  showDifferences();
   showCharts(bounded);
+  document.dispatchEvent(new CustomEvent("page-time", { detail: bounded }));
   if (remember) keepInAddress(bounded);
 }
 
@@ -175,21 +123,6 @@ if (clock) {
     svg.addEventListener("click", (event) => setTime(timeAt(svg, event)));
   }
   showCharts(Number(clock.value));
-  for (const frame of frames) frame.wanted = nearest(frame.times, Number(clock.value));
-  showDifferences();
-}
-
-// With the twin's pictures beside the recorded ones there is room for one camera at a time.
-const cameras = [...document.querySelectorAll(".trio")];
-function showCamera(index) {
-  cameras.forEach((camera, at) => { camera.hidden = at !== index % cameras.length; });
-  setTime(Number(clock.value), { remember: false });
-}
-if (cameras.length > 1) {
-  const other = document.getElementById("camera");
-  other.hidden = false;
-  other.addEventListener("click", () => showCamera(cameras.findIndex((camera) => !camera.hidden) + 1));
-  showCamera(0);
 }
 
 // Keys of the player, wherever the focus is.
@@ -199,6 +132,7 @@ function playerKey(event) {
   else if (event.key === "ArrowLeft") setTime(Number(clock.value) - 0.1);
   else if (event.key === "ArrowRight") setTime(Number(clock.value) + 0.1);
   else if (event.key === "c") document.getElementById("camera")?.click();
+  else if (event.key === "v") document.getElementById("mode")?.dispatchEvent(new Event("next"));
   else if (event.key === "d") document.getElementById("divergence")?.click();
   else return;
   event.preventDefault();

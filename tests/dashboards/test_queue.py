@@ -160,7 +160,7 @@ def test_the_queue_page_leads_to_each_trial_and_says_why(browser: Any) -> None:
     assert sorted(ids) == ["trial_0001", "trial_0002", "trial_0003", "trial_0004"]
     text = words(answer.text)
     assert "wrong no: the twin fails, the trial succeeded" in text
-    assert "2.80 s into the plan: the cube left the gripper during carry" in text
+    assert "at 3.80 s : the cube left the gripper during carry" in text
     picture = browser.get("/queue/thumbnail/trial_0002")
     assert picture.headers["content-type"] == "image/jpeg"
     for address in ("/queue/thumbnail/..%2F..%2Fx", "/queue/thumbnail/scan"):

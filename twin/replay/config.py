@@ -299,3 +299,45 @@ class ReplayRunConfig:
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be replayed."""
         refuse_outside(self, {"workers": (1, 4096), "samples": (0, 100_000)})
+
+
+CHANGES: Mapping[str, tuple[float, float]] = {
+    "friction": (0.05, 10),
+    "grip_force": (0.05, 10),
+    "mass": (0.05, 20),
+    "grip_delay_s": (0, 2),
+    "x_m": (-0.2, 0.2),
+    "y_m": (-0.2, 0.2),
+    "turn_rad": (-3.2, 3.2),
+}
+"""How far a replay may be asked to be from the nominal one, ends included."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChangeConfig:
+    """What is otherwise than in the nominal replay of a plan; as it stands, nothing."""
+
+    friction: float = 1.0
+    """Times the objects' friction, and with it that between them and all others."""
+    grip_force: float = 1.0
+    """Times the force of the gripper."""
+    mass: float = 1.0
+    """Times the masses of objects that can be moved."""
+    grip_delay_s: float = 0.0
+    """The gripper acts this much later [s]."""
+    object: str = ""
+    """Which object stands elsewhere; empty: all that can be moved, by the same."""
+    x_m: float = 0.0
+    """How far along x of the robot's base [m]."""
+    y_m: float = 0.0
+    """And along y [m]."""
+    turn_rad: float = 0.0
+    """And turned about the vertical through it [rad]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is farther than anybody means.
+
+        Raises:
+            UsageError: Naming the number and its limits.
+        """
+        refuse_outside(self, CHANGES)

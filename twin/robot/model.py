@@ -409,6 +409,15 @@ class RobotModel:
         """Forward kinematics along a joint path."""
         return np.stack([self.T_base_tcp(row) for row in joints_rad])
 
+    def skeleton_m(
+        self, joints_rad: Float[np.ndarray, " num_joints"]
+    ) -> Float[np.ndarray, "num_points 3"]:
+        """Where base, the arm's joints from base to hand, and tool are: the arm as a line [m]."""
+        pin.forwardKinematics(self.model, self.data, self.configuration(joints_rad))
+        tool = pin.updateFramePlacement(self.model, self.data, self.tcp_id).translation
+        joints = [self.data.oMi[self.model.getJointId(name)].translation for name in self.joints]
+        return np.array([np.zeros(3), *joints, tool])
+
     def T_base_link(
         self, link: str, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:

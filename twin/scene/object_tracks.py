@@ -124,6 +124,34 @@ def replayed_tracks(
     return ObjectTracks(paths=paths)
 
 
+def localised_tracks(
+    episode: Episode,
+    localised: Sequence[Mapping[str, object]],
+    task: Task,
+    postures: PostureTrack | None,
+) -> ObjectTracks:
+    """Where a recorded episode's objects were: localised, and carried in between.
+
+    Args:
+        episode: The recording, for its executions.
+        localised: Its gst localisation v1 records.
+        task: The objects.
+        postures: Joints and fingers, if they were recorded.
+    """
+    events = streams.events(episode)
+    plan_ids = {
+        str(event["plan_id"])
+        for event in events
+        if event["type"] == "execution_ended" and event.get("plan_id") is not None
+    }
+    executions = {}
+    for plan_id in plan_ids:
+        start_ns, end_ns = streams.execution_ns(events, plan_id)
+        if start_ns is not None and end_ns is not None:
+            executions[plan_id] = (start_ns, end_ns)
+    return carried_tracks(localised, executions, task, postures)
+
+
 def carried_tracks(
     localised: Sequence[Mapping[str, object]],
     executions_ns: Mapping[str, tuple[int, int]],

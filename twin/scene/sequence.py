@@ -34,7 +34,7 @@ from twin.scene.image_agreement import (
 )
 from twin.scene.localise.episode import write_localised
 from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.object_tracks import ObjectTracks, carried_tracks, replayed_tracks
+from twin.scene.object_tracks import ObjectTracks, localised_tracks, replayed_tracks
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.render import (
@@ -155,17 +155,7 @@ def recorded_tracks(
         records = streams.localisations(Episode.open(path))
     except GstError as error:
         return ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
-    plan_ids = {
-        str(event["plan_id"])
-        for event in streams.events(episode)
-        if event["type"] == "execution_ended" and event.get("plan_id") is not None
-    }
-    executions = {
-        plan_id: span
-        for plan_id in plan_ids
-        if (span := streams.executed_interval_ns(episode, plan_id)) is not None
-    }
-    return carried_tracks(records, executions, task, postures)
+    return localised_tracks(episode, records, task, postures)
 
 
 def frames_of(

@@ -1,0 +1,214 @@
+"""Addresses behind a trial's page: its 3D scene, pictures of a camera, and what-if."""
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
+from bridge.whole_file import write_whole
+from dashboards.episode_page import read_replays, sent_plan_of
+from dashboards.errors import NotHereError
+from dashboards.frames import RENDERED, pack_frames
+from dashboards.library import derived_path, derived_paths, episode_path
+from dashboards.recording import Problems, read_recording
+from dashboards.trial_plots import shown_replays
+from dashboards.what_if import QUANTITIES, BusyError, Question, WhatIfJobs, read_change
+
+if TYPE_CHECKING:  # loads the twin
+    from dashboards.trial_scene import TrialScene
+
+RunOf = Callable[[Request], RunFolder]
+MAX_BODY = 4_000
+"""Bytes of one question, with a wide margin."""
+PICTURES = "scene_pictures"
+"""Folder in the run's ``results/``."""
+SHOWN = ("replay", "localised")
+"""Derived episodes that the 3D view shows."""
+_GATHERING = threading.Lock()
+"""Robot models keep scratch memory: one answer at a time uses them."""
+
+
+def trial_routes(run_of: RunOf, small: Sequence[Middleware]) -> list[Route]:
+    """Return the addresses.
+
+    Args:
+        run_of: The run that a request is about.
+        small: Compresses answers.
+    """
+    pages = _TrialPages(run_of)
+    return [
+        Route("/episode/{id}/scene", pages.scene, middleware=small),
+        Route("/episode/{id}/scene.jpg", pages.picture),
+        Route("/episode/{id}/frames/{camera}", pages.frames),
+        Route("/episode/{id}/what_if", pages.what_if),
+        Route("/episode/{id}/what_if", pages.ask, methods=["POST"]),
+        Route("/episode/{id}/what_if/cancel", pages.cancel, methods=["POST"]),
+    ]
+
+
+class _TrialPages:
+    def __init__(self, run_of: RunOf) -> None:
+        self._run = run_of
+        self._jobs = WhatIfJobs()
+
+    def scene(self, request: Request) -> Response:
+        """``/episode/<id>/scene``: Gaussians, poses and ways for the 3D view."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        with _GATHERING:
+            data = _packed(path, run.path, _stamps(run, path, *SHOWN))
+        return Response(data, media_type="application/octet-stream")
+
+    def frames(self, request: Request) -> Response:
+        """``/episode/<id>/frames/<camera>?file=``: all pictures of a camera, or of the twin's."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        camera_id, name = request.path_params["camera"], request.query_params.get("file")
+        if name:
+            path, camera_id = derived_path(run, name), RENDERED + camera_id
+        headers = {"Cache-Control": "private, max-age=600"}
+        data = pack_frames(path, camera_id)
+        return Response(data, media_type="application/octet-stream", headers=headers)
+
+    def what_if(self, request: Request) -> Response:
+        """``/episode/<id>/what_if``: what was answered, and whether a job runs."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        return JSONResponse(self._jobs.state(run.path, path.stem, _basis(run, path)))
+
+    async def ask(self, request: Request) -> Response:
+        """``POST /episode/<id>/what_if``: replay the plan otherwise."""
+        body = bytearray()
+        async for part in request.stream():
+            body += part
+            if len(body) > MAX_BODY:
+                return _refused(413, "a question has at most 4 kB.")
+        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
+            return _refused(415, "a question is sent as application/json.")
+        try:
+            record = json.loads(body)
+        except (ValueError, RecursionError):
+            return _refused(400, "a question is a JSON object.")
+        if not isinstance(record, dict) or not set(record) <= {"change", "sweep", "plan"}:
+            return _refused(400, "a question has change, sweep and plan.")
+        return await run_in_threadpool(self._ask, request, record)
+
+    def _ask(self, request: Request, record: dict[str, Any]) -> Response:
+        try:
+            run = self._run(request)
+            path = episode_path(run, request.path_params["id"])
+            sweep, plan_id = record.get("sweep", ""), record.get("plan")
+            if sweep not in ("", *QUANTITIES):
+                message = f"no quantity {sweep!r}. There are: {', '.join(QUANTITIES)}."
+                raise UsageError(message)
+            if plan_id not in [plan.id for _, plan in read_recording(path).plans]:
+                raise UsageError("the trial has no such plan.")
+            question = Question(
+                run_path=run.path,
+                episode_id=path.stem,
+                plan_id=plan_id,
+                basis=_basis(run, path),
+                change=read_change(record.get("change", {})),
+                sweep=sweep,
+            )
+            return JSONResponse(self._jobs.start(question), status_code=202)
+        except BusyError as error:
+            return _refused(409, str(error))
+        except NotHereError as error:
+            return _refused(404, str(error))
+        except GstError as error:
+            return _refused(400, str(error))
+
+    def cancel(self, request: Request) -> Response:
+        """``POST /episode/<id>/what_if/cancel``: end the job, whichever it is."""
+        episode_path(self._run(request), request.path_params["id"])
+        self._jobs.cancel()
+        return JSONResponse({})
+
+    def picture(self, request: Request) -> Response:
+        """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        try:
+            t_s = round(float(request.query_params.get("t", "0")), 2)
+        except ValueError:
+            t_s = 0.0
+        what = repr((path.stem, _stamps(run, path, *SHOWN), t_s))
+        name = hashlib.sha256(path.stem.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        key = hashlib.sha256(what.encode(errors="surrogatepass")).hexdigest()[:16]
+        kept = run.results_dir / PICTURES / f"{name}-{key}.jpg"
+        headers = {"Cache-Control": "private, max-age=600"}
+        with _GATHERING:
+            if kept.is_file():
+                return Response(kept.read_bytes(), media_type="image/jpeg", headers=headers)
+            data = _drawn(path, run.path, t_s)
+            try:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                for old in kept.parent.glob(f"{name}-*.jpg"):
+                    old.unlink()
+                write_whole(kept, data)
+            except OSError:  # a run that only can be read is drawn anew each time
+                pass
+        return Response(data, media_type="image/jpeg", headers=headers)
+
+
+def _refused(status: int, message: str) -> Response:
+    return JSONResponse({"message": message}, status_code=status)
+
+
+Stamps = tuple[tuple[str, int, int], ...]
+
+
+def _basis(run: RunFolder, path: Path) -> str:
+    """Name what a replay of a trial is made of: recording, scene and calibration."""
+    return hashlib.sha256(repr(_stamps(run, path)).encode()).hexdigest()[:16]
+
+
+def _stamps(run: RunFolder, path: Path, *kinds: str) -> Stamps:
+    """Names, times of writing and sizes of what a trial's scene is made of.
+
+    Args:
+        run: The run folder.
+        path: The recorded episode.
+        kinds: Of derived episodes that count too.
+    """
+    files = [path, run.scene_dir / "scene.json", run.scene_dir / "calibration.json"]
+    for kind in kinds:
+        files += derived_paths(run, path.stem, kind)
+    found = [(file.name, file.stat()) for file in files if file.is_file()]
+    return tuple((name, status.st_mtime_ns, status.st_size) for name, status in found)
+
+
+@lru_cache(maxsize=2)
+def _packed(path: Path, run_path: Path, _stamps: Stamps) -> bytes:
+    from dashboards.scene_file import pack_scene  # noqa: PLC0415  # loads the twin
+
+    return pack_scene(_gathered(path, run_path))
+
+
+def _drawn(path: Path, run_path: Path, t_s: float) -> bytes:
+    from dashboards.scene_file import draw_picture  # noqa: PLC0415  # loads the twin
+
+    return draw_picture(_gathered(path, run_path), t_s)
+
+
+def _gathered(path: Path, run_path: Path) -> "TrialScene":
+    from dashboards.trial_scene import gather_scene  # noqa: PLC0415  # loads the twin
+
+    run = RunFolder(run_path)
+    recording = read_recording(path)
+    problems = Problems()
+    replays = read_replays(derived_paths(run, path.stem, "replay"), recording, problems)
+    sent_plan = sent_plan_of(recording)
+    return gather_scene(run, recording, shown_replays(replays, sent_plan), sent_plan)
