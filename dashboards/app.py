@@ -46,6 +46,7 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
+        *pages.studies(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
@@ -189,6 +190,12 @@ class Pages:
         from dashboards.review_routes import review_routes  # noqa: PLC0415  # compares runs
 
         return review_routes(self._run, self._page)
+
+    def studies(self) -> list[Route]:
+        """``/failures``: what goes wrong, and how often."""
+        from dashboards.study_routes import study_routes  # noqa: PLC0415  # beside the reviews
+
+        return study_routes(self._run, self._page)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

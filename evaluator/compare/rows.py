@@ -80,6 +80,10 @@ class TrialRow:
     executed_replay: str | None = None
     failing_cause: str | None = None
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
+    failing_bodies: tuple[str, ...] = ()
+    """What touched, came too close or was lost then."""
+    failing_stage: str = ""
+    """The stage of the plan in which it failed, where the verdict gives an instant."""
     study_arm: str = ""
     """without, with or control; empty outside a study."""
     why_unknown: str = ""

@@ -13,6 +13,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from bridge.whole_file import write_whole
 from evaluator.cache import FOLDER, SummaryCache
+from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.run import compare_run
 from evaluator.compare.stages import first_failed_stage
@@ -102,7 +103,11 @@ def _write(
         for motion in motions
         if (motion.side, motion.against) == ("recorded", "planned")
     }
-    trials = sorted((_trial(row, far_m.get(row.episode)) for row in rows), key=severity)
+    regions = start_regions(rows)
+    trials = sorted(
+        (_trial(row, far_m.get(row.episode), regions.get(row.episode, "")) for row in rows),
+        key=severity,
+    )
     about = {
         "state": state.digest,
         "as_of_ns": began_ns,
@@ -126,7 +131,8 @@ def _write(
     return content
 
 
-def _trial(row: TrialRow, distance_m: float | None) -> IndexedTrial:
+def _trial(row: TrialRow, distance_m: float | None, region: str) -> IndexedTrial:
+    kind = failure_kind(row)
     return IndexedTrial(
         episode=row.episode,
         file="" if row.path is None else row.path.name,
@@ -153,6 +159,10 @@ def _trial(row: TrialRow, distance_m: float | None) -> IndexedTrial:
         executed_replay=row.executed_replay,
         began_ns=row.began_ns,
         distance_m=distance_m,
+        fail_cause="" if kind is None else kind.cause,
+        fail_stage="" if kind is None else kind.stage,
+        fail_bodies="" if kind is None else kind.bodies,
+        start_region=region,
     )
 
 

@@ -1,0 +1,68 @@
+"""Addresses of pages about many trials at once. What reads episodes is imported when asked for."""
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from bridge.errors import MissingDependencyError
+from dashboards.comparison import judge
+from dashboards.errors import NotHereError
+from dashboards.review_routes import Page, RunOf
+from evaluator.review_index import FailureSelection, IndexedTrial
+
+
+def study_routes(run_of: RunOf, page: Page) -> list[Route]:
+    """Return the addresses of failures.
+
+    Args:
+        run_of: The run that a request is about.
+        page: Fills in a template.
+    """
+    pages = _StudyPages(run_of, page)
+    return [
+        Route("/failures", pages.failures),
+        Route("/failures/picture/{id}", pages.picture),
+        Route("/failures/clip/{id}", pages.clip),
+    ]
+
+
+class _StudyPages:
+    def __init__(self, run_of: RunOf, page: Page) -> None:
+        self._run = run_of
+        self._page = page
+
+    def failures(self, request: Request) -> Response:
+        """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
+        from dashboards.failures_page import PART_WORDS, build_failures  # noqa: PLC0415
+
+        run = self._run(request)
+        found = build_failures(run, judge(run), FailureSelection.of(request.query_params))
+        return self._page("failures.html", request, page=found, part_words=PART_WORDS)
+
+    def picture(self, request: Request) -> Response:
+        """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
+        from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
+
+        return _kept(picture(self._run(request), self._trial(request)), "image/jpeg")
+
+    def clip(self, request: Request) -> Response:
+        """``/failures/clip/<id>``: a trial around its moment, as MP4."""
+        from dashboards.clips import clip  # noqa: PLC0415  # reads episodes
+
+        try:
+            data = clip(self._run(request), self._trial(request))
+        except MissingDependencyError as error:
+            raise NotHereError(str(error)) from error
+        return _kept(data, "video/mp4")
+
+    def _trial(self, request: Request) -> IndexedTrial:
+        row = judge(self._run(request)).row(request.path_params["id"])
+        if row is None or not row.file:
+            message = "no such recorded trial in this run."
+            raise NotHereError(message)
+        return row
+
+
+def _kept(data: bytes, media_type: str) -> Response:
+    headers = {"Cache-Control": "private, max-age=600"}
+    return Response(data, media_type=media_type, headers=headers)
