@@ -135,8 +135,8 @@ class StageTime:
     """When a plan means to do one of its stages, since its start."""
 
     id: str
-    start_ns: int
-    end_ns: int
+    t_start_ns: int
+    t_end_ns: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,8 +298,8 @@ def _stages(records: object) -> Iterator[StageTime]:
         try:
             yield StageTime(
                 id=str(stage["id"]),
-                start_ns=int(stage["t_start_ns"]),
-                end_ns=int(stage["t_end_ns"]),
+                t_start_ns=int(stage["t_start_ns"]),
+                t_end_ns=int(stage["t_end_ns"]),
             )
         except (KeyError, TypeError, ValueError):  # the replay says what is wrong with it
             return
