@@ -197,7 +197,7 @@ def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:
     """Name the stage of the plan that an instant is in; what is after the last is in the last."""
     if t_ns is None:
         return ""
-    begun = [each.id for each in facts.plan_stages if each.t_start_ns <= t_ns]
+    begun = [each.id for each in facts.plan_stages if t_ns >= each.t_start_ns]
     return begun[-1] if begun else ""
 
 
