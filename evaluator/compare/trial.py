@@ -198,7 +198,7 @@ def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:
     if t_ns is None:
         return ""
     begun = [each.id for each in facts.plan_stages if t_ns >= each.t_start_ns]
-    return begun[-1] if begun else ""
+    return next(reversed(begun), "")
 
 
 def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:
