@@ -20,7 +20,7 @@ from bridge.errors import GstError
 from dashboards import wording
 from dashboards.comparison import judge
 from dashboards.errors import NotHereError
-from dashboards.guard import Admission, Guard
+from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.overview_page import build_overview, neighbours
 from evaluator.review_index import SHOW, Selection
@@ -37,7 +37,8 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         library: The runs that are shown.
         admission: Which host and token are answered; None answers only on the loopback address.
     """
-    pages = Pages(library)
+    admission = admission or Admission()
+    pages = Pages(library, looks_beside=is_loopback(admission.host))
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -53,7 +54,7 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
     ]
     return Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, admission=admission or Admission())],
+        middleware=[Middleware(Guard, admission=admission)],
         exception_handlers={
             GstError: pages.failed,
             HTTPException: pages.http_failed,
@@ -120,9 +121,15 @@ def _download(path: Path) -> Response:
 class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
-    def __init__(self, library: Library) -> None:
-        """Remember the runs and load the templates."""
+    def __init__(self, library: Library, *, looks_beside: bool = True) -> None:
+        """Remember the runs and load the templates.
+
+        Args:
+            library: The runs that are shown.
+            looks_beside: Whether runs in the same folder may be compared with them.
+        """
         self._library = library
+        self._looks_beside = looks_beside
         self._environment = _environment()
 
     def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
@@ -192,10 +199,13 @@ class Pages:
         return review_routes(self._run, self._page)
 
     def studies(self) -> list[Route]:
-        """``/failures``: what goes wrong, and how often."""
+        """``/failures`` and ``/compare``: what goes wrong, and what differs."""
         from dashboards.study_routes import study_routes  # noqa: PLC0415  # beside the reviews
 
-        return study_routes(self._run, self._page)
+        def others(run: RunFolder) -> dict[str, RunFolder]:
+            return self._library.others(run, beside=self._looks_beside)
+
+        return study_routes(self._run, self._page, others)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -1,35 +1,44 @@
 """Addresses of pages about many trials at once. What reads episodes is imported when asked for."""
 
+from collections.abc import Callable, Mapping
+
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import MissingDependencyError
 from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.review_routes import Page, RunOf
 from evaluator.review_index import FailureSelection, IndexedTrial
 
+OthersOf = Callable[[RunFolder], Mapping[str, RunFolder]]
+"""Gives the runs that one may be compared with, by name."""
 
-def study_routes(run_of: RunOf, page: Page) -> list[Route]:
-    """Return the addresses of failures.
+
+def study_routes(run_of: RunOf, page: Page, others_of: OthersOf) -> list[Route]:
+    """Return the addresses of failures and comparisons.
 
     Args:
         run_of: The run that a request is about.
         page: Fills in a template.
+        others_of: The runs that one may be compared with.
     """
-    pages = _StudyPages(run_of, page)
+    pages = _StudyPages(run_of, page, others_of)
     return [
         Route("/failures", pages.failures),
         Route("/failures/picture/{id}", pages.picture),
         Route("/failures/clip/{id}", pages.clip),
+        Route("/compare", pages.compare),
     ]
 
 
 class _StudyPages:
-    def __init__(self, run_of: RunOf, page: Page) -> None:
+    def __init__(self, run_of: RunOf, page: Page, others_of: OthersOf) -> None:
         self._run = run_of
         self._page = page
+        self._others = others_of
 
     def failures(self, request: Request) -> Response:
         """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
@@ -54,6 +63,20 @@ class _StudyPages:
         except MissingDependencyError as error:
             raise NotHereError(str(error)) from error
         return _kept(data, "video/mp4")
+
+    def compare(self, request: Request) -> Response:
+        """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
+        from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
+
+        run = self._run(request)
+        others = self._others(run)
+        name = request.query_params.get("with", "")
+        if name and name not in others:
+            message = f"no run {name!r} to compare with. There are: {', '.join(others) or 'none'}."
+            raise NotHereError(message)
+        judged = {each: judge(other) if each == name else None for each, other in others.items()}
+        found = build_compare(run, judge(run), judged, request.query_params)
+        return self._page("compare.html", request, page=found)
 
     def _trial(self, request: Request) -> IndexedTrial:
         row = judge(self._run(request)).row(request.path_params["id"])
