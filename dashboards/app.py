@@ -1,6 +1,7 @@
 """The application: addresses to pages. All state is in the address; only labels are written."""
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -90,6 +91,7 @@ def _environment() -> Environment:
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))
     environment.globals["link"] = link
+    environment.globals["share"] = share_link
     environment.globals["SHOW"] = SHOW
     return environment
 
@@ -98,6 +100,17 @@ def link(path: str, **query: object) -> str:
     """Build an address; empty values are left out of the query."""
     kept = {key: value for key, value in query.items() if value not in (None, "")}
     return quote(path) + (f"?{urlencode(kept)}" if kept else "")
+
+
+def share_link(run: str | None, episodes: Sequence[str]) -> str:
+    """Build the address of a file with some trials.
+
+    Args:
+        run: Name of the run where several are shown.
+        episodes: Ids of the trials.
+    """
+    named = [*([] if run is None else [("run", run)]), *(("trial", name) for name in episodes)]
+    return f"/share?{urlencode(named)}"
 
 
 def _seconds(request: Request) -> float | None:

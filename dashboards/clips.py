@@ -1,7 +1,7 @@
 """Recorded beside twin around the moment of a trial: one picture, a short clip, or a strip."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -90,20 +90,18 @@ def footage(run: RunFolder, row: IndexedTrial, config: ClipConfig = CONFIG) -> F
     path, moment, at_ns = _instant(run, row)
     camera = main_camera(path)
     span = (at_ns - round(config.before_s * NS_PER_S), at_ns + round(config.after_s * NS_PER_S))
-    recorded = _thinned(list(read_span(path, camera.camera_id, *span)), config.rate_hz)
+    recorded = _small(read_span(path, camera.camera_id, *span), config)
     if not recorded:  # the moment lies outside of what the camera saw
         stamp_ns = camera.stamps_ns[camera.nearest(at_ns)]
-        recorded = list(read_span(path, camera.camera_id, stamp_ns, stamp_ns))
+        recorded = _small(read_span(path, camera.camera_id, stamp_ns, stamp_ns), config)
     if not recorded:
         message = f"no camera images in {path.name} around its moment."
         raise NotHereError(message)
-    drawn = _twin_pictures(run, row, camera.camera_id, span)
-    frames = []
-    for stamp_ns, image in recorded:
-        sides = [_scaled(image, config.height_px)]
-        if drawn:
-            sides.append(_nearest(drawn, stamp_ns, sides[0], config.height_px))
-        frames.append(_beside(sides))
+    drawn = _twin_pictures(run, row, camera.camera_id, span, config)
+    frames = [
+        _beside([image, _nearest(drawn, stamp_ns, image)] if drawn else [image])
+        for stamp_ns, image in recorded
+    ]
     return Footage(
         frames=tuple(frames),
         times_s=tuple((stamp_ns - at_ns) / NS_PER_S for stamp_ns, _ in recorded),
@@ -124,7 +122,11 @@ def _instant(run: RunFolder, row: IndexedTrial) -> tuple[Path, Moment | None, in
 
 
 def _twin_pictures(
-    run: RunFolder, row: IndexedTrial, camera_id: str, span_ns: tuple[int, int]
+    run: RunFolder,
+    row: IndexedTrial,
+    camera_id: str,
+    span_ns: tuple[int, int],
+    config: ClipConfig,
 ) -> list[tuple[int, Image]]:
     """What a replay drew through the same camera: the plan's pictures before the execution's."""
     name = RENDERED + camera_id
@@ -140,29 +142,27 @@ def _twin_pictures(
             continue
     for *_, path in sorted(found, reverse=True):
         margin_ns = round(APART_S * NS_PER_S)
-        pictures = list(read_span(path, name, span_ns[0] - margin_ns, span_ns[1] + margin_ns))
+        found_here = read_span(path, name, span_ns[0] - margin_ns, span_ns[1] + margin_ns)
+        pictures = _small(found_here, config)
         if pictures:
             return pictures
     return []
 
 
-def _thinned(found: Sequence[tuple[int, Image]], rate_hz: int) -> list[tuple[int, Image]]:
-    """Leave out frames that come faster than the rate."""
+def _small(found: Iterable[tuple[int, Image]], config: ClipConfig) -> list[tuple[int, Image]]:
+    """Scale pictures down, and leave out those that come faster than the rate."""
     kept: list[tuple[int, Image]] = []
-    least_ns = 0.9 * NS_PER_S / rate_hz  # a camera's own rate is never exact
+    least_ns = 0.9 * NS_PER_S / config.rate_hz  # a camera's own rate is never exact
     for stamp_ns, image in found:
         if not kept or stamp_ns - kept[-1][0] >= least_ns:
-            kept.append((stamp_ns, image))
+            kept.append((stamp_ns, _scaled(image, config.height_px)))
     return kept
 
 
-def _nearest(
-    drawn: Sequence[tuple[int, Image]], stamp_ns: int, beside: Image, height_px: int
-) -> Image:
+def _nearest(drawn: Sequence[tuple[int, Image]], stamp_ns: int, beside: Image) -> Image:
     stamp, image = min(drawn, key=lambda each: abs(each[0] - stamp_ns))
-    if abs(stamp - stamp_ns) > APART_S * NS_PER_S:
-        return np.full_like(beside, NOTHING_U8)
-    return _scaled(image, height_px)
+    is_apart = abs(stamp - stamp_ns) > APART_S * NS_PER_S
+    return np.full_like(beside, NOTHING_U8) if is_apart else image
 
 
 def _scaled(image: Image, height_px: int) -> Image:
@@ -178,6 +178,27 @@ def _beside(sides: Sequence[Image]) -> Image:
         return sides[0]
     gap = np.full((sides[0].shape[0], GAP_PX, 3), 255, dtype=np.uint8)
     return np.concatenate([sides[0], gap, sides[1]], axis=1)
+
+
+def contact_sheet(frames: Sequence[Image], columns: int) -> Image:
+    """Lay frames of one size out in rows, in reading order.
+
+    Args:
+        frames: At least one.
+        columns: So many beside each other.
+    """
+    height, width = frames[0].shape[:2]
+    rows = -(-len(frames) // columns)
+    columns = min(columns, len(frames))
+    sheet = np.full(
+        (rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3),
+        255,
+        dtype=np.uint8,
+    )
+    for place, frame in enumerate(frames):
+        top, left = (place // columns) * (height + GAP_PX), (place % columns) * (width + GAP_PX)
+        sheet[top : top + height, left : left + width] = frame
+    return sheet
 
 
 def as_jpeg(image: Image, quality: int) -> bytes:

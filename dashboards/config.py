@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -24,6 +25,30 @@ class DashboardConfig:
     def __post_init__(self) -> None:
         """Refuse a port that no machine has."""
         refuse_outside(self, PORTS)
+
+
+SHARE_LIMITS = {"max_mb": (0.01, 20.0), "before_s": (0.0, 30.0), "after_s": (0.0, 30.0)}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ShareConfig:
+    """Which trials go into one file, and how large it may be."""
+
+    trials: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    """Ids of trials; without any the worst disagreements, else the worst failures."""
+    out: Path | None = None
+    """File to write; RUN/results/shared/trials.html, which the report then names, without it."""
+    max_mb: float = 20.0
+    """Size of the file; clips get fewer and smaller frames until it fits."""
+    before_s: float = 3.0
+    """Clips begin so long before the moment of divergence."""
+    after_s: float = 2.0
+    """They end so long after it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no file can be."""
+        refuse_outside(self, SHARE_LIMITS)
 
 
 @Parameter(name="*")

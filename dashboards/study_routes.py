@@ -1,18 +1,21 @@
 """Addresses of pages about many trials at once. What reads episodes is imported when asked for."""
 
 from collections.abc import Callable, Mapping
+from threading import Lock
 
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import MissingDependencyError
+from bridge.errors import MissingDependencyError, UsageError
 from dashboards.comparison import judge
+from dashboards.config import ShareConfig
 from dashboards.errors import NotHereError
 from dashboards.review_routes import Page, RunOf
 from evaluator.review_index import FailureSelection, IndexedTrial
 
+_SHARING = Lock()
 OthersOf = Callable[[RunFolder], Mapping[str, RunFolder]]
 """Gives the runs that one may be compared with, by name."""
 
@@ -31,6 +34,7 @@ def study_routes(run_of: RunOf, page: Page, others_of: OthersOf) -> list[Route]:
         Route("/failures/picture/{id}", pages.picture),
         Route("/failures/clip/{id}", pages.clip),
         Route("/compare", pages.compare),
+        Route("/share", pages.share),
     ]
 
 
@@ -77,6 +81,19 @@ class _StudyPages:
         judged = {each: judge(other) if each == name else None for each, other in others.items()}
         found = build_compare(run, judge(run), judged, request.query_params)
         return self._page("compare.html", request, page=found)
+
+    def share(self, request: Request) -> Response:
+        """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""
+        from dashboards.share_file import build_share  # noqa: PLC0415  # loads the evaluator
+
+        named = tuple(request.query_params.getlist("trial"))
+        try:
+            with _SHARING:  # it takes seconds: one at a time
+                made = build_share(self._run(request), ShareConfig(trials=named))
+        except UsageError as error:
+            raise NotHereError(str(error)) from error
+        headers = {"Content-Disposition": 'attachment; filename="trials.html"'}
+        return Response(made.text, media_type="text/html", headers=headers)
 
     def _trial(self, request: Request) -> IndexedTrial:
         row = judge(self._run(request)).row(request.path_params["id"])

@@ -53,12 +53,12 @@ def within_tables(read: ReadRun, kind: Kind, first: str, second: str) -> tuple[T
         message = f"{first!r} against {second!r}: choose two different ones of {names}."
         raise EvaluatorError(message)
     if kind == "engine":
-        mine, theirs = (_answers_in(read, engine) for engine in (first, second))
+        answers = [_answers_in(read, engine) for engine in (first, second)]
         return against_tables(
-            [trial.row for trial in mine],
-            [trial.row for trial in theirs],
+            [trial.row for trial in answers[0]],
+            [trial.row for trial in answers[1]],
             names=(first, second),
-            trials=(mine, theirs),
+            trials=(answers[0], answers[1]),
         )
     pairs, left = _pairs(read.rows, kind, first, second)
     if not pairs:
@@ -71,11 +71,11 @@ def within_tables(read: ReadRun, kind: Kind, first: str, second: str) -> tuple[T
         [trial for trial in read.trials if getattr(trial.row, kind) == name]
         for name in (first, second)
     )
-    names = tuple(f"{kind} {name}" if name in COLUMNS else name for name in (first, second))
+    mine, theirs = (f"{kind} {x}" if x in COLUMNS else x for x in (first, second))
     return (
-        _differences(pairs, kind, (names[0], names[1]), left),
-        *_flips(pairs, kind, (names[0], names[1])),
-        *settings_table((sides[0], sides[1]), (names[0], names[1])),
+        _differences(pairs, kind, (mine, theirs), left),
+        *_flips(pairs, kind, (mine, theirs)),
+        *settings_table((sides[0], sides[1]), (mine, theirs)),
     )
 
 
