@@ -20,10 +20,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
 from dashboards.comparison import judge
+from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.overview_page import build_overview, neighbours
+from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
 
 HERE = Path(__file__).parent
@@ -31,15 +33,18 @@ SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 """Text is compressed; images and episodes are already."""
 
 
-def create_app(library: Library, admission: Admission | None = None) -> Starlette:
+def create_app(
+    library: Library, admission: Admission | None = None, live: DashboardConfig | None = None
+) -> Starlette:
     """Build the application over some run folders.
 
     Args:
         library: The runs that are shown.
         admission: Which host and token are answered; None answers only on the loopback address.
+        live: Where the page Live finds the recorder; None asks at the usual place.
     """
     admission = admission or Admission()
-    pages = Pages(library, looks_beside=is_loopback(admission.host))
+    pages = Pages(library, live or DashboardConfig(), looks_beside=is_loopback(admission.host))
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -48,12 +53,12 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
-        *pages.studies(),
+        *pages.studies.routes(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
     ]
-    return Starlette(
+    app = Starlette(
         routes=routes,
         middleware=[Middleware(Guard, admission=admission)],
         exception_handlers={
@@ -61,6 +66,8 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
             HTTPException: pages.http_failed,
         },
     )
+    app.state.studies = pages.studies
+    return app
 
 
 def _environment() -> Environment:
@@ -134,16 +141,28 @@ def _download(path: Path) -> Response:
 class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
-    def __init__(self, library: Library, *, looks_beside: bool = True) -> None:
+    def __init__(
+        self, library: Library, live: DashboardConfig, *, looks_beside: bool = True
+    ) -> None:
         """Remember the runs and load the templates.
 
         Args:
             library: The runs that are shown.
+            live: Where the recorder is.
             looks_beside: Whether runs in the same folder may be compared with them.
         """
         self._library = library
-        self._looks_beside = looks_beside
         self._environment = _environment()
+        self.studies = StudyPages(
+            self._run,
+            self._page,
+            lambda run: library.others(run, beside=looks_beside),
+            self._part,
+            live,
+        )
+
+    def _part(self, name: str, state: object) -> str:
+        return self._environment.get_template(f"live_{name}.html").render(state=state)
 
     def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
         name = request.query_params.get("run", "")
@@ -210,15 +229,6 @@ class Pages:
         from dashboards.review_routes import review_routes  # noqa: PLC0415  # compares runs
 
         return review_routes(self._run, self._page)
-
-    def studies(self) -> list[Route]:
-        """``/failures`` and ``/compare``: what goes wrong, and what differs."""
-        from dashboards.study_routes import study_routes  # noqa: PLC0415  # beside the reviews
-
-        def others(run: RunFolder) -> dict[str, RunFolder]:
-            return self._library.others(run, beside=self._looks_beside)
-
-        return study_routes(self._run, self._page, others)
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from bridge.wire.config import DEFAULT_ENDPOINT
 
 BUILT_IN_POLICY = "perturbed"
 """Of the cell's own planner; the others are asked on the wire."""
@@ -21,6 +22,12 @@ class DashboardConfig:
     """Address to listen on; anything but the loopback address asks for a token."""
     port: int = 8600
     """Port to listen on; 0 takes any free one."""
+    recorder: str = "main"
+    """Name of the recorder that the page Live listens to."""
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Where that recorder is; nothing is opened before somebody looks at the page."""
+    live_config: Path | None = None
+    """zenoh configuration (JSON5) for that, for example with access control."""
 
     def __post_init__(self) -> None:
         """Refuse a port that no machine has."""

@@ -1,4 +1,3 @@
-"use strict";
 // A picture of a trial becomes its short clip while it is pointed at, focused, or while all play.
 
 const shots = [...document.querySelectorAll("[data-clip]")];
