@@ -22,7 +22,7 @@ from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
 FILE_NAME = "review_index.sqlite"
-VERSION = 3
+VERSION = 4
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
