@@ -91,8 +91,10 @@ class ComparePage:
     """Why there are no paired differences; empty where there are."""
     command: str
     """Does the same without these pages."""
-    twins: bool
-    """Whether two twins of the same trials are compared; their settings may differ."""
+    has_replays: bool
+    """Whether settings of replays could differ at all."""
+    linked: frozenset[str]
+    """Trials that have a page of their own."""
 
 
 def build_compare(
@@ -111,7 +113,13 @@ def build_compare(
     """
     is_small = judgement.index is not None and state_of(run).num_files <= WAITED_FOR
     offered = _choices(run, judgement, query) if is_small else ()
-    shared: dict[str, Any] = {"others": tuple(others), "choices": offered}
+    rows = judgement.rows if is_small else ()
+    shared: dict[str, Any] = {
+        "others": tuple(others),
+        "choices": offered,
+        "has_replays": any(row.planned_replay for row in rows),
+        "linked": frozenset(row.episode for row in rows if row.file),
+    }
     theirs = others.get(query.get("with", ""))
     kind, first, second = (query.get(name, "") for name in ("by", "a", "b"))
     try:
@@ -123,7 +131,7 @@ def build_compare(
             return _page(shared, None, (), why_not=why)
         if kind and is_small:
             tables = _within(run, _state(judgement), kind, first, second)
-            return _page(shared, (first, second), tables, twins=kind == "engine")
+            return _page(shared, (first, second), tables)
     except GstError as error:
         names = (first, second) if theirs is None else (run.path.resolve().name, query["with"])
         return _page(shared, names, (), why_not=str(error))
@@ -172,7 +180,7 @@ def _of_runs(
     names = (run.path.resolve().name, name)
     paths = [shlex.quote(str(each)) for each in (run.path, theirs.run.path)]
     command = f"robot-gst evaluate {paths[0]} --against {paths[1]}"
-    known: dict[str, Any] = {"command": command, "twins": True}
+    known: dict[str, Any] = {"command": command}
     if max(state_of(each).num_files for each in (run, theirs.run)) > WAITED_FOR:
         why = "These runs are too large to be compared while a page waits; the command does it."
         return _page(shared, names, (), why_not=why, **known)
@@ -214,7 +222,6 @@ def _page(
     why_not: str = "",
     numbers: Sequence[NumberPair] = (),
     command: str = "",
-    twins: bool = False,
 ) -> ComparePage:
     bars = tuple(bar for table in tables if table.id in DIFFERENCES for bar in _bars(table))
     return ComparePage(
@@ -227,7 +234,6 @@ def _page(
         num_numbers=len(numbers),
         why_not=why_not,
         command=command,
-        twins=twins,
     )
 
 
