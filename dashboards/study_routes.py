@@ -14,6 +14,7 @@ from bridge.errors import GstError, MissingDependencyError, UsageError
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.errors import NotHereError
+from dashboards.loading import LOADING
 from evaluator.review_index import FailureSelection, IndexedTrial
 
 if TYPE_CHECKING:
@@ -75,7 +76,8 @@ class StudyPages:
                 self._feed.end()
 
     def _live(self) -> "LiveFeed":
-        from dashboards.live_page import feed_of  # noqa: PLC0415  # loads zenoh
+        with LOADING:
+            from dashboards.live_page import feed_of  # noqa: PLC0415  # loads zenoh
 
         with self._making:
             self._feed = self._feed or feed_of(self._config)
@@ -83,7 +85,8 @@ class StudyPages:
 
     def failures(self, request: Request) -> Response:
         """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
-        from dashboards.failures_page import PART_WORDS, build_failures  # noqa: PLC0415
+        with LOADING:
+            from dashboards.failures_page import PART_WORDS, build_failures  # noqa: PLC0415
 
         run = self._run(request)
         found = build_failures(run, judge(run), FailureSelection.of(request.query_params))
@@ -91,13 +94,15 @@ class StudyPages:
 
     def picture(self, request: Request) -> Response:
         """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
-        from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
 
         return _kept(picture(self._run(request), self._trial(request)), "image/jpeg")
 
     def clip(self, request: Request) -> Response:
         """``/failures/clip/<id>``: a trial around its moment, as MP4."""
-        from dashboards.clips import clip  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.clips import clip  # noqa: PLC0415  # reads episodes
 
         try:
             data = clip(self._run(request), self._trial(request))
@@ -107,7 +112,8 @@ class StudyPages:
 
     def compare(self, request: Request) -> Response:
         """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
-        from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
+        with LOADING:
+            from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
 
         run = self._run(request)
         others = self._others(run)
@@ -121,7 +127,8 @@ class StudyPages:
 
     def share(self, request: Request) -> Response:
         """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""
-        from dashboards.share_file import build_share  # noqa: PLC0415  # loads the evaluator
+        with LOADING:
+            from dashboards.share_file import build_share  # noqa: PLC0415  # loads the evaluator
 
         named = tuple(request.query_params.getlist("trial"))
         try:
@@ -151,7 +158,8 @@ class StudyPages:
 
     async def events(self, request: Request) -> Response:
         """``/live/events``: parts of the page that changed, as server-sent events."""
-        from dashboards.live_page import LiveState, told  # noqa: PLC0415  # loads zenoh
+        with LOADING:
+            from dashboards.live_page import LiveState, told  # noqa: PLC0415  # loads zenoh
 
         def render(state: LiveState) -> dict[str, object]:
             parts: dict[str, object] = {name: self._part(name, state) for name in PARTS}
