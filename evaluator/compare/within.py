@@ -91,13 +91,13 @@ def _by_engine(read: ReadRun) -> list[tuple[Trial, dict[str, Trial]]]:
         )
         by: dict[str, Trial] = {}
         for engine, file in files.items():
-            said = file.facts.verdict
+            decided = file.facts.verdict
             row = replace(
                 trial.row,
-                sim_planned=None if said is None else said.accepted,
-                p_success=None if said is None else said.p_success,
-                first_failing=None if said is None else said.first_failing,
-                failing_cause=None if said is None else said.failing_cause,
+                sim_planned=None if decided is None else decided.accepted,
+                p_success=None if decided is None else decided.p_success,
+                first_failing=None if decided is None else decided.first_failing,
+                failing_cause=None if decided is None else decided.failing_cause,
             )
             by[engine] = replace(trial, row=row, replays={**trial.replays, "planned": file})
         found.append((trial, by))
@@ -127,8 +127,8 @@ def _pairs(rows: Sequence[TrialRow], kind: str, first: str, second: str) -> tupl
         starts.setdefault(key, ([], []))[name == second].append(row)
     pairs = []
     for mine, theirs in starts.values():
-        apart_m = start_distance_m(mine[0], theirs[0]) if mine and theirs else None
-        if len(mine) != 1 or len(theirs) != 1 or (apart_m or 0.0) > START_LIMIT_M:
+        distance_m = start_distance_m(mine[0], theirs[0]) if mine and theirs else None
+        if len(mine) != 1 or len(theirs) != 1 or (distance_m or 0.0) > START_LIMIT_M:
             left += len(mine) + len(theirs)
         else:
             pairs.append((mine[0], theirs[0]))

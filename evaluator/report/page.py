@@ -139,8 +139,8 @@ def name_shared(report: Path) -> None:
         if not (opened and closed):
             return
         links = ", ".join(f'<a href="{SHARED}/{quote(name)}">{escape(name)}</a>' for name in names)
-        said = f'<p class="soft">Trials with their clips: {links}</p>' if names else ""
-        new = f"{before}{opened}{said}{closed}{after}"
+        paragraph = f'<p class="soft">Trials with their clips: {links}</p>' if names else ""
+        new = f"{before}{opened}{paragraph}{closed}{after}"
         if new != text:
             write_whole(report, new.encode())
     except (OSError, UnicodeDecodeError):  # not there, or not ours to write
