@@ -135,9 +135,17 @@ def build_compare(
     except GstError as error:
         names = (first, second) if theirs is None else (run.path.resolve().name, query["with"])
         return _page(shared, names, (), why_not=str(error))
-    stored = () if judgement.results is None else judgement.results.tables
-    kept = [table for table in stored if table.id in ("against", "against_settings")]
-    return _page(shared, None, kept)
+    return _page(shared, None, _stored(judgement))
+
+
+def _stored(judgement: Judgement) -> list[Table]:
+    """What ``evaluate --against`` left in the results."""
+    try:
+        results = judgement.results
+    except GstError:  # they went away since
+        results = None
+    tables = () if results is None else results.tables
+    return [table for table in tables if table.id in ("against", "against_settings")]
 
 
 def _state(judgement: Judgement) -> str:
