@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, chromium
-from serving import dashboard
 from test_review_index import HOSTILE, made, many
 from visible import words
 
@@ -290,24 +288,3 @@ def test_hostile_names_are_text(synthetic: ModuleType, tmp_path: Path) -> None:
     text = synthetic.browser_of(run).get("/failures").text
     assert "<script>alert" not in text
     assert "&lt;script&gt;" in text
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_a_clip_plays_while_it_is_pointed_at(drawn: RunFolder, tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    with dashboard(drawn) as (_, url), chromium(tmp_path / "home") as tab:
-        tab.show(f"{url}failures", width=390, dark=True)
-        assert tab.ask("document.documentElement.scrollWidth") <= 390
-        tab.ask_when("document.querySelector('.pair img').complete")
-        tab.ask("document.querySelector('.pair').focus()")
-        tab.ask_when("(document.querySelector('.pair video') || {}).currentTime > 0.2")
-        assert tab.ask("document.querySelector('.pair img').hidden") is True
-        size = tab.ask("document.querySelector('video').videoWidth")
-        assert size == 2 * 288 + clips.GAP_PX
-        tab.ask("document.querySelector('.pair').blur()")
-        assert tab.ask("document.querySelector('.pair video')") is None
-        assert tab.complaints == []
-        assert all(address.startswith(url) for address in tab.asked)
-        tab.show(tab.ask("document.querySelector('.pair').href"), width=1440, dark=False)
-        assert tab.ask("Number(document.getElementById('clock').value)") == pytest.approx(3.8)

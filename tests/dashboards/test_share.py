@@ -11,7 +11,6 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, chromium
 from test_review_index import HOSTILE
 from visible import words
 
@@ -167,23 +166,3 @@ def test_the_page_of_failures_offers_the_file(
     assert answer.headers["content-disposition"].startswith("attachment")
     assert answer.text.count("<video") == 2
     assert browser.get("/share?trial=..%2Fx").status_code == 404
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_it_opens_from_a_disk_with_scripts_off_and_its_clip_plays(
-    run: RunFolder, tmp_path: Path
-) -> None:
-    pytest.importorskip("av")
-    path, _ = share(run, ShareConfig(trials=("trial_0001",), out=tmp_path / "sent" / "one.html"))
-    with chromium(tmp_path / "home") as tab:
-        tab.call("Emulation.setScriptExecutionDisabled", value=True)
-        for width, dark in ((390, True), (1440, False)):
-            tab.show(path.as_uri(), width=width, dark=dark)
-            assert tab.complaints == []
-            assert all(a.startswith(("data:", path.as_uri())) for a in tab.asked)
-            assert tab.picture().startswith(b"\x89PNG")
-        tab.call("Emulation.setScriptExecutionDisabled", value=False)
-        assert tab.ask("document.documentElement.scrollWidth") <= 1440
-        tab.ask("void document.querySelector('video').play()")
-        tab.ask_when("document.querySelector('video').currentTime > 0.2")
