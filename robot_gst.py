@@ -133,6 +133,12 @@ COMMANDS: tuple[Command, ...] = (
         "runs/monday",
     ),
     (
+        "share",
+        "dashboards.cli:share",
+        "Write trials with their clips into one file to send.",
+        "runs/monday --trials trial_0003",
+    ),
+    (
         "doctor",
         f"{EPISODES}:doctor",
         "Show what is installed, what is missing and how to get it.",

@@ -1,6 +1,7 @@
 """The application: addresses to pages. All state is in the address but labels and what-ifs."""
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -19,12 +20,14 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
 from dashboards.comparison import judge
+from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
-from dashboards.guard import Admission, Guard
+from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
 from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview, neighbours
 from dashboards.review_routes import review_routes
+from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
 
 HERE = Path(__file__).parent
@@ -32,14 +35,18 @@ SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 """Text is compressed; images and episodes are already."""
 
 
-def create_app(library: Library, admission: Admission | None = None) -> Starlette:
+def create_app(
+    library: Library, admission: Admission | None = None, live: DashboardConfig | None = None
+) -> Starlette:
     """Build the application over some run folders.
 
     Args:
         library: The runs that are shown.
         admission: Which host and token are answered; None answers only on the loopback address.
+        live: Where the page Live finds the recorder; None asks at the usual place.
     """
-    pages = Pages(library)
+    admission = admission or Admission()
+    pages = Pages(library, live or DashboardConfig(), looks_beside=is_loopback(admission.host))
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -49,18 +56,21 @@ def create_app(library: Library, admission: Admission | None = None) -> Starlett
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
         *pages.trial(),
+        *pages.studies.routes(),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
     ]
-    return Starlette(
+    app = Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, admission=admission or Admission())],
+        middleware=[Middleware(Guard, admission=admission)],
         exception_handlers={
             GstError: pages.failed,
             HTTPException: pages.http_failed,
         },
     )
+    app.state.studies = pages.studies
+    return app
 
 
 def _environment() -> Environment:
@@ -91,6 +101,7 @@ def _environment() -> Environment:
         environment.filters[function.__name__] = function
     environment.filters["quoted"] = lambda path: shlex.quote(str(path))
     environment.globals["link"] = link
+    environment.globals["share"] = share_link
     environment.globals["SHOW"] = SHOW
     return environment
 
@@ -99,6 +110,17 @@ def link(path: str, **query: object) -> str:
     """Build an address; empty values are left out of the query."""
     kept = {key: value for key, value in query.items() if value not in (None, "")}
     return quote(path) + (f"?{urlencode(kept)}" if kept else "")
+
+
+def share_link(run: str | None, episodes: Sequence[str]) -> str:
+    """Build the address of a file with some trials.
+
+    Args:
+        run: Name of the run where several are shown.
+        episodes: Ids of the trials.
+    """
+    named = [*([] if run is None else [("run", run)]), *(("trial", name) for name in episodes)]
+    return f"/share?{urlencode(named)}"
 
 
 def _seconds(request: Request) -> float | None:
@@ -122,10 +144,28 @@ def _download(path: Path) -> Response:
 class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
-    def __init__(self, library: Library) -> None:
-        """Remember the runs and load the templates."""
+    def __init__(
+        self, library: Library, live: DashboardConfig, *, looks_beside: bool = True
+    ) -> None:
+        """Remember the runs and load the templates.
+
+        Args:
+            library: The runs that are shown.
+            live: Where the recorder is.
+            looks_beside: Whether runs in the same folder may be compared with them.
+        """
         self._library = library
         self._environment = _environment()
+        self.studies = StudyPages(
+            self._run,
+            self._page,
+            lambda run: library.others(run, beside=looks_beside),
+            self._part,
+            live,
+        )
+
+    def _part(self, name: str, state: object) -> str:
+        return self._environment.get_template(f"live_{name}.html").render(state=state)
 
     def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
         name = request.query_params.get("run", "")

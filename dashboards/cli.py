@@ -6,12 +6,13 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from dashboards.config import DashboardConfig, DemoConfig, TrialsConfig
+from dashboards.config import DashboardConfig, DemoConfig, ShareConfig, TrialsConfig
 
 OUTPUT = Output()
 DASHBOARD = DashboardConfig()
 DEMO = DemoConfig()
 TRIALS = TrialsConfig()
+SHARE = ShareConfig()
 
 
 def dashboard(
@@ -75,6 +76,42 @@ def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTP
     from dashboards.trials import run_trials
 
     return run_trials(run, config, output)
+
+
+def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT) -> int:
+    """Write chosen trials with clips, figures and tables into one file that opens anywhere.
+
+    Example: robot-gst share runs/monday --trials trial_0003 trial_0007 --out two_trials.html
+
+    Args:
+        run: Run folder; robot-gst evaluate comes before.
+        config: Which trials, and how large the file may be.
+        output: How to talk.
+    """
+    from bridge.episode.run_folder import RunFolder
+    from bridge.errors import MissingDependencyError
+
+    try:
+        from dashboards.share_file import MB
+        from dashboards.share_file import share as write
+    except ModuleNotFoundError as error:
+        if error.name not in ("jinja2", "markupsafe"):
+            raise
+        raise MissingDependencyError(
+            package=str(error.name), extra="dashboard", purpose="a file to share"
+        ) from error
+    path, made = write(RunFolder.open(run), config)
+    for note in made.notes:
+        output.say(f"Without a clip: {note}")
+    record = {
+        "path": str(path),
+        "size_bytes": made.size_bytes,
+        "trials": list(made.trials),
+        "clips": made.level.words,
+    }
+    text = f"{path}: {len(made.trials)} trials, {made.size_bytes / MB:.1f} MB ({made.level.words})"
+    output.result(record, text)
+    return 0
 
 
 def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:

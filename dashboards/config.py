@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from bridge.wire.config import DEFAULT_ENDPOINT
 
 BUILT_IN_POLICY = "perturbed"
 """Of the cell's own planner; the others are asked on the wire."""
@@ -20,10 +22,40 @@ class DashboardConfig:
     """Address to listen on; anything but the loopback address asks for a token."""
     port: int = 8600
     """Port to listen on; 0 takes any free one."""
+    recorder: str = "main"
+    """Name of the recorder that the page Live listens to."""
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Where that recorder is; nothing is opened before somebody looks at the page."""
+    live_config: Path | None = None
+    """zenoh configuration (JSON5) for that, for example with access control."""
 
     def __post_init__(self) -> None:
         """Refuse a port that no machine has."""
         refuse_outside(self, PORTS)
+
+
+SHARE_LIMITS = {"max_mb": (0.01, 20.0), "before_s": (0.0, 30.0), "after_s": (0.0, 30.0)}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ShareConfig:
+    """Which trials go into one file, and how large it may be."""
+
+    trials: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    """Ids of trials; without any the worst disagreements, else the worst failures."""
+    out: Path | None = None
+    """File to write; RUN/results/shared/trials.html, which the report then names, without it."""
+    max_mb: float = 20.0
+    """Size of the file; clips get fewer and smaller frames until it fits."""
+    before_s: float = 3.0
+    """Clips begin so long before the moment of divergence."""
+    after_s: float = 2.0
+    """They end so long after it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no file can be."""
+        refuse_outside(self, SHARE_LIMITS)
 
 
 @Parameter(name="*")

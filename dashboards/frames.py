@@ -3,16 +3,20 @@
 import json
 import sys
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import color_file_from_message
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.streams import image_messages
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
+from bridge.media.color import decode_color
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
@@ -147,6 +151,35 @@ def _track_of(path: Path, camera_id: str) -> CameraTrack:
         text = f"{path.name} has no frames of camera {camera_id!r}. Cameras: {found}."
         raise NotHereError(text)
     return tracks[camera_id]
+
+
+def read_span(
+    path: Path, camera_id: str, start_ns: int, end_ns: int
+) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield the sRGB images of a camera between two instants, in one pass through the file.
+
+    Args:
+        path: The episode file.
+        camera_id: Id of the camera, without the parts of its topic.
+        start_ns: Source time of the first wanted [ns].
+        end_ns: Source time of the last wanted [ns].
+    """
+    track = camera_tracks(path)[camera_id]
+    places = [i for i, stamp in enumerate(track.stamps_ns) if start_ns <= stamp <= end_ns]
+    if not places:
+        return
+    episode = Episode.open(path)
+    summary = episode.topics().get(track.topic)
+    is_video = summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
+    first = max(0, places[0] - FRAMES_BEFORE[0]) if is_video else places[0]
+    log_ns = track.log_times_ns[first : places[-1] + 1]
+    wanted = {track.stamps_ns[place] for place in places}
+    for message in image_messages(
+        episode, [track.topic], start_ns=min(log_ns), end_ns=max(log_ns) + 1
+    ):
+        if message.publish_time_ns in wanted:
+            color = color_file_from_message(message.type_name, message.data)
+            yield message.publish_time_ns, decode_color(color.data)
 
 
 def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:

@@ -3,7 +3,7 @@
 import hashlib
 import io
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from dashboards.comparison import Judgement
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, CameraTrack, camera_tracks, read_frame
 from dashboards.library import episode_path
-from evaluator.review_index import IndexedTrial, severity
+from evaluator.review_index import IndexedTrial, severity, stamp_of
 
 PER_PAGE = 24
 SHOW = {
@@ -249,18 +249,33 @@ def thumbnail(run: RunFolder, row: IndexedTrial) -> bytes:
     """
     path = episode_path(run, row.episode)
     moment = moment_of(run, row)
-    status = path.stat()
-    what = (row.episode, status.st_mtime_ns, status.st_size, moment, THUMBNAIL_PX)
-    name = hashlib.sha256(row.episode.encode("utf-8", "surrogatepass")).hexdigest()[:16]
-    key = hashlib.sha256(repr(what).encode()).hexdigest()[:16]
-    kept = run.results_dir / THUMBNAILS / f"{name}-{key}.jpg"
+    what = (stamp_of(path), moment, THUMBNAIL_PX)
+    place = run.results_dir / THUMBNAILS
+    return drawn_once(place, row.episode, what, lambda: _drawn(path, moment))
+
+
+def drawn_once(
+    folder: Path, episode: str, what: object, draw: Callable[[], bytes], ending: str = "jpg"
+) -> bytes:
+    """Return a picture of a trial that is drawn once and kept; one of something else goes.
+
+    Args:
+        folder: Where it is kept, inside the run.
+        episode: Id of the trial.
+        what: Everything that it depends on; equal text stands for an equal picture.
+        draw: Makes it.
+        ending: Of its file.
+    """
+    name = hashlib.sha256(episode.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+    key = hashlib.sha256(repr(what).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+    kept = folder / f"{name}-{key}.{ending}"
     with _DRAWING:
         if kept.is_file():
             return kept.read_bytes()
-        data = _drawn(path, moment)
+        data = draw()
         try:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            for old in kept.parent.glob(f"{name}-*.jpg"):
+            folder.mkdir(parents=True, exist_ok=True)
+            for old in folder.glob(f"{name}-*.{ending}"):
                 old.unlink()
             write_whole(kept, data)
         except OSError:  # a run that only can be read is drawn anew each time

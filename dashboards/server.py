@@ -90,7 +90,7 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     listener = listen(config)
     token = None if is_loopback(config.host) else secrets.token_urlsafe(24)
     address = Address(host=config.host, port=listener.getsockname()[1], token=token)
-    app = create_app(library, Admission(host=config.host, token=token))
+    app = create_app(library, Admission(host=config.host, token=token), config)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
@@ -103,9 +103,11 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
     others = set(threading.enumerate())
     threading.Thread(target=_ask_ahead, args=(library,), daemon=True).start()
+    app.state.studies.is_ending = lambda: server.should_exit
     with listener, _ending_on_signals(server):
         output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
         server.run(sockets=[listener])
+    app.state.studies.end()
     stop_updates()
     if _are_at_work(set(threading.enumerate()) - others):
         # Python waits for threads that make a page, a minute for a large run, and ends others by

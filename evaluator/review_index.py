@@ -22,7 +22,7 @@ from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
 FILE_NAME = "review_index.sqlite"
-VERSION = 2
+VERSION = 4
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -62,6 +62,12 @@ class IndexedTrial:
     began_ns: int
     distance_m: float | None
     """Largest distance of the recorded tool from the planned replay's, where it was measured."""
+    fail_cause: str = ""
+    """What kind of failure it is (``FailureKind``); empty for one that failed on neither side."""
+    fail_stage: str = ""
+    fail_bodies: str = ""
+    start_region: str = ""
+    """Where the object of its task started that is placed most differently."""
 
     @property
     def agrees(self) -> bool | None:
@@ -204,6 +210,95 @@ class Selection:
             return columns
         first, _, rest = columns.partition(", ")
         return f"{first} DESC" + (f", {rest}" if rest else "")
+
+
+FAILURE_PARTS = {
+    "cause": "fail_cause",
+    "stage": "fail_stage",
+    "bodies": "fail_bodies",
+    "start": "start_region",
+}
+"""What failures are sorted by, and the columns that hold it."""
+FAILED = {
+    "": "all",
+    "foretold": "both fail",
+    "wrong_yes": "only the trial fails",
+    "wrong_no": "only the twin fails",
+}
+_FAILED = {
+    "foretold": "sim_planned = 0 AND recorded = 0",
+    "wrong_yes": "recorded = 0 AND ifnull(sim_planned, 1) = 1",
+    "wrong_no": "sim_planned = 0 AND ifnull(recorded, 1) = 1",
+}
+NOT_KNOWN = "-"
+"""Selects failures of which a part is not known: an empty value selects all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailureSelection:
+    """Which failures are shown, and by what they are grouped; empty means all."""
+
+    task: str = ""
+    condition: str = ""
+    policy: str = ""
+    failed: str = ""
+    """One of ``FAILED``."""
+    cause: str = ""
+    stage: str = ""
+    bodies: str = ""
+    start: str = ""
+    by: str = ""
+    """Names of ``FAILURE_PARTS`` joined by dots."""
+    page: str = ""
+
+    @staticmethod
+    def of(query: Mapping[str, str]) -> "FailureSelection":
+        """Read the query of an address; unknown values simply select nothing."""
+        names = (item.name for item in fields(FailureSelection))
+        return FailureSelection(**{name: query.get(name, "") for name in names})
+
+    def query(self, **changes: str) -> dict[str, str]:
+        """Return this selection as a query, with some fields changed, from its first page."""
+        return {**vars(self), "page": "", **changes}
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What failures are grouped by; all of ``FAILURE_PARTS`` where nothing is chosen."""
+        chosen = self.by.split(".")
+        return tuple(name for name in FAILURE_PARTS if name in chosen) or tuple(FAILURE_PARTS)
+
+    def where(self, *, but: str = "") -> tuple[str, list[Any]]:
+        """Return the SQL of the filters, and its values.
+
+        Args:
+            but: One of ``FAILURE_PARTS`` whose filter is left out.
+        """
+        terms, values = ["fail_cause != ''"], list[Any]()
+        if self.failed:
+            terms.append(_FAILED.get(self.failed, "0"))
+        for name in FACETS:
+            if getattr(self, name):
+                terms.append(f"{name}_slug = ?")
+                values.append(getattr(self, name))
+        for name, column in FAILURE_PARTS.items():
+            wanted = getattr(self, name)
+            if wanted and name != but:
+                terms.append(f"{column} = ?")
+                values.append("" if wanted == NOT_KNOWN else wanted)
+        return " AND ".join(terms), values
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailureGroup:
+    """Failures of one kind."""
+
+    parts: Mapping[str, str]
+    """By name of ``FAILURE_PARTS``; only those that are grouped by."""
+    count: int
+    recorded: int
+    """How many of them failed as recorded."""
+    twin: int
+    """How many failed in the twin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -430,6 +525,56 @@ class ReviewIndex:
         text = f"SELECT {name}_slug, min({name}), count(*) FROM trials WHERE {name} != '' GROUP BY"
         with self._reading() as db:
             return tuple(db.execute(f"{text} {name}_slug ORDER BY 2"))
+
+    def failure_groups(self, selection: FailureSelection) -> tuple[FailureGroup, ...]:
+        """Return the kinds of failure in a selection, the most frequent first."""
+        where, values = selection.where()
+        columns = ", ".join(FAILURE_PARTS[name] for name in selection.parts)
+        text = (
+            f"SELECT {columns}, count(*), sum(ifnull(recorded, 1) = 0), "
+            f"sum(ifnull(sim_planned, 1) = 0), min(seq) FROM trials WHERE {where} "
+            f"GROUP BY {columns} ORDER BY count(*) DESC, min(seq)"
+        )
+        with self._reading() as db:
+            return tuple(
+                FailureGroup(
+                    parts=dict(zip(selection.parts, row, strict=False)),
+                    count=row[-4],
+                    recorded=row[-3],
+                    twin=row[-2],
+                )
+                for row in db.execute(text, values)
+            )
+
+    def failures(
+        self, selection: FailureSelection, *, limit: int, offset: int = 0
+    ) -> tuple[IndexedTrial, ...]:
+        """Return the trials of a selection of failures, in the order of ``severity``.
+
+        Args:
+            selection: Which ones.
+            limit: At most so many.
+            offset: So many are passed over.
+        """
+        where, values = selection.where()
+        text = f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY seq"
+        with self._reading() as db:
+            return tuple(
+                map(_trial, db.execute(f"{text} LIMIT ? OFFSET ?", (*values, limit, offset)))
+            )
+
+    def failure_values(self, selection: FailureSelection, name: str) -> tuple[tuple[str, int], ...]:
+        """Return what one part can be under the other filters, and how often it is.
+
+        Args:
+            selection: The other filters.
+            name: One of ``FAILURE_PARTS``.
+        """
+        where, values = selection.where(but=name)
+        column = FAILURE_PARTS[name]
+        text = f"SELECT {column}, count(*) FROM trials WHERE {where} GROUP BY {column}"
+        with self._reading() as db:
+            return tuple(db.execute(f"{text} ORDER BY count(*) DESC, {column}", values))
 
     def files(self, *, broken: bool, limit: int = -1) -> tuple[tuple[IndexedFile, ...], int]:
         """Return the files that are no trials, and how many there are.

@@ -111,7 +111,7 @@ def against_tables(
         "McNemar's mid-p test. The others: 95 % percentiles of trials drawn anew with both "
         f"answers, inside their groups; an interval that holds 0 shows no difference.{left}",
     )
-    return (table, *_flips(shared, (first, second)), *_settings(trials, (first, second)))
+    return (table, *_flips(shared, (first, second)), *settings_table(trials, (first, second)))
 
 
 def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str, Cell]]:
@@ -245,10 +245,15 @@ def _word(answer: bool | None) -> str | None:
     return None if answer is None else ("success" if answer else "failure")
 
 
-def _settings(
+def settings_table(
     trials: tuple[Sequence[Trial], Sequence[Trial]], names: tuple[str, str]
 ) -> tuple[Table, ...]:
-    """List the settings in which the replays of both differ."""
+    """List the settings in which the replays of both differ; nothing where none does.
+
+    Args:
+        trials: The trials of both sides, with the replays that count.
+        names: What both are called.
+    """
     found = [_settings_of(each) for each in trials]
     rows: list[dict[str, Cell]] = [
         {"setting": name, names[0]: found[0].get(name), names[1]: found[1].get(name)}
@@ -269,6 +274,8 @@ def _settings_of(trials: Sequence[Trial]) -> dict[str, str]:
         if file is None:
             continue
         made = {"engine": file.derived.engine, "scene": (file.derived.scene_hash or "")[:12]}
+        if file.derived.calibration_id:
+            made["calibration"] = file.derived.calibration_id
         for name, value in (made | made_with(file)).items():
             values.setdefault(name, {})[str(value)] = None
     return {name: ", ".join(found) for name, found in values.items()}

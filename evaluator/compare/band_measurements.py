@@ -6,6 +6,7 @@ from functools import partial
 from statistics import median
 
 import numpy as np
+from jaxtyping import Float
 
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import interval_or_reason, measured
@@ -91,6 +92,62 @@ class BandCurve:
     recorded_spread_m: tuple[float, ...]
     """Root mean square distance from the recorded mean curve; empty with a single run."""
     simulated_spread_m: tuple[float, ...]
+
+
+PATH_SAMPLES = 51
+"""Instants of normalised time at which paths are kept for drawing."""
+Path3 = tuple[tuple[float, float, float], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandPath:
+    """Where a body went in the runs of one side: mean curve over the moving part, and reach."""
+
+    task: str
+    body: str
+    """``tool``, or an object."""
+    side: str
+    """``recorded``, or the engine."""
+    num_runs: int
+    mean_m: Path3
+    low_m: Path3
+    """Least coordinates of any run, at each instant."""
+    high_m: Path3
+
+
+def band_paths(task: str, sides: Sequence[Side]) -> list[BandPath]:
+    """Lay out where the tool and each object went on each side.
+
+    Args:
+        task: Task of the runs.
+        sides: Recorded runs and those of each engine; a body that a side has not is left out.
+    """
+    names = dict.fromkeys(name for side in sides for run in side.runs for name in run.objects)
+    paths = []
+    for body in ("tool", *names):
+        for side in sides:
+            tracks = [track for run in side.runs if (track := run.body(body)) is not None]
+            if not tracks:
+                continue
+            runs_m = np.stack(
+                [moving_part(track).normalised_time(PATH_SAMPLES).p_m for track in tracks]
+            )
+            paths.append(
+                BandPath(
+                    task=task,
+                    body=body,
+                    side=side.name,
+                    num_runs=len(tracks),
+                    mean_m=_points(runs_m.mean(axis=0)),
+                    low_m=_points(runs_m.min(axis=0)),
+                    high_m=_points(runs_m.max(axis=0)),
+                )
+            )
+    return paths
+
+
+def _points(curve_m: Float[np.ndarray, "num_samples 3"]) -> Path3:
+    return tuple((x, y, z) for x, y, z in curve_m.tolist())
 
 
 def distance_measurements(task: str, real: Side, simulated: Side) -> list[Measurement]:

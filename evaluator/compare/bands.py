@@ -14,8 +14,10 @@ from evaluator.compare.band_measurements import (
     BandCurve as BandCurve,  # part of what the report says
 )
 from evaluator.compare.band_measurements import (
+    BandPath,
     Run,
     Side,
+    band_paths,
     distance_measurements,
     inside_band,
     spread_measurements,
@@ -133,6 +135,8 @@ class BandReport(Part):
     """What the imported runs say."""
 
     curves: tuple[BandCurve, ...] = ()
+    paths: tuple[BandPath, ...] = ()
+    """Where tool and objects went, for drawing."""
 
 
 def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> BandReport:
@@ -150,12 +154,14 @@ def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> 
     more: list[Table] = []
     curves: list[BandCurve] = []
     missing: list[str] = []
+    paths: list[BandPath] = []
     for task in sorted({run.task for run in runs}):
         real, simulated = _sides(task, runs)
         if not real.runs or not simulated:
             lacking = "simulated" if real.runs else "recorded"
             missing.append(f"bands of {task or 'the imported runs'}: no {lacking} run")
         sides = ([real] if real.runs else []) + simulated
+        paths += band_paths(task, sides)
         found = [m for side in sides for m in spread_measurements(task, side)]
         for side in simulated if real.runs else ():
             found += distance_measurements(task, real, side)
@@ -177,6 +183,7 @@ def compare_bands(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> 
         exclusions=tuple(left_out),
         missing=tuple(missing),
         curves=tuple(curves),
+        paths=tuple(paths),
     )
 
 

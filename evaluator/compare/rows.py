@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from evaluator.compare.band_measurements import BandCurve
+from evaluator.compare.band_measurements import BandCurve, BandPath
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
@@ -83,6 +83,10 @@ class TrialRow:
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
     divergence: FirstDivergence | None = None
     """Where planned, executed and recorded part first, of the executed replay."""
+    failing_bodies: tuple[str, ...] = ()
+    """What touched, came too close or was lost then."""
+    failing_stage: str = ""
+    """The stage of the plan in which it failed, where the verdict gives an instant."""
     study_arm: str = ""
     """without, with or control; empty outside a study."""
     why_unknown: str = ""
@@ -189,6 +193,7 @@ class Comparison:
     states: tuple[StateSummary, ...] = ()
     """Where objects were predicted, replayed and localised after each stage."""
     bands: tuple[BandCurve, ...] = ()
+    paths: tuple[BandPath, ...] = ()
     """Distance and repeatability of imported runs over normalised time."""
     views: tuple[ViewQuality, ...] = ()
     """Every rendered view that was scored, with pictures of the worst."""

@@ -76,6 +76,7 @@ def compare_run(
     return replace(
         _with_parts(base, (views, methods, bands)),
         bands=bands.curves,
+        paths=bands.paths,
         views=(*views.views, *methods.views),
     )
 

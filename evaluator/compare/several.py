@@ -112,7 +112,7 @@ def with_against(
         EvaluatorError: When they share no trial.
     """
     refuse_twice([source, other])
-    mine, theirs = (_answers(path, options, output) for path in (source, other))
+    mine, theirs = (answers_of(path, options, output) for path in (source, other))
     tables = against_tables(
         comparison.rows or mine[0],
         theirs[0],
@@ -122,10 +122,16 @@ def with_against(
     return replace(comparison, tables=(*comparison.tables, *tables))
 
 
-def _answers(
-    path: Path, options: TableOptions, output: Output
+def answers_of(
+    path: Path, options: TableOptions = AS_SAVED, output: Output = QUIET
 ) -> tuple[Sequence[TrialRow], Sequence[Trial]]:
-    """Trials with the twin's answers, and of a run the replays behind them."""
+    """Read trials with the twin's answers, and of a run the replays behind them.
+
+    Args:
+        path: A run or a table.
+        options: How tables are read.
+        output: Shows progress.
+    """
     if not (path / "episodes").is_dir():
         return list(map(row_from_record, take(path, options).trials)), ()
     run = RunFolder.open(path)

@@ -18,6 +18,8 @@ from evaluator.statistics.funnel import (
 )
 from evaluator.statistics.intervals import wilson
 
+NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
+"""Stand for the stage of a failure of which nobody named one."""
 Trial = tuple[TrialRow, tuple[tuple[str, bool | None], ...]]
 
 
@@ -224,5 +226,5 @@ def first_failed_stage(row: TrialRow) -> str:
     """Name the first stage labelled a failure, or say that none was."""
     stages = stages_of(row)
     if not stages:
-        return "stage not labelled"
-    return next((name for name, answer in stages if answer is False), "no stage, but the task")
+        return NOT_LABELLED
+    return next((name for name, answer in stages if answer is False), NO_STAGE)

@@ -171,6 +171,8 @@ def _row(
         first_failing=None if failing is None else failing.first_failing,
         failing_detail=None if failing is None else failing.failing_detail,
         failing_cause=None if failing is None else failing.failing_cause,
+        failing_bodies=() if failing is None else failing.failing_bodies,
+        failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
         clauses=() if planned.verdict is None else planned.verdict.clauses,
         gate_clauses=() if verdict is None else verdict.clauses,
         stages=_stages(outcome),
@@ -190,6 +192,14 @@ def _row(
 
 
 _ANSWERS = {"success": True, "failure": False}
+
+
+def _stage_at(facts: RecordedFacts, t_ns: int | None) -> str:
+    """Name the stage of the plan that an instant is in; what is after the last is in the last."""
+    if t_ns is None:
+        return ""
+    begun = [each.id for each in facts.plan_stages if t_ns >= each.t_start_ns]
+    return next(reversed(begun), "")
 
 
 def _stages(outcome: Outcome | None) -> tuple[tuple[str, bool | None], ...]:

@@ -9,9 +9,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import count
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from bridge.errors import MissingDependencyError
+from bridge.whole_file import write_whole
 from evaluator.report import wording
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
 from evaluator.report.front import FIGURES, front, front_tables
@@ -54,6 +57,11 @@ OPEN_ROWS = 14
 """A longer table is folded away: it is looked things up in, not read."""
 ALWAYS_OPEN = ("published", "success", "layout", TRIALS)
 
+SHARED = "shared"
+"""Folder beside the report: files with the clips of single trials."""
+NO_SHARED = "<!--shared--><!--/shared-->"
+"""Where the report names them; ``name_shared`` fills it in."""
+
 Inline = tuple[Drawing, str | None]
 """A figure, and its SVG for the page; None where nothing could draw it."""
 
@@ -94,10 +102,12 @@ def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewP
         rows=tuple((item.episode, item.scope, item.reason) for item in results.exclusions),
     )
     return (
-        _environment()
+        environment()
         .get_template("report.html")
         .render(
             results=results,
+            title=f"{results.run}: how far to trust the twin",
+            shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
             contents=names,
@@ -113,6 +123,28 @@ def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewP
             next_figure=count(1).__next__,
         )
     )
+
+
+def name_shared(report: Path) -> None:
+    """Let a written report name the files in the folder ``shared`` beside it, or none.
+
+    Args:
+        report: The page; one that another version wrote is left as it is.
+    """
+    try:
+        text = report.read_text()
+        names = sorted(path.name for path in (report.parent / SHARED).glob("*.html"))
+        before, opened, rest = text.partition("<!--shared-->")
+        _, closed, after = rest.partition("<!--/shared-->")
+        if not (opened and closed):
+            return
+        links = ", ".join(f'<a href="{SHARED}/{quote(name)}">{escape(name)}</a>' for name in names)
+        paragraph = f'<p class="soft">Trials with their clips: {links}</p>' if names else ""
+        new = f"{before}{opened}{paragraph}{closed}{after}"
+        if new != text:
+            write_whole(report, new.encode())
+    except (OSError, UnicodeDecodeError):  # not there, or not ours to write
+        return
 
 
 def _part(
@@ -156,7 +188,8 @@ def _short(provenance: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return what fills in the templates of the report, for pages that look like it."""
     environment = Environment(
         loader=PackageLoader("evaluator.report"),
         autoescape=True,

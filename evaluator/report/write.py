@@ -14,7 +14,7 @@ from evaluator.report.figures.distributions import worst_pairs
 from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
 from evaluator.report.figures.selection import drawable, drawings_of
 from evaluator.report.methods import methods
-from evaluator.report.page import page
+from evaluator.report.page import name_shared, page
 from evaluator.report.sections import TRIALS
 from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
@@ -95,6 +95,7 @@ def write_report(comparison: Comparison, folder: Path, beside: Beside | None = N
         )
         report = {folder / "report.html": text.encode()}
         shown_files = _write(report | _figure_files(folder / "figures", drawn, rendered))
+        name_shared(folder / "report.html")
     except OSError as error:
         message = f"cannot write into {folder}: {error.strerror}. Choose another with --out."
         raise EvaluatorError(message) from error

@@ -5,7 +5,7 @@ arm moved is left to ``motion``.
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,21 +77,28 @@ class VerdictSummary:
     """Cause, bodies and time, to be read."""
     clauses: Clauses = ()
     engine: str = ""
+    failing_bodies: tuple[str, ...] = ()
+    """What touched, came too close or was lost, in the verdict's order."""
+    failing_t_ns: int | None = None
+    """First instant at which it is false, since the start of the plan."""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
     """Sum a verdict up."""
     name = verdict.first_failing
+    factor = None if name is None else verdict.factors()[name]
     probability = None if verdict.p_success is None else verdict.p_success.get("value")
     return VerdictSummary(
         accepted=verdict.accepted,
         why_undecided=verdict.reason or _undecided(verdict),
         p_success=None if probability is None else float(probability),
         first_failing=name,
-        failing_cause=None if name is None else verdict.factors()[name].cause,
+        failing_cause=None if factor is None else factor.cause,
         failing_detail=_detail(verdict),
         clauses=clauses_of(verdict),
         engine=verdict.engine,
+        failing_bodies=() if factor is None else factor.bodies,
+        failing_t_ns=None if factor is None else factor.first_t_ns,
     )
 
 
@@ -124,6 +131,15 @@ class LocalisedPosition:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StageTime:
+    """When a plan means to do one of its stages, since its start."""
+
+    id: str
+    t_start_ns: int
+    t_end_ns: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class RecordedFacts:
     """What one recorded episode says of itself, with the label given to it afterwards."""
 
@@ -136,6 +152,8 @@ class RecordedFacts:
     num_plans_sent: int = 0
     plan_id: str | None = None
     """The plan actually sent: the last one whose execution started."""
+    plan_stages: tuple[StageTime, ...] = ()
+    """Of that plan."""
     started_ns: int | None = None
     """When its execution started and ended, on the cell's clock."""
     ended_ns: int | None = None
@@ -151,7 +169,7 @@ class RecordedFacts:
 class _Log:
     """What happened with plans, in the order it was received."""
 
-    plan_ids: set[str] = field(default_factory=set)
+    plans: dict[str, tuple[StageTime, ...]] = field(default_factory=dict)
     sent: list[str] = field(default_factory=list)
     started_ns: int | None = None
     ended_ns: int | None = None
@@ -193,9 +211,10 @@ def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> Recorded
         info=info,
         began_ns=episode.start_ns,
         outcome=outcome_of(run, episode) or log.label,
-        num_plans=len(log.plan_ids),
+        num_plans=len(log.plans),
         num_plans_sent=len(set(log.sent)),
         plan_id=plan_id,
+        plan_stages=() if plan_id is None else log.plans.get(plan_id, ()),
         started_ns=log.started_ns,
         ended_ns=log.ended_ns,
         verdict=None if verdict is None else summarise_verdict(verdict),
@@ -249,7 +268,8 @@ def _read_log(episode: Episode) -> _Log:
     ]
     for message in episode.messages(topics):
         if message.type_name == schema.PLAN:
-            log.plan_ids.add(_plan_id(message.data))
+            name, stages = _plan_of(message.data)
+            log.plans[name] = stages
         elif message.type_name == schema.VERDICT:
             _note_verdict(log, message)
         elif message.type_name == schema.LOCALISATION:
@@ -259,8 +279,8 @@ def _read_log(episode: Episode) -> _Log:
     return log
 
 
-def _plan_id(data: bytes) -> str:
-    """Read a plan's id alone; checking hundreds of waypoints takes longer than all the rest."""
+def _plan_of(data: bytes) -> tuple[str, tuple[StageTime, ...]]:
+    """Read a plan's id and stages; checking hundreds of waypoints takes longer than the rest."""
     try:
         record = json.loads(data)
     except (ValueError, RecursionError):
@@ -268,8 +288,21 @@ def _plan_id(data: bytes) -> str:
     if isinstance(record, dict) and record.get("schema_version") == SCHEMA_VERSION:
         plan_id = record.get("id")
         if isinstance(plan_id, str) and plan_id:
-            return plan_id
-    return Plan.from_json(data).id  # which says what is wrong
+            return plan_id, tuple(_stages(record.get("stages")))
+    plan = Plan.from_json(data)  # which says what is wrong
+    return plan.id, ()
+
+
+def _stages(records: object) -> Iterator[StageTime]:
+    for stage in records if isinstance(records, list) else ():
+        try:
+            yield StageTime(
+                id=str(stage["id"]),
+                t_start_ns=int(stage["t_start_ns"]),
+                t_end_ns=int(stage["t_end_ns"]),
+            )
+        except (KeyError, TypeError, ValueError):  # the replay says what is wrong with it
+            return
 
 
 def _note_verdict(log: _Log, message: RawMessage) -> None:
@@ -527,6 +560,20 @@ class DerivedIndex:
         ]
         decided = _newest(alone).facts.verdict if alone else None
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
+
+    def by_engine(self, *, source: str, source_sha256: str, plan_id: str) -> dict[str, DerivedFile]:
+        """Return the newest planned replay of a plan in each engine, those that never count too.
+
+        Args:
+            source: Id of the recorded episode.
+            source_sha256: Its hash as it is now; a replay of another version does not count.
+            plan_id: Plan that was sent.
+        """
+        found: dict[str, list[DerivedFile]] = {}
+        for file in _current(self._replays.get((source, plan_id, "planned"), []), source_sha256):
+            if file.derived.engine:
+                found.setdefault(file.derived.engine, []).append(file)
+        return {engine: _newest(files) for engine, files in found.items()}
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
         """Find the newest localisation of a recorded episode.

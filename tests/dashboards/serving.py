@@ -13,7 +13,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
-def dashboard(run: RunFolder, port: int = 0) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def dashboard(
+    run: RunFolder, port: int = 0, *options: str
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Start the real command and wait for its address."""
     command = [
         sys.executable,
@@ -24,6 +26,7 @@ def dashboard(run: RunFolder, port: int = 0) -> Iterator[tuple[subprocess.Popen[
         "--port",
         str(port),
         "--json",
+        *options,
     ]
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -33,7 +33,15 @@ class VideoWriter:
     """Append frames to one MP4 file at a constant rate."""
 
     def __init__(
-        self, path: Path, *, fps: int, width: int, height: int, crf: int, is_depth: bool = False
+        self,
+        path: Path,
+        *,
+        fps: int,
+        width: int,
+        height: int,
+        crf: int,
+        is_depth: bool = False,
+        keyframe_every: int = KEYFRAME_EVERY,
     ) -> None:
         """Create the file; sizes that are odd get full chroma, for the usual one needs even.
 
@@ -44,6 +52,7 @@ class VideoWriter:
             height: Of every frame [px].
             crf: Quality of colour, lower is better.
             is_depth: Frames are 12-bit codes, kept without loss.
+            keyframe_every: So many frames apart are those that can be decoded alone.
 
         Raises:
             MissingDependencyError: Without PyAV, or with one that has no encoder for this.
@@ -55,7 +64,7 @@ class VideoWriter:
         self._frame_class = av.VideoFrame
         self._intra = av.video.frame.PictureType.I
         self._container = av.open(str(path), "w")
-        options = {"g": str(KEYFRAME_EVERY), "bf": "0", "preset": "veryfast", "forced-idr": "1"}
+        options = {"g": str(keyframe_every), "bf": "0", "preset": "veryfast", "forced-idr": "1"}
         if is_depth:
             options["x265-params"] = "lossless=1:bframes=0:log-level=none"
         else:

@@ -1,0 +1,176 @@
+"""Failures by cause, stage, bodies and start region, with a wall of pictures and short clips."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError
+from dashboards.clips import can_film
+from dashboards.comparison import Judgement
+from dashboards.overview_page import Facet
+from dashboards.queue_page import Moment, moment_of
+from evaluator.review_index import (
+    FACETS,
+    FAILED,
+    FAILURE_PARTS,
+    NOT_KNOWN,
+    FailureGroup,
+    FailureSelection,
+    IndexedTrial,
+    ReviewIndex,
+    Selection,
+)
+
+GROUPS, SHOWN, ALONE = 12, 4, 24
+"""Kinds on one screen; trials of each; trials on one screen where there is one kind alone."""
+MOST_VALUES = 100
+PART_WORDS = {
+    "cause": "cause in the twin",
+    "stage": "stage",
+    "bodies": "bodies",
+    "start": "start region",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One trial on the wall."""
+
+    row: IndexedTrial
+    moment: Moment | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """One kind of failure with its trials."""
+
+    group: FailureGroup
+    words: tuple[tuple[str, str], ...]
+    """What is known of it: name of the part, and its words."""
+    narrowed: dict[str, str]
+    """The query that shows this kind alone."""
+    shots: tuple[Shot, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailuresPage:
+    """Everything the template needs."""
+
+    selection: FailureSelection
+    kinds: tuple[Kind, ...]
+    num_kinds: int
+    count: int
+    """Failures selected."""
+    of: int
+    """Failures in the run."""
+    num_trials: int
+    facets: tuple[Facet, ...]
+    failed: tuple[tuple[str, str, int], ...]
+    """Value, words and number of each choice of who failed."""
+    page: int
+    pages: int
+    can_film: bool
+
+
+def build_failures(
+    run: RunFolder, judgement: Judgement, selection: FailureSelection
+) -> FailuresPage:
+    """Gather one screen of failures.
+
+    Args:
+        run: The run folder.
+        judgement: Its trials.
+        selection: Which failures, and by what they are grouped.
+    """
+    index = judgement.index
+    if index is None:
+        return FailuresPage(
+            selection=selection,
+            kinds=(),
+            num_kinds=0,
+            count=0,
+            of=0,
+            num_trials=0,
+            facets=(),
+            failed=(),
+            page=1,
+            pages=1,
+            can_film=can_film(),
+        )
+    groups = index.failure_groups(selection)
+    count = sum(group.count for group in groups)
+    is_alone = len(groups) == 1
+    pages = max(1, -(-count // ALONE) if is_alone else -(-len(groups) // GROUPS))
+    page = min(Selection(page=selection.page).page_number, pages)
+    shown = groups if is_alone else groups[(page - 1) * GROUPS : page * GROUPS]
+    limit, offset = (ALONE, ALONE * (page - 1)) if is_alone else (SHOWN, 0)
+    return FailuresPage(
+        selection=selection,
+        kinds=tuple(_kind(run, index, selection, group, limit, offset) for group in shown),
+        num_kinds=len(groups),
+        count=count,
+        of=_count(index, FailureSelection()),
+        num_trials=index.count(Selection()),
+        facets=(*_groups(index, selection), *_parts(index, selection)),
+        failed=tuple(
+            (value, words, _count(index, FailureSelection(**selection.query(failed=value))))
+            for value, words in FAILED.items()
+        ),
+        page=page,
+        pages=pages,
+        can_film=can_film(),
+    )
+
+
+def _count(index: ReviewIndex, selection: FailureSelection) -> int:
+    return sum(group.count for group in index.failure_groups(selection))
+
+
+def _kind(
+    run: RunFolder,
+    index: ReviewIndex,
+    selection: FailureSelection,
+    group: FailureGroup,
+    limit: int,
+    offset: int,
+) -> Kind:
+    narrowed = selection.query(**{name: text or NOT_KNOWN for name, text in group.parts.items()})
+    trials = index.failures(FailureSelection(**narrowed), limit=limit, offset=offset)
+    return Kind(
+        group=group,
+        words=tuple(
+            (PART_WORDS[name], text.replace("_", " ")) for name, text in group.parts.items() if text
+        ),
+        narrowed=narrowed,
+        shots=tuple(Shot(row=row, moment=_moment(run, row)) for row in trials),
+    )
+
+
+def _moment(run: RunFolder, row: IndexedTrial) -> Moment | None:
+    try:
+        return moment_of(run, row)
+    except GstError:  # the trial's own page says what is wrong
+        return None
+
+
+def _groups(index: ReviewIndex, selection: FailureSelection) -> Sequence[Facet]:
+    found = []
+    for name in FACETS:
+        values = index.values(name)
+        if len(values) > 1:
+            labelled = [(value, label.replace("_", " ")) for value, label, _ in values]
+            found.append(Facet(name=name, values=(("", "all"), *labelled[:MOST_VALUES])))
+    return found
+
+
+def _parts(index: ReviewIndex, selection: FailureSelection) -> Sequence[Facet]:
+    found = []
+    for name in FAILURE_PARTS:
+        values = index.failure_values(selection, name)
+        if len(values) > 1 or getattr(selection, name):
+            labelled = [
+                (text or NOT_KNOWN, f"{text.replace('_', ' ') or 'not known'} ({count})")
+                for text, count in values[:MOST_VALUES]
+            ]
+            found.append(Facet(name=name, values=(("", "all"), *labelled)))
+    return found

@@ -1,0 +1,373 @@
+"""One file to send: chosen trials with clips, figures and tables; offline, readable unscripted."""
+
+import base64
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, PrefixLoader, StrictUndefined
+from markupsafe import Markup
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, UsageError
+from bridge.whole_file import write_whole
+from dashboards import wording
+from dashboards.clips import (
+    ClipConfig,
+    Footage,
+    as_jpeg,
+    as_video,
+    can_film,
+    contact_sheet,
+    footage,
+)
+from dashboards.comparison import Judgement, judge
+from dashboards.config import SHARE_LIMITS, ShareConfig
+from dashboards.episode_page import build_page
+from dashboards.figures import TimePlot
+from dashboards.library import episode_path
+from evaluator.compare.rows import Comparison
+from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
+from evaluator.report.figures.selection import drawable, drawings_of
+from evaluator.report.front import FIGURES, front
+from evaluator.report.page import SHARED, environment, name_shared
+from evaluator.report.wording import stand_in_sentence
+from evaluator.result import Table
+from evaluator.review_index import IndexedTrial, Selection
+
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:"
+"""The file forbids itself to load anything."""
+BY_ITSELF = 8
+"""Trials that are taken where none is named: the worst disagreements, else the worst failures."""
+MOST_TRIALS = 60
+PLOTS = 4
+"""Of a trial: how far the tool was from the twin's, and what comes after it on its page."""
+STRIP_FRAMES = 6
+MB = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """How well clips are shown; the next one is smaller."""
+
+    words: str
+    height_px: int
+    rate_hz: int
+    crf: int
+    quality: int
+    is_video: bool = True
+
+
+LEVELS = (
+    Level(words="288 lines, 15 Hz", height_px=288, rate_hz=15, crf=24, quality=82),
+    Level(words="216 lines, 10 Hz", height_px=216, rate_hz=10, crf=28, quality=78),
+    Level(words="144 lines, 6 Hz", height_px=144, rate_hz=6, crf=32, quality=70),
+    Level(words="strips", height_px=120, rate_hz=3, crf=0, quality=65, is_video=False),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """What the file shows of a trial: a video with its picture, or a strip of pictures."""
+
+    picture: str
+    """JPEG as a data address: of the moment, or the strip."""
+    video: str
+    """MP4 as a data address; empty for a strip."""
+    words: str
+    """What is seen, for those who cannot."""
+    width: int
+    height: int
+
+    @property
+    def num_bytes(self) -> int:
+        """Length in the file."""
+        return len(self.picture) + len(self.video)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedTrial:
+    """One trial of the file."""
+
+    row: IndexedTrial
+    clip: Clip | None
+    why_no_clip: str
+    plots: tuple[TimePlot, ...]
+    t_s: float
+    """Where the plots have their mark: the moment, in seconds since the first sample."""
+    moment_text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shared:
+    """A file that was made."""
+
+    text: str
+    trials: tuple[str, ...]
+    level: Level
+    notes: tuple[str, ...]
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file."""
+        return len(self.text.encode())
+
+
+def share(run: RunFolder, config: ShareConfig) -> tuple[Path, Shared]:
+    """Write chosen trials into one file, and let the report name it.
+
+    Args:
+        run: The run folder.
+        config: Which trials, and where to.
+
+    Raises:
+        UsageError: When a trial is not there, none can be chosen, or they do not fit.
+    """
+    out = config.out or run.results_dir / SHARED / "trials.html"
+    is_beside = out.resolve().parent == (run.results_dir / SHARED).resolve()
+    report = "../report.html" if is_beside and (run.results_dir / "report.html").is_file() else ""
+    made = build_share(run, config, report=report)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(out, made.text.encode())
+    except OSError as error:
+        message = f"cannot write {out}: {error.strerror}. Choose another file with --out."
+        raise UsageError(message) from error
+    if is_beside:
+        name_shared(run.results_dir / "report.html")
+    return out, made
+
+
+def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Shared:
+    """Make the file, as well as it fits.
+
+    Args:
+        run: The run folder.
+        config: Which trials, and how large it may be.
+        report: Where the report lies from the file; empty leaves the link out.
+
+    Raises:
+        UsageError: When a trial is not there, none can be chosen, or they do not fit.
+    """
+    judgement = judge(run)
+    rows = chosen_trials(judgement, config.trials)
+    shared = _shared_parts(run, judgement, report)
+    trials = [_trial(run, row) for row in rows]
+    levels = [level for level in LEVELS if can_film() or not level.is_video]
+    limit = round(config.max_mb * MB)
+    least = 0
+    for level in levels:
+        shown, notes = _with_clips(run, trials, level, config, limit)
+        if shown is None:
+            continue
+        text = (
+            _environment()
+            .get_template("pages/share.html")
+            .render(**shared, trials=shown, level=level)
+        )
+        made = Shared(
+            text=text, trials=tuple(row.episode for row in rows), level=level, notes=notes
+        )
+        least = made.size_bytes
+        if least <= limit:
+            return made
+    size = f"take {least / MB:.1f} MB" if least else f"take more than {config.max_mb:g} MB"
+    message = (
+        f"{len(rows)} trials {size} even as strips of pictures; the limit is "
+        f"{config.max_mb:g} MB. Name fewer with --trials, or raise --max-mb (at most "
+        f"{SHARE_LIMITS['max_mb'][1]:g})."
+    )
+    raise UsageError(message)
+
+
+def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[IndexedTrial]:
+    """Return the trials that were named; without names the worst that have a recording.
+
+    Args:
+        judgement: The run's trials.
+        names: Ids of episodes.
+
+    Raises:
+        UsageError: For one that is not there, with the nearest name, or where none can be chosen.
+    """
+    index = judgement.index
+    if index is None:
+        raise UsageError("this run was not evaluated yet: run robot-gst evaluate first.")
+    if len(names) > MOST_TRIALS:
+        message = f"{len(names)} trials are too many for one file; name at most {MOST_TRIALS}."
+        raise UsageError(message)
+    found = []
+    for name in dict.fromkeys(names):
+        row = index.trial(name)
+        if row is None:
+            known = [trial.episode for trial in index.trials(Selection())]
+            near = difflib.get_close_matches(name, known, n=1)
+            meant = f"; did you mean {near[0]}?" if near else "."
+            message = f"no trial {name!r} in this run{meant} robot-gst ls lists them."
+            raise UsageError(message)
+        found.append(row)
+    for show in () if names else ("disagree", "failure"):
+        found = [row for row in index.trials(Selection(show=show)) if row.file][:BY_ITSELF]
+        if found:
+            break
+    if not found:
+        message = "no trial disagrees or failed; name those to share with --trials."
+        raise UsageError(message)
+    return found
+
+
+def _shared_parts(run: RunFolder, judgement: Judgement, report: str) -> dict[str, Any]:
+    """What the file says of the whole run."""
+    results = judgement.results
+    success = None if results is None else _table(results.tables, "success")
+    drawing, svg = _figure(judgement.comparison)
+    return {
+        "name": run.path.resolve().name,
+        "title": f"Trials of {run.path.resolve().name}",
+        "policy": POLICY,
+        "light": LIGHT,
+        "dark": DARK,
+        "banner": None if results is None else stand_in_sentence(results),
+        "first": None if results is None else front(results),
+        "success": success,
+        "drawing": drawing,
+        "svg": None if svg is None else Markup(svg),  # drawn by the evaluator
+        "report": report,
+    }
+
+
+def _table(tables: Sequence[Table], name: str) -> Table | None:
+    return next((table for table in tables if table.id == name and table.rows), None)
+
+
+def _figure(comparison: Comparison | None) -> tuple[Drawing | None, str | None]:
+    """Draw the report's first figure; none without matplotlib, or without groups."""
+    if comparison is None:
+        return None, None
+    drawn, _ = drawings_of(drawable(comparison))
+    first = next((d for name in FIGURES for d in drawn if d.id == name), None)
+    if first is None:
+        return None, None
+    try:
+        from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
+    except ModuleNotFoundError:
+        return None, None
+    return first, render.render(first).inline
+
+
+def _trial(run: RunFolder, row: IndexedTrial) -> SharedTrial:
+    """Everything of a trial but its clip."""
+    plots: tuple[TimePlot, ...] = ()
+    t_s, text, why = 0.0, "", ""
+    if row.file:
+        try:
+            page = build_page(run, row.file.removesuffix(".mcap"), row, None)
+            plots, t_s = page.plots[:PLOTS], page.t_s
+            text = "" if page.divergence is None else page.divergence.text
+        except GstError as error:
+            why = str(error).replace(str(run.path), run.path.name)
+    else:
+        why = "from a table: nothing was recorded"
+    return SharedTrial(row=row, clip=None, why_no_clip=why, plots=plots, t_s=t_s, moment_text=text)
+
+
+def _with_clips(
+    run: RunFolder,
+    trials: Sequence[SharedTrial],
+    level: Level,
+    config: ShareConfig,
+    limit: int,
+) -> tuple[list[SharedTrial] | None, tuple[str, ...]]:
+    """Add clips of one quality; None as soon as they alone are too large."""
+    shown, notes, size = list[SharedTrial](), list[str](), 0
+    clip_config = ClipConfig(
+        before_s=config.before_s,
+        after_s=config.after_s,
+        height_px=level.height_px,
+        rate_hz=level.rate_hz,
+        crf=level.crf,
+        quality=level.quality,
+    )
+    for trial in trials:
+        if trial.why_no_clip:
+            shown.append(trial)
+            notes.append(f"{trial.row.episode}: {trial.why_no_clip}")
+            continue
+        try:
+            episode_path(run, trial.row.file.removesuffix(".mcap"))
+            found = footage(run, trial.row, clip_config)
+            clip = _clip(found, clip_config, level, trial)
+        except GstError as error:
+            why = str(error).replace(str(run.path), run.path.name)
+            shown.append(replace(trial, why_no_clip=why))
+            notes.append(f"{trial.row.episode}: {why}")
+            continue
+        size += clip.num_bytes
+        if size > limit:
+            return None, ()
+        shown.append(replace(trial, clip=clip))
+    return shown, tuple(notes)
+
+
+def _clip(found: Footage, config: ClipConfig, level: Level, trial: SharedTrial) -> Clip:
+    height, width = found.frames[0].shape[:2]
+    sides = "recorded, and the twin beside it," if found.has_twin else "recorded"
+    at = f"around the moment when {trial.moment_text}" if trial.moment_text else "at the end"
+    words = f"{trial.row.episode} {sides} {at}"
+    if level.is_video and len(found.frames) > 1:
+        key = as_jpeg(found.frames[found.key], config.quality)
+        return Clip(
+            picture=_data("image/jpeg", key),
+            video=_data("video/mp4", as_video(found, config)),
+            words=words,
+            width=width,
+            height=height,
+        )
+    last = len(found.frames) - 1
+    num = min(STRIP_FRAMES, len(found.frames))
+    places = sorted({round(last * step / max(1, num - 1)) for step in range(num)} | {found.key})
+    frames = [found.frames[place] for place in places]
+    picture = contact_sheet(frames, columns=2 if found.has_twin else 3)
+    return Clip(
+        picture=_data("image/jpeg", as_jpeg(picture, config.quality)),
+        video="",
+        words=f"{words}, {len(frames)} pictures in reading order",
+        width=picture.shape[1],
+        height=picture.shape[0],
+    )
+
+
+def _data(media_type: str, data: bytes) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
+
+
+@cache
+def _environment() -> Environment:
+    """The report's templates and words, and beside them those of the pages."""
+    report = environment()
+    made = Environment(
+        loader=ChoiceLoader(
+            [
+                PackageLoader("evaluator.report"),
+                PrefixLoader({"pages": PackageLoader("dashboards")}),
+            ]
+        ),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    words = (wording.outcome_word, wording.verdict_word, wording.condition_word, wording.tone)
+    made.filters |= {function.__name__: function for function in words} | {
+        name: report.filters[name] for name in report.filters if name not in made.filters
+    }
+    made.filters["length_text"] = wording.length_text
+    made.tests["figures"] = report.tests["figures"]
+    shown: Mapping[str, Any] = {
+        name: value for name, value in report.globals.items() if name.startswith("shown_")
+    }
+    made.globals |= shown
+    return made

@@ -1,0 +1,192 @@
+"""Addresses of pages about many trials at once. What reads episodes is imported when asked for."""
+
+from collections.abc import Callable, Mapping
+from threading import Lock
+from typing import TYPE_CHECKING
+
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+
+from bridge.episode.run_folder import RunFolder
+from bridge.errors import GstError, MissingDependencyError, UsageError
+from dashboards.comparison import judge
+from dashboards.config import DashboardConfig, ShareConfig
+from dashboards.errors import NotHereError
+from dashboards.loading import LOADING
+from evaluator.review_index import FailureSelection, IndexedTrial
+
+if TYPE_CHECKING:
+    from dashboards.live_page import LiveFeed
+
+PARTS = ("summary", "topics", "clocks", "verdicts", "advice")
+"""Of the page Live that change by themselves."""
+_SHARING = Lock()
+RunOf = Callable[[Request], RunFolder]
+Page = Callable[..., Response]
+OthersOf = Callable[[RunFolder], Mapping[str, RunFolder]]
+"""Gives the runs that one may be compared with, by name."""
+
+
+class StudyPages:
+    """Answers about many trials at once, and about the recording under way."""
+
+    def __init__(
+        self,
+        run_of: RunOf,
+        page: Page,
+        others_of: OthersOf,
+        part: Callable[[str, object], str],
+        config: DashboardConfig,
+    ) -> None:
+        """Remember whom to ask.
+
+        Args:
+            run_of: The run that a request is about.
+            page: Fills in a template.
+            others_of: The runs that one may be compared with.
+            part: Fills in a part of the page Live, by name, with what is heard.
+            config: Where the recorder is.
+        """
+        self._run, self._page, self._others, self._part = run_of, page, others_of, part
+        self._config = config
+        self._feed: LiveFeed | None = None
+        self._making = Lock()
+        self.is_ending: Callable[[], bool] = lambda: False
+        """Whether the server ends: a viewer of the page Live would hold it up."""
+
+    def routes(self) -> list[Route]:
+        """Return the addresses."""
+        return [
+            Route("/failures", self.failures),
+            Route("/failures/picture/{id}", self.picture),
+            Route("/failures/clip/{id}", self.clip),
+            Route("/compare", self.compare),
+            Route("/share", self.share),
+            Route("/live", self.live),
+            Route("/live/events", self.events),
+            Route("/live/preview/{camera}", self.preview),
+        ]
+
+    def end(self) -> None:
+        """Stop listening to a recorder."""
+        with self._making:
+            if self._feed is not None:
+                self._feed.end()
+
+    def _live(self) -> "LiveFeed":
+        with LOADING:
+            from dashboards.live_page import feed_of  # noqa: PLC0415  # loads zenoh
+
+        with self._making:
+            self._feed = self._feed or feed_of(self._config)
+            return self._feed
+
+    def failures(self, request: Request) -> Response:
+        """``/failures?cause=&stage=&bodies=&start=&by=``: what goes wrong, and its pictures."""
+        with LOADING:
+            from dashboards.failures_page import PART_WORDS, build_failures  # noqa: PLC0415
+
+        run = self._run(request)
+        found = build_failures(run, judge(run), FailureSelection.of(request.query_params))
+        return self._page("failures.html", request, page=found, part_words=PART_WORDS)
+
+    def picture(self, request: Request) -> Response:
+        """``/failures/picture/<id>``: a trial at its moment, recorded beside twin."""
+        with LOADING:
+            from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
+
+        return _kept(picture(self._run(request), self._trial(request)), "image/jpeg")
+
+    def clip(self, request: Request) -> Response:
+        """``/failures/clip/<id>``: a trial around its moment, as MP4."""
+        with LOADING:
+            from dashboards.clips import clip  # noqa: PLC0415  # reads episodes
+
+        try:
+            data = clip(self._run(request), self._trial(request))
+        except MissingDependencyError as error:
+            raise NotHereError(str(error)) from error
+        return _kept(data, "video/mp4")
+
+    def compare(self, request: Request) -> Response:
+        """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
+        with LOADING:
+            from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
+
+        run = self._run(request)
+        others = self._others(run)
+        name = request.query_params.get("with", "")
+        if name and name not in others:
+            message = f"no run {name!r} to compare with. There are: {', '.join(others) or 'none'}."
+            raise NotHereError(message)
+        judged = {each: judge(other) if each == name else None for each, other in others.items()}
+        found = build_compare(run, judge(run), judged, request.query_params)
+        return self._page("compare.html", request, page=found)
+
+    def share(self, request: Request) -> Response:
+        """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""
+        with LOADING:
+            from dashboards.share_file import build_share  # noqa: PLC0415  # loads the evaluator
+
+        named = tuple(request.query_params.getlist("trial"))
+        try:
+            with _SHARING:  # it takes seconds: one at a time
+                made = build_share(self._run(request), ShareConfig(trials=named))
+        except UsageError as error:
+            raise NotHereError(str(error)) from error
+        headers = {"Content-Disposition": 'attachment; filename="trials.html"'}
+        return Response(made.text, media_type="text/html", headers=headers)
+
+    def live(self, request: Request) -> Response:
+        """``/live``: the recording under way."""
+        feed, why = None, ""
+        try:
+            feed = self._live()
+        except GstError as error:
+            why = f"Nothing can be heard here: {error}"
+        state = None if feed is None else feed.state()
+        return self._page(
+            "live.html",
+            request,
+            state=state,
+            why=why,
+            config=self._config,
+            parts={} if state is None else {name: self._part(name, state) for name in PARTS},
+        )
+
+    async def events(self, request: Request) -> Response:
+        """``/live/events``: parts of the page that changed, as server-sent events."""
+        with LOADING:
+            from dashboards.live_page import LiveState, told  # noqa: PLC0415  # loads zenoh
+
+        def render(state: LiveState) -> dict[str, object]:
+            parts: dict[str, object] = {name: self._part(name, state) for name in PARTS}
+            return parts | {"previews": state.previews}
+
+        async def is_gone() -> bool:
+            return self.is_ending() or await request.is_disconnected()
+
+        feed = await run_in_threadpool(self._live)
+        return StreamingResponse(told(feed, render, is_gone), media_type="text/event-stream")
+
+    def preview(self, request: Request) -> Response:
+        """``/live/preview/<camera>``: its last picture."""
+        data = self._live().preview(request.path_params["camera"])
+        if data is None:
+            message = "no picture of that camera was heard."
+            raise NotHereError(message)
+        return Response(data, media_type="image/jpeg")
+
+    def _trial(self, request: Request) -> IndexedTrial:
+        row = judge(self._run(request)).row(request.path_params["id"])
+        if row is None or not row.file:
+            message = "no such recorded trial in this run."
+            raise NotHereError(message)
+        return row
+
+
+def _kept(data: bytes, media_type: str) -> Response:
+    headers = {"Cache-Control": "private, max-age=600"}
+    return Response(data, media_type=media_type, headers=headers)

@@ -1,0 +1,210 @@
+"""Two runs, conditions, policies or engines: the page shows what the evaluator finds, no more."""
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from headless import CHROMIUM, NO_CHROMIUM, chromium
+from scipy.stats import binom
+from serving import dashboard
+from visible import words
+
+from bridge.episode.run_folder import RunFolder
+from bridge.terminal import Output
+from dashboards import share_file
+from dashboards.config import ShareConfig
+from dashboards.guard import Admission
+from dashboards.library import Library
+from evaluator.cache import SummaryCache
+from evaluator.compare.run import read_run
+from evaluator.compare.several import with_against
+from evaluator.compare.within import choices, within_tables
+from evaluator.errors import EvaluatorError
+from evaluator.result import Table
+
+BOTH = "/compare?by=condition&a=without_replanning&b=with_replanning"
+
+
+@pytest.fixture
+def runs(shared_run: RunFolder, synthetic: ModuleType, tmp_path: Path) -> tuple[RunFolder, ...]:
+    """Return a run, and a copy of it in whose twin trial 2 succeeds, in another engine."""
+    first, second = (tmp_path / name for name in ("monday", "tuesday"))
+    for path in (first, second):
+        shutil.copytree(shared_run.path, path)
+    other = RunFolder.open(second)
+    for path in other.derived_dir.glob("trial_0002.replay.planned.*"):
+        path.unlink()
+    synthetic.write_replay(other, synthetic.TRIALS[1], "planned", True, engine="rigid-two")
+    return RunFolder.open(first), other
+
+
+def cells(table: Table, row: int = 0) -> dict[str, Any]:
+    return dict(zip(table.columns, table.rows[row], strict=True))
+
+
+def test_two_runs_show_what_evaluate_against_finds(
+    runs: tuple[RunFolder, ...], synthetic: ModuleType
+) -> None:
+    first, second = runs
+    text = synthetic.browser_of(first, second).get("/compare?with=tuesday").text
+    seen = words(text)
+    comparison = synthetic.compare_run(first)
+    found = with_against(comparison, first.path, second.path, output=Output(quiet=True))
+    (against,) = (table for table in found.tables if table.id == "against")
+    for row in range(len(against.rows)):
+        for name in ("monday", "tuesday", "difference"):
+            value = cells(against, row)[name]
+            assert value is None or f"{value:.3f}".replace("-", "−") in seen
+    assert "Trials that flip: 1 of 3" in seen
+    assert re.findall(r'<a href="/episode/(\w+)\?run=monday', text) == ["trial_0002"]
+    assert re.search(
+        r"Settings of the replays that differ: 1 .* engine bullet bullet, rigid-two", seen
+    )
+    assert "robot-gst evaluate" in seen
+    back = words(synthetic.browser_of(second, first).get("/compare?with=monday").text)
+    assert "Trials that flip: 1 of 3" in back
+
+
+def test_runs_without_a_common_trial_show_only_the_numbers_that_differ(
+    runs: tuple[RunFolder, ...], synthetic: ModuleType
+) -> None:
+    first, second = runs
+    for path in (second.episodes_dir, second.derived_dir):
+        for file in path.iterdir():
+            file.unlink()
+    for trial in synthetic.TRIALS[:1]:
+        synthetic.write_trial(second, replace(trial, id="other", start_id="s9"), images=False)
+    comparison = synthetic.compare_run(second)
+    synthetic.write_results(comparison.results(), second.results_dir / "results.json")
+    text = synthetic.browser_of(first, second).get("/compare?with=tuesday").text
+    seen = words(text)
+    assert "No trial has an outcome and an answer of both twins" in seen
+    assert "Numbers that differ" in seen
+    assert "these are not pairs" in seen
+    assert "rate.recorded.cube_into_box.without" in text.replace("<wbr>", "")
+    again = words(synthetic.browser_of(first, first).get("/compare").text)
+    assert "Numbers that differ" not in again
+
+
+def test_two_conditions_are_paired_by_start(shared_run: RunFolder, browser: Any) -> None:
+    read = read_run(shared_run, SummaryCache(None))
+    assert choices(read) == {"condition": ("without_replanning", "with_replanning")}
+    table, flips = within_tables(read, "condition", "without_replanning", "with_replanning")
+    recorded, twin = cells(table), cells(table, 1)
+    assert (recorded["without_replanning"], recorded["with_replanning"]) == (0.5, 1.0)
+    assert (recorded["difference"], recorded["pairs"]) == (-0.5, 2)
+    assert recorded["low"] < -0.5 < recorded["high"]
+    assert recorded["p"] == pytest.approx(2 * (binom.cdf(0, 1, 0.5) - 0.5 * binom.pmf(0, 1, 0.5)))
+    assert twin["pairs"] == 1  # the twin could not decide one of them
+    assert len(flips.rows) == 1
+    back, _ = within_tables(read, "condition", "with_replanning", "without_replanning")
+    assert cells(back)["difference"] == 0.5
+    assert cells(back)["low"] == pytest.approx(-recorded["high"])
+    seen = words(browser.get(BOTH).text)
+    assert "Starts that end differently: 1 of 2" in seen
+    assert "recorded success: no difference is shown." in seen
+    assert "−0.500" in seen
+
+
+def test_a_start_that_was_tried_twice_or_elsewhere_is_no_pair(shared_run: RunFolder) -> None:
+    read = read_run(shared_run, SummaryCache(None))
+    names = ("without_replanning", "with_replanning")
+    twice = replace(read, rows=[*read.rows, replace(read.rows[0], episode="again")])
+    table = within_tables(twice, "condition", *names)[0]
+    assert cells(table)["pairs"] == 1
+    assert "3 trials have no partner" in table.note
+    far = [
+        replace(row, start_positions_m={"cube": (0.4 + 0.1 * place, 0.0, 0.0)})
+        for place, row in enumerate(read.rows)
+    ]
+    with pytest.raises(EvaluatorError, match="4 trials could not be paired"):
+        within_tables(replace(read, rows=far), "condition", *names)
+    for first, second in (("with_replanning", "with_replanning"), ("with_replanning", "x")):
+        with pytest.raises(EvaluatorError, match="choose two different ones"):
+            within_tables(read, "condition", first, second)
+
+
+def test_two_engines_are_held_against_the_same_trials(
+    runs: tuple[RunFolder, ...], synthetic: ModuleType
+) -> None:
+    run = runs[0]
+    for trial in synthetic.TRIALS[:3]:
+        synthetic.write_replay(run, trial, "planned", trial.recorded, engine="perfect")
+    address = "/compare?by=engine&a=perfect&b=bullet"
+    seen = words(synthetic.browser_of(run).get(address).text)
+    assert "Trials that flip: 1 of 3" in seen
+    read = read_run(run, SummaryCache(None))
+    assert choices(read)["engine"] == ("bullet", "perfect")
+    accuracy = cells(within_tables(read, "engine", "perfect", "bullet")[0])
+    assert (accuracy["perfect"], accuracy["bullet"]) == (1.0, pytest.approx(2 / 3))
+
+
+def test_what_cannot_be_compared_is_said(browser: Any, own_run: RunFolder, synthetic: Any) -> None:
+    assert browser.get("/compare").status_code == 200
+    assert browser.get("/compare?with=..%2F..%2Fetc").status_code == 404
+    for query in ("by=condition&a=x&b=y", "by=planet&a=x&b=y", "by=engine&a=%3Cscript%3E&b="):
+        answer = browser.get(f"/compare?{query}")
+        assert answer.status_code == 200
+        assert "<script>x" not in answer.text
+        assert "choose two " in words(answer.text)
+    alone = words(synthetic.browser_of(own_run).get("/compare").text)
+    assert "nothing to hold this run against" in alone
+
+
+def test_runs_beside_a_run_are_offered_on_the_loopback_address_alone(
+    runs: tuple[RunFolder, ...], synthetic: ModuleType, tmp_path: Path
+) -> None:
+    (tmp_path / "no_run").mkdir()
+    assert list(Library.open([runs[0].path]).others(runs[0], beside=True)) == ["tuesday"]
+    assert "with=tuesday" in synthetic.browser_of(runs[0]).get("/compare").text
+    outside = Admission(host="127.0.0.1.example", token=None)
+    app = synthetic.create_app(Library.open([runs[0].path]), outside)
+    hidden = synthetic.Browser(app).get("/compare", headers={"Host": "127.0.0.1.example"})
+    assert hidden.status_code == 200
+    assert "tuesday" not in hidden.text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+def test_in_a_browser_a_clip_plays_a_flip_leads_to_its_trial_and_a_shared_file_opens(
+    runs: tuple[RunFolder, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("av")
+    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))  # matplotlib takes seconds
+    config = ShareConfig(trials=("trial_0001",), out=tmp_path / "sent" / "one.html")
+    shared, _ = share_file.share(runs[0], config)
+    with dashboard(runs[0]) as (_, url), chromium(tmp_path / "home") as tab:
+
+        def show(address: str, *, width: int, dark: bool) -> None:
+            tab.show(address, width=width, dark=dark)
+            assert tab.ask("document.documentElement.scrollWidth") <= width
+            assert tab.complaints == []
+            assert all(asked.startswith((url, "data:", "file:")) for asked in tab.asked)
+
+        show(f"{url}failures", width=390, dark=True)
+        tab.ask_when("document.querySelector('.pair img').complete")
+        tab.ask("document.querySelector('.pair').focus()")
+        tab.ask_when("(document.querySelector('.pair video') || {}).currentTime > 0.2")
+        assert tab.ask("document.querySelector('.pair img').hidden") is True
+        assert tab.ask("document.querySelector('video').videoWidth") == 288
+        tab.ask("document.querySelector('.pair').blur()")
+        assert tab.ask("document.querySelector('.pair video')") is None
+        show(tab.ask("document.querySelector('.pair').href"), width=1440, dark=False)
+        assert tab.ask("Number(document.getElementById('clock').value)") == pytest.approx(3.8)
+
+        for width, dark in ((390, True), (1440, False)):
+            show(f"{url}compare?with=tuesday", width=width, dark=dark)
+            assert tab.ask("document.querySelectorAll('.forest circle').length") >= 2
+        show(tab.ask("document.querySelector('td a').href"), width=1440, dark=False)
+        assert tab.ask("document.querySelector('h1').innerText").startswith("trial_0002")
+
+        tab.call("Emulation.setScriptExecutionDisabled", value=True)
+        show(shared.as_uri(), width=390, dark=True)
+        assert tab.picture().startswith(b"\x89PNG")
+        tab.call("Emulation.setScriptExecutionDisabled", value=False)
+        tab.ask("void document.querySelector('video').play()")
+        tab.ask_when("document.querySelector('video').currentTime > 0.2")
