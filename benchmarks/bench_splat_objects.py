@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, report_targets
 
-from twin.scene.objects.assignment import assign_splats
+from twin.scene.objects.assignment import assign_splats, object_poses
 
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)
@@ -113,7 +113,8 @@ def scanned(task_names: Sequence[str], seeds: Sequence[int]) -> list[Target]:
     for task_name, seed in product(task_names, seeds):
         scan = scan_objects.take_scan(task_name, seed)
         owner = scan_objects.true_owners(scan)
-        given = assign_splats(scan.cloud, scan.poses, scan.start.task, shapes_in(scan.shapes))
+        places = object_poses(scan.cloud, scan.localised, scan.start.task)
+        given = assign_splats(scan.cloud, places, scan.start.task, shapes_in(scan.shapes))
         for key in scan.start.task.objects:
             name = key.split("_")[0]
             scores.setdefault(name, []).append(scan_objects.score_shape(scan, key))

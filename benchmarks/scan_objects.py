@@ -14,8 +14,7 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, trai
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.assignment import object_poses
-from twin.scene.objects.decompose import SceneParts, shape_mesh, split_objects
+from twin.scene.objects.decompose import SceneParts, closed_parts, shape_mesh, split_objects
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.shape.from_training import shapes_of
 from twin.scene.shape.mesh import volume_m3
@@ -41,8 +40,9 @@ class Scanned:
     shapes: dict[str, ObjectShape | str]
 
     def apart(self) -> SceneParts:
-        """Objects cut out along their shapes."""
-        return split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
+        """Objects cut out along their shapes, and closed."""
+        parts = split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
+        return closed_parts(parts, self.poses, self.shapes, self.views, InitialiseConfig())
 
 
 def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = False) -> Scanned:
@@ -67,7 +67,9 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     num = LocaliseConfig().max_views
     chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, num).round().astype(int)]
     localised = localise_objects([*chosen, *others], start.task)
-    poses = object_poses(cloud, localised, start.task)
+    poses = {
+        k: item.T_base_object for k, item in localised.items() if item.T_base_object is not None
+    }
     return Scanned(
         start=start,
         views=views,

@@ -70,7 +70,7 @@ def make_record(
         fitted: The cloud, and what fitting it took.
         views: Numbers of the held-out views.
         num_background: Gaussians that belong to no object.
-        num_completed: The last of them, which stand for what nobody measured.
+        num_completed: Those of them that stand for what nobody measured.
         cost: Of the whole rebuild.
     """
     settings = asdict(config)

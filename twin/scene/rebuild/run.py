@@ -54,7 +54,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 21
+METHOD_VERSION = 22
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -128,7 +128,13 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
     decomposed = decompose(
-        sources, fitted.cloud, training.choices, training.views, complete, output
+        sources,
+        fitted.cloud,
+        training.choices,
+        training.views,
+        complete,
+        output,
+        config.initialise,
     )
     if decomposed.remark:
         output.say(decomposed.remark)
@@ -150,7 +156,6 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
-        num_completed=len(completed),
     )
     clock.end("objects_and_semantics")
     record = make_record(
@@ -163,7 +168,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         fitted=fitted,
         views=views,
         num_background=len(decomposed.background),
-        num_completed=len(completed),
+        num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
     record |= extras

@@ -21,14 +21,15 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
-from twin.robot.surface import LinkSurface, PosedSurface, link_poses, link_surfaces
+from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.fit.on_mesh import Triangles, surface_area_m2
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.robot.link_surface import on_surface, surface_area_m2
+from twin.scene.robot.link_surface import on_surface
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
 
@@ -187,14 +188,14 @@ class RobotFrames:
                 continue
         return clouds
 
-    def _shapes(self) -> dict[str, list[LinkSurface]]:
+    def _shapes(self) -> dict[str, list[Triangles]]:
         """Shapes of the links by name, where all episodes have one description."""
         robots = {tracked.robot for tracked in self._tracked.values()}
         if len(robots) != 1:
             return {}
-        shapes: dict[str, list[LinkSurface]] = {}
+        shapes: dict[str, list[Triangles]] = {}
         for item in link_surfaces(next(iter(robots))):
-            shapes.setdefault(item.link, []).append(item)
+            shapes.setdefault(item.link, []).append((item.vertices_m, item.triangles))
         return shapes
 
     def joined(
