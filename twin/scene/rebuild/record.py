@@ -197,6 +197,11 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
         for item in record["cameras"]
     ]
+    lines += [
+        f"{key}: {item['num_splats']} Gaussians, {item['num_completed']} where no view saw it"
+        for key, item in record.get("objects", {}).items()
+        if item.get("num_completed")
+    ]
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     lines += _view_lines(record["views"])
