@@ -11,6 +11,7 @@ from bridge.geometry import se3
 from twin.robot.posture import Posture
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose
+from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
 from twin.scene.robot.splats import posed, read_links
 from twin.scene.store.folder import SCENE_FILE, Scene
 
@@ -29,6 +30,8 @@ class MovableScene:
     links: Mapping[str, GaussianCloud]
     T_root_base: Float[np.ndarray, "4 4"]
     """The robot's base in the scene's frame."""
+    lighting: Lighting = EVEN
+    """On the links."""
 
     def at(
         self,
@@ -59,7 +62,13 @@ class MovableScene:
             own = bent[name] if name in bent else moved_cloud(item.cloud, placed[name])
             parts.append(own)
         if posture is not None and self.links:
-            robot = posed(self.links, posture.joints_rad, urdf, width_m=posture.width_m)
+            robot = posed(
+                self.links,
+                posture.joints_rad,
+                urdf,
+                width_m=posture.width_m,
+                lighting=self.lighting,
+            )
             parts.append(moved_cloud(robot, self.T_root_base))
         return concatenate(parts)
 
@@ -100,4 +109,5 @@ def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
         objects=read_objects(run, scene.record),
         links=read_links(run, scene.record),
         T_root_base=se3.invert(T_base_root),
+        lighting=read_lighting(scene.record),
     )

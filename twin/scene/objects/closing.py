@@ -72,7 +72,8 @@ def closed_object(
     colors, weights = (
         np.stack(rows) for rows in zip(*(look.at(p, normals) for look in looks), strict=True)
     )
-    is_seen, is_own = (weights > 0).any(axis=0), (weights > NEAR_OUTLINE).any(axis=0)
+    most = weights.max(axis=0)
+    is_seen, is_own = most > 0, most > NEAR_OUTLINE
     if not is_seen.any():
         return None
     known = is_own if is_own.any() else is_seen
@@ -102,7 +103,8 @@ class _ClosedSurface:
         directions = rays @ T_object_camera[:3, :3].T
         origins = np.broadcast_to(T_object_camera[:3, 3], directions.shape)
         both = np.concatenate([origins, directions], axis=-1).astype(np.float32)
-        found = self._scene.cast_rays(open3d.core.Tensor(np.ascontiguousarray(both)))
+        tensor: Any = open3d.core.Tensor
+        found = self._scene.cast_rays(tensor(np.ascontiguousarray(both)))
         return found["t_hit"].numpy(), found["primitive_normals"].numpy()
 
 

@@ -5,7 +5,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,7 @@ from twin.scene.raster.rasteriser import RasterConfig, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
-from twin.scene.robot.extraction import DrivenRobot, write_robot
+from twin.scene.robot.extraction import DrivenRobot, LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
@@ -200,7 +200,7 @@ def _hold_out(
     training: TrainingSet,
     fitted: FitResult,
     decomposed: Decomposition,
-    links: Mapping[str, GaussianCloud],
+    links: LitLinks,
     config: RebuildConfig,
     clock: _Clock,
     output: Output,

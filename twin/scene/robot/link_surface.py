@@ -6,16 +6,18 @@ takes the colour of the points near it that face the same way; a side that nobod
 link's own middle colour. A shape that does not fit reality is not used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.on_mesh import WIDER, Triangles, even_points
 from twin.scene.frames.rgbd import PointSet
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.robot.lighting import EVEN, Lighting, Patches, fit_lighting
 from twin.scene.settings import InitialiseConfig
 
 FITS_M = 0.006
@@ -24,6 +26,96 @@ REACH_M = 0.03
 """Colours of points farther away are not the surface's."""
 NEIGHBOURS = 16
 BLUR_M = 0.006
+PATCH_M, PATCH_NEIGHBOURS = 0.012, 4
+"""Pieces of a link's surface whose light is compared between postures, and how many are looked at
+to find the one that a point lies on."""
+FACES_ALIKE = 0.7
+"""Cosine between a measured normal and that of the surface it is of."""
+MOST_WEIGHT = 10
+"""More points on one piece count no more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenLink:
+    """What one frame measured of a link."""
+
+    points: PointSet
+    """In the link's frame."""
+    R_base_link: Float[np.ndarray, "3 3"]
+    """How the link was turned."""
+
+
+def link_lighting(
+    shapes: Mapping[str, Sequence[Triangles]], seen: Mapping[str, Sequence[SeenLink]]
+) -> Lighting:
+    """The light on a robot, from links that were seen turned in several ways.
+
+    Args:
+        shapes: Of the links, in their frames.
+        seen: What was measured of each.
+    """
+    patches: list[Patches] = []
+    first = 0
+    for link, items in sorted(seen.items()):
+        if not shapes.get(link):
+            continue
+        p, normals = even_points(shapes[link], PATCH_M)
+        tree = cKDTree(p)
+        for item in items:
+            piece, is_on = _pieces(item.points, tree, normals)
+            ids, inverse = np.unique(piece[is_on], return_inverse=True)
+            count = np.maximum(np.bincount(inverse, minlength=len(ids)), 1)
+            colors = [
+                np.bincount(inverse, item.points.colors[is_on, k], len(ids)) / count
+                for k in range(3)
+            ]
+            patches.append(
+                Patches(
+                    ids=first + ids,
+                    colors=np.stack(colors, axis=1),
+                    normals=normals[ids] @ item.R_base_link.T,
+                    weights=np.minimum(count, MOST_WEIGHT).astype(np.float64),
+                )
+            )
+        first += len(p)
+    return fit_lighting(patches)
+
+
+def own_colors(
+    shapes: Sequence[Triangles], seen: Sequence[SeenLink], lighting: Lighting
+) -> list[PointSet]:
+    """What was measured of a link with its own colours, as in even light.
+
+    Args:
+        shapes: Of the link, in its frame: measured normals are noisy, theirs are not; may be none.
+        seen: What was measured.
+        lighting: In which it was.
+    """
+    if lighting == EVEN:
+        return [item.points for item in seen]
+    p, normals = even_points(shapes, PATCH_M) if shapes else (np.zeros((1, 3)), np.zeros((1, 3)))
+    tree = cKDTree(p)
+    result = []
+    for item in seen:
+        piece, is_on = _pieces(item.points, tree, normals)
+        facing = np.where(is_on[:, None], normals[piece], item.points.normals)
+        light = lighting.brightness(facing @ item.R_base_link.T)
+        colors = as_float32(item.points.colors / light[:, None])
+        result.append(replace(item.points, colors=colors))
+    return result
+
+
+def _pieces(
+    points: PointSet, tree: cKDTree, normals: Float[np.ndarray, "num_pieces 3"]
+) -> tuple[Int[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+    """The piece of surface each point lies on, and whether it does."""
+    count = min(PATCH_NEIGHBOURS, tree.n)
+    distance, ids = tree.query(points.p_m, k=count)
+    distance, ids = distance.reshape(-1, count), ids.reshape(-1, count)
+    alike = np.einsum("pkc,pc->pk", normals[ids], points.normals)
+    rows, best = np.arange(len(ids)), alike.argmax(axis=1)
+    is_on = (alike[rows, best] > FACES_ALIKE) & (distance[rows, best] < 2 * PATCH_M)
+    return ids[rows, best], is_on
 
 
 def on_surface(
@@ -45,12 +137,18 @@ def on_surface(
         np.concatenate([getattr(item, name) for item in sets])
         for name in ("p_m", "normals", "colors")
     )
-    away_m, _ = cKDTree(p).query(seen_m)
-    if np.median(away_m) > FITS_M + spacing_m / 2:
+    if not _fits(p, seen_m, spacing_m):
         return None
     colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
     sizes = np.full(len(p), WIDER * spacing_m)
     return flat_gaussians(p, normals, colors, sizes, config)
+
+
+def _fits(
+    p: Float[np.ndarray, "num_points 3"], seen_m: Float[np.ndarray, "num_seen 3"], spacing_m: float
+) -> bool:
+    away_m, _ = cKDTree(p).query(seen_m)
+    return bool(np.median(away_m) <= FITS_M + spacing_m / 2)
 
 
 def _colors(
