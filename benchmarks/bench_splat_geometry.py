@@ -113,9 +113,10 @@ def rows_of(name: str, run: RunFolder) -> list[Target]:
         rows += [
             Target(what=f"{name}: {kind} found off by", measured=worst, limit=LIMITS[kind],
                    unit=UNITS[kind],
-                   reference=f"worst of {len(same)} of {len(wanted)}; the recording's own {own:+.2f}"),
-            Target(what=f"{name}: {kind} errors that nobody is told of", measured=float(len(silent)),
-                   limit=0.0, reference=", ".join(silent) or f"of {len(wanted)}"),
+                   reference=f"worst of {len(same)} of {len(wanted)}; its own {own:+.2f}"),
+            Target(what=f"{name}: {kind} errors not told",
+                   measured=float(len(silent)), limit=0.0,
+                   reference=", ".join(silent) or f"of {len(wanted)}"),
         ]  # fmt: skip
     return rows
 

@@ -234,6 +234,9 @@ def _view_lines(views: Mapping[str, Any]) -> list[str]:
         line = f"{what} ({count}): PSNR {raw:.2f} dB raw, {gain:.2f} dB with a gain per channel"
         if views[f"static_psnr_db{ending}"] is not None:
             line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
+        if views.get(f"seen_psnr_db{ending}") is not None:
+            share = 100 * views[f"seen_fraction{ending}"]
+            line += f", {views[f'seen_psnr_db{ending}']:.2f} dB in the {share:.0f} % that was seen"
         line += f"; SSIM {views[f'ssim{ending}']:.3f}"
         for name in ("median", "mean"):
             value = views.get(f"depth_{name}_abs_m{ending}")  # older scenes have no median
