@@ -87,12 +87,14 @@ def read_training_set(
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
-    report = check_scan(read.cameras, config.frames)
-    report, corrected = check_geometry(read.cameras, report, config.frames)
+    before = check_scan(read.cameras, config.frames)
+    report, corrected = check_geometry(read.cameras, before, config.frames)
     if any(new is not old for new, old in zip(corrected, choices, strict=True)):
         choices, robot = corrected, find_robot(corrected, output)
         read = _read(choices, config, robot, output)
-        report = replace(report, poses=check_scan(read.cameras, config.frames).poses)
+        again = check_scan(read.cameras, config.frames)
+        remarks = [remark for remark in report.found if remark not in before.found]
+        report = replace(again, found=(*again.found, *remarks))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), stride)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
