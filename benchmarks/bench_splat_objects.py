@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, report_targets
 
-from twin.scene.objects.assignment import assign_splats
+from twin.scene.objects.assignment import assign_splats, object_poses
 
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)
@@ -110,20 +110,23 @@ def scanned(task_names: Sequence[str], seeds: Sequence[int]) -> list[Target]:
     scores: dict[str, list[scan_objects.ShapeScore | None]] = {}
     foreign: dict[str, list[float]] = {}
     missed: dict[str, list[float]] = {}
+    turned: dict[str, list[scan_objects.TurnedScore | None]] = {}
     for task_name, seed in product(task_names, seeds):
         scan = scan_objects.take_scan(task_name, seed)
         owner = scan_objects.true_owners(scan)
-        given = assign_splats(scan.cloud, scan.poses, scan.start.task, shapes_in(scan.shapes))
+        places = object_poses(scan.cloud, scan.localised, scan.start.task)
+        given = assign_splats(scan.cloud, places, scan.start.task, shapes_in(scan.shapes))
         for key in scan.start.task.objects:
             name = key.split("_")[0]
             scores.setdefault(name, []).append(scan_objects.score_shape(scan, key))
+            turned.setdefault(name, []).append(scan_objects.score_turned(scan, key))
             if key not in scan.poses:
                 continue
             index = list(scan.poses).index(key)
             mine, true = given == index, owner == index
             foreign.setdefault(name, []).append(float((mine & ~true).sum() / max(mine.sum(), 1)))
             missed.setdefault(name, []).append(float((true & ~mine).sum() / max(true.sum(), 1)))
-    rows = []
+    rows = turned_rows(turned)
     for name, found in scores.items():
         rows += scan_rows(name, found)
         for what, shares in (
@@ -132,6 +135,24 @@ def scanned(task_names: Sequence[str], seeds: Sequence[int]) -> list[Target]:
         ):
             share = 100 * float(np.median(shares.get(name, [np.inf])))
             rows.append(Target(what=f"scanned {name}: {what}", measured=share, limit=5.0, unit="%"))
+    return rows
+
+
+def turned_rows(turned: Mapping[str, Sequence[Any]]) -> list[Target]:
+    """The table's lines for objects turned over; the worst scan counts."""
+    rows = []
+    for name, scores in turned.items():
+        found = [score for score in scores if score is not None]
+        for what, limit, unit, value in (
+            ("see-through pixels", 1.0, "%", lambda score: 100 * score.see_through),
+            ("colour of seen sides off by", 6.0, "/255", lambda score: score.seen_error),
+            ("colour of hidden sides off by", 6.0, "/255", lambda score: score.hidden_error),
+        ):
+            worst = max((value(score) for score in found), default=float("inf"))
+            rows.append(
+                Target(what=f"{name} turned over: {what}", measured=worst, limit=limit, unit=unit,
+                       reference=f"worst of {len(found)} of {len(scores)} scans")
+            )  # fmt: skip
     return rows
 
 

@@ -15,7 +15,6 @@ from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import ObjectSplats
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, available_isas
 from twin.scene.sequence import Artist, Frame
-from twin.scene.store.folder import Scene
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
@@ -185,9 +184,10 @@ def of_a_sequence(repeats: int) -> Target:
     """A frame of ``render --episode``: background, two objects and eight links, put together."""
     links = {name: surface_cloud(SMALL, 1500) for name in LINKS}
     thing = ObjectSplats(cloud=surface_cloud(SMALL, 1500), T_base_object=np.eye(4))
-    background = surface_cloud(VGA, COUNTS[0])
+    seen = surface_cloud(VGA, COUNTS[0] - 3000)
+    guessed = surface_cloud(VGA, 3000).as_completed()
     parts = MovableScene(
-        background=background,
+        background=concatenate([seen, guessed]),
         objects={"first": thing, "second": thing},
         links=links,
         T_root_base=np.eye(4),
@@ -197,7 +197,6 @@ def of_a_sequence(repeats: int) -> Target:
         parts=parts,
         urdf=ROBOT.urdf_text(),
         camera=VGA,
-        scene=Scene(record={"background": {"num_completed": 3000}}, background=background),
     )
     posture = Posture(joints_rad=np.full(len(ROBOT.joints), 0.4), width_m=0.04)
     frame = Frame(

@@ -1,12 +1,16 @@
 """A scan of the stand-in cell taken apart as ``rebuild`` does it, with the truth beside it."""
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from localise_cell import Start, look_around
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
+from bridge.geometry.camera import Camera
 from bridge.task.meshes.catalogue import object_mesh
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import fit
@@ -14,8 +18,8 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, trai
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.assignment import object_poses
-from twin.scene.objects.decompose import SceneParts, shape_mesh, split_objects
+from twin.scene.objects.decompose import SceneParts, closed_parts, shape_mesh, split_objects
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.shape.from_training import shapes_of
 from twin.scene.shape.mesh import volume_m3
@@ -26,6 +30,7 @@ GRIPPER_M = 0.28
 """The gripper hangs into the wrist camera's frames nearer than this; ``rebuild`` knows it by the
 joints."""
 STRIDE = 2
+TURNED = Camera(width=160, height=160, fx=200.0, fy=200.0, cx=80.0, cy=80.0)
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
@@ -41,8 +46,9 @@ class Scanned:
     shapes: dict[str, ObjectShape | str]
 
     def apart(self) -> SceneParts:
-        """Objects cut out along their shapes."""
-        return split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
+        """Objects cut out along their shapes, and closed."""
+        parts = split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
+        return closed_parts(parts, self.poses, self.shapes, self.views, InitialiseConfig())
 
 
 def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = False) -> Scanned:
@@ -67,7 +73,9 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     num = LocaliseConfig().max_views
     chosen = [wrist[k] for k in np.linspace(0, len(wrist) - 1, num).round().astype(int)]
     localised = localise_objects([*chosen, *others], start.task)
-    poses = object_poses(cloud, localised, start.task)
+    poses = {
+        k: item.T_base_object for k, item in localised.items() if item.T_base_object is not None
+    }
     return Scanned(
         start=start,
         views=views,
@@ -179,3 +187,72 @@ def true_owners(scan: Scanned) -> np.ndarray:
         owner[away < nearest] = index
         nearest = np.minimum(nearest, away)
     return owner
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnedScore:
+    """How an object looks that is turned over."""
+
+    see_through: float
+    """Share of the pixels of its silhouette that let more than half through, in the worst turn."""
+    seen_error: float
+    """Mean colour over its pixels of a view against the recorded one, worst channel, 0..255; the
+    median over views."""
+    hidden_error: float
+    """Mean colour of what no view saw against that of the nearest surface that was seen."""
+
+
+def score_turned(scan: Scanned, key: str) -> TurnedScore | None:
+    """Turn an object about; None where it was not closed."""
+    shape, parts = scan.shapes.get(key), scan.apart()
+    if not isinstance(shape, ObjectShape) or key not in parts.objects:
+        return None
+    cloud, T = parts.objects[key].cloud, parts.objects[key].T_base_object
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    mesh = (shape.vertices_m, shape.faces)
+    through = []
+    for turn in product((-1, 1), repeat=3):
+        away = 4.0 * float(np.linalg.norm(shape.vertices_m, axis=1).max())
+        T_object_camera = se3.look_at(
+            away * np.array(turn) / np.sqrt(3), np.zeros(3), np.array([0.0, 0.0, 1.0])
+        )
+        inside = np.isfinite(_depth(mesh, T_object_camera, TURNED))
+        alpha = rasteriser.view(cloud, TURNED, T_object_camera).alpha
+        through.append(float((alpha[inside] < 0.5).mean()))
+    placed, errors = moved_cloud(cloud, T), []
+    for view in scan.views:
+        shown = scan_mask(view, mesh, T)
+        if shown.sum() < 100:
+            continue
+        drawn = rasteriser.view(placed, view.full.camera, view.T_base_color).image[shown]
+        recorded = np.moveaxis(view.full.image(), 0, -1)[shown]
+        errors.append(255 * float(np.abs((drawn - recorded).mean(axis=0)).max()))
+    hidden, seen = cloud.completed, np.flatnonzero(~cloud.completed)
+    error = 0.0
+    if hidden.any():
+        _, nearest = cKDTree(cloud.means_m[seen]).query(cloud.means_m[hidden])
+        apart = (cloud.colors[hidden] - cloud.colors[seen[nearest]]).mean(axis=0)
+        error = 255 * float(np.abs(apart).max())
+    return TurnedScore(
+        see_through=max(through), seen_error=float(np.median(errors)), hidden_error=error
+    )
+
+
+def scan_mask(view: TrainingView, mesh: Mesh, T_base_object: np.ndarray) -> np.ndarray:
+    """Pixels two or more inside an object's outline in which its surface was measured."""
+    camera, measured = view.full.camera, view.full.depth_m
+    expected = _depth(mesh, se3.invert(T_base_object) @ view.T_base_color, camera)
+    near = np.abs(measured - np.where(np.isfinite(expected), expected, -1.0)) < 0.01
+    return np.asarray(binary_erosion(near & (measured > 0), iterations=2))
+
+
+def _depth(mesh: Mesh, T_mesh_camera: np.ndarray, camera: Camera) -> np.ndarray:
+    import cast_views
+    import open3d as o3d
+
+    directions = camera.rays() @ T_mesh_camera[:3, :3].T
+    origins = np.broadcast_to(T_mesh_camera[:3, 3], directions.shape)
+    rays = np.concatenate([origins, directions], axis=-1).astype(np.float32)
+    return np.asarray(
+        cast_views.ray_scene([mesh]).cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+    )

@@ -3,11 +3,11 @@
 The file is the one that other splat viewers read (SuperSplat, Rerun).
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
@@ -45,9 +45,14 @@ class GaussianCloud:
     )
     """How colour changes with the direction it is seen along: coefficients of the real spherical
     harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
+    completed: Bool[np.ndarray, " num_splats"] = field(
+        default_factory=lambda: np.zeros(0, dtype=bool)
+    )
+    """Those that stand for what nobody measured: closed holes, undersides, hidden sides. They are
+    drawn like all others."""
 
     def __post_init__(self) -> None:
-        """A cloud made without harmonics has rows of none.
+        """A cloud made without harmonics has rows of none, and one without marks was measured.
 
         Raises:
             TwinError: When there are neither none nor all three of degree 1.
@@ -61,6 +66,8 @@ class GaussianCloud:
         if len(self.harmonics) == 0 and len(self.means_m) > 0:
             none = np.zeros((len(self.means_m), 0, 3), dtype=np.float32)
             object.__setattr__(self, "harmonics", none)
+        if len(self.completed) == 0 and len(self.means_m) > 0:
+            object.__setattr__(self, "completed", np.zeros(len(self.means_m), dtype=bool))
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -73,7 +80,12 @@ class GaussianCloud:
 
     def take(self, index: np.ndarray) -> "GaussianCloud":
         """Select and order Gaussians by a mask or a list of ids."""
-        return GaussianCloud(**{name: as_float32(rows[index]) for name, rows in arrays(self)})
+        chosen = {name: as_float32(rows[index]) for name, rows in arrays(self)}
+        return GaussianCloud(**chosen, completed=self.completed[index])
+
+    def as_completed(self) -> "GaussianCloud":
+        """The same Gaussians, all marked as standing for what nobody measured."""
+        return replace(self, completed=np.ones(len(self), dtype=bool))
 
     def opacities(self) -> Float32[np.ndarray, " num_splats"]:
         """Opacity of each Gaussian at its centre, 0..1."""
@@ -81,11 +93,11 @@ class GaussianCloud:
 
 
 def arrays(cloud: GaussianCloud) -> list[tuple[str, np.ndarray]]:
-    """Return the arrays of a cloud with their names, in the order of the fields.
+    """Return what is drawn of a cloud, arrays with their names, in the order of the fields.
 
-    ``harmonics`` is left out where there are none.
+    ``harmonics`` is left out where there are none, and ``completed`` changes no image.
     """
-    named = [(item.name, getattr(cloud, item.name)) for item in fields(cloud)]
+    named = [(item.name, getattr(cloud, item.name)) for item in fields(cloud)[:-1]]
     return named if cloud.num_harmonics else named[:-1]
 
 
@@ -98,9 +110,10 @@ def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
     """Put clouds one after another; those without harmonics get zeros where others have some."""
     most = max(cloud.num_harmonics for cloud in clouds)
     padded = [with_harmonics(cloud, most) for cloud in clouds]
-    names = [item.name for item in fields(GaussianCloud)]
+    names = [item.name for item in fields(GaussianCloud)[:-1]]
     return GaussianCloud(
-        **{name: as_float32(np.concatenate([getattr(c, name) for c in padded])) for name in names}
+        **{name: as_float32(np.concatenate([getattr(c, name) for c in padded])) for name in names},
+        completed=np.concatenate([c.completed for c in padded]),
     )
 
 
@@ -114,7 +127,7 @@ def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> Gaus
     kept = min(num_harmonics, cloud.num_harmonics)
     harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
     harmonics[:, :kept] = cloud.harmonics[:, :kept]
-    return GaussianCloud(**(dict(arrays(cloud)) | {"harmonics": harmonics}))
+    return replace(cloud, harmonics=harmonics)
 
 
 def harmonic_basis(
@@ -189,12 +202,10 @@ def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> Ga
         ],
         axis=1,
     )
-    return GaussianCloud(
+    return replace(
+        cloud,
         means_m=as_float32(se3.apply(T_new_old, cloud.means_m.astype(np.float64))),
         quats_wxyz=as_float32(quats),
-        scales_log=cloud.scales_log,
-        opacities_logit=cloud.opacities_logit,
-        colors=cloud.colors,
         harmonics=turned_harmonics(cloud.harmonics, T_new_old[:3, :3]),
     )
 
@@ -207,6 +218,8 @@ COLUMNS = (
 )
 REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_FIRST))
 """Harmonics of degree 1: all of red, then green, then blue. Written only where there are any."""
+COMPLETED_COLUMN = "completed"
+"""1 where nobody measured what a Gaussian stands for; written only where there are any."""
 REST_COUNTS = (9, 24, 45)
 MAX_SPLATS = 50_000_000
 
@@ -222,7 +235,8 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
     spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them.
-    Metres, in the frame that ``scene.json`` names.
+    Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1, where some
+    are; other viewers pass it over.
 
     Args:
         path: Of the PLY file; one that is there is replaced.
@@ -238,6 +252,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
             cloud.opacities_logit[:, None],
             cloud.scales_log,
             quats,
+            *([cloud.completed[:, None]] if cloud.completed.any() else []),
         ],
         axis=1,
     ).astype("<f4")
@@ -281,13 +296,17 @@ def read_ply(path: Path) -> GaussianCloud:
         opacities_logit=columns("opacity")[:, 0].copy(),
         colors=as_float32(columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DC) + 0.5),
         harmonics=_harmonics(names, table),
+        completed=table[:, names.index(COMPLETED_COLUMN)] > 0.5
+        if COMPLETED_COLUMN in names
+        else np.zeros(count, dtype=bool),
     )
 
 
 def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
     after_color = COLUMNS.index("f_dc_2") + 1
     rest = REST_COLUMNS[: 3 * cloud.num_harmonics]
-    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:])
+    marks = (COMPLETED_COLUMN,) if cloud.completed.any() else ()
+    return (*COLUMNS[:after_color], *rest, *COLUMNS[after_color:], *marks)
 
 
 def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:

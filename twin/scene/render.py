@@ -20,7 +20,7 @@ from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.movable_scene import read_movable_scene
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -237,7 +237,7 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         depth_path = path.with_name(f"{path.stem}_depth{path.suffix}")
         depth_path.write_bytes(encode_png(depth_image(view.depth_m)))
         seen_path = path.with_name(f"{path.stem}_seen{path.suffix}")
-        seen = seen_mask(rasteriser, view.alpha, scene, len(composed.cloud))
+        seen = seen_mask(rasteriser, view.alpha, composed.cloud)
         seen_path.write_bytes(encode_png(np.where(seen, np.uint8(255), np.uint8(0))))
         written += [str(depth_path), str(seen_path)]
     return {
@@ -257,23 +257,18 @@ SEEN = 0.5
 def seen_mask(
     rasteriser: Rasteriser | CudaRasteriser,
     alpha: Float32[np.ndarray, "height width"],
-    scene: Scene,
-    num_splats: int,
+    cloud: GaussianCloud,
 ) -> Bool[np.ndarray, "height width"]:
     """Pixels of the image drawn last that show what was measured, and not what was completed.
 
     Args:
-        rasteriser: Drew a cloud that begins with the scene's background.
+        rasteriser: Drew the cloud.
         alpha: Of that image.
-        scene: Its record says how many of the background's last Gaussians nobody measured.
-        num_splats: Gaussians of that cloud.
+        cloud: Knows which of its Gaussians nobody measured.
     """
-    num_completed = int(scene.record["background"].get("num_completed", 0))
-    if num_completed == 0:
+    if not cloud.completed.any():
         return np.asarray(alpha >= SEEN)
-    measured = np.ones((num_splats, 1), dtype=np.float32)
-    last = len(scene.background)
-    measured[last - num_completed : last] = 0.0
+    measured = as_float32(~cloud.completed)[:, None]
     return np.asarray(rasteriser.draw_features(measured)[0] >= SEEN)
 
 

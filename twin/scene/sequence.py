@@ -284,7 +284,6 @@ def render_sequence(
         parts=parts,
         urdf="" if episode.postures is None else episode.postures.urdf,
         camera=sized_camera(info.camera, config.size),
-        scene=scene,
     )
     out = config.out or run.results_dir / f"{episode.shown.path.stem}.{camera_id}.mp4"
     comparison = _Comparison.start(run, episode, parts) if config.compare else None
@@ -373,14 +372,12 @@ class Artist:
     parts: MovableScene
     urdf: str
     camera: Camera
-    scene: Scene
-    """Says what was measured."""
 
     def draw(self, frame: Frame) -> Drawn:
         """Draw the scene as it was at one instant."""
         cloud = self.parts.at(frame.Ts_base_object, frame.posture, self.urdf)
         view = self.rasteriser.view(cloud, self.camera, frame.T_base_camera)
-        seen = seen_mask(self.rasteriser, view.alpha, self.scene, len(cloud))
+        seen = seen_mask(self.rasteriser, view.alpha, cloud)
         return Drawn(image_u8=view.image_u8(), depth_m=view.depth_m, seen_mask=seen)
 
 

@@ -74,6 +74,10 @@ class FrameConfig:
     check_poses: bool = True
     """Refuse poses that fit the depth only when read in another convention, and cameras that move
     while their poses stand still."""
+    correct_geometry: bool = False
+    """Where one number makes the depth of a moving camera agree clearly better (a factor of its
+    depth, its focal length, or how late its poses are), use that number instead of the recorded
+    one. Without this it is said, and refused where the difference is large."""
     align_poses: bool = False
     """Lay the depth of each training frame onto all others before the fit, for rough poses."""
     align_holdout: bool = False

@@ -4,7 +4,7 @@ Each Gaussian blends the rigid motions of its eight nearest nodes. A node's rota
 factor of how its neighbourhood moved; Gaussians keep their size, they only move and turn.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -113,12 +113,10 @@ def pose_cloud(
     harmonics = cloud.harmonics
     if cloud.num_harmonics:
         harmonics = turned_harmonics(harmonics, se3.rotation_from_quaternion(turn))
-    return GaussianCloud(
+    return replace(
+        cloud,
         means_m=as_float32(means),
         quats_wxyz=as_float32(_product(turn, cloud.quats_wxyz.astype(np.float64))),
-        scales_log=cloud.scales_log,
-        opacities_logit=cloud.opacities_logit,
-        colors=cloud.colors,
         harmonics=harmonics,
     )
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.dataset.geometry_search import check_geometry
 from twin.scene.dataset.masks import (
     EgoMask,
     MovingVoxels,
@@ -79,15 +80,23 @@ def read_training_set(
         NoFramesError: When no frame has colour, depth and a pose together.
         NoDepthError: When no depth image holds anything usable.
         PoseConventionError: When the poses fit only if read in another convention.
+        WrongGeometryError: When one number of a camera's geometry is clearly off.
     """
     robot = find_robot(choices, output)
     read = _read(choices, config, robot, output)
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
+    before = check_scan(read.cameras, config.frames)
+    report, corrected = check_geometry(read.cameras, before, config.frames)
+    if any(new is not old for new, old in zip(corrected, choices, strict=True)):
+        choices, robot = corrected, find_robot(corrected, output)
+        read = _read(choices, config, robot, output)
+        again = check_scan(read.cameras, config.frames)
+        remarks = [remark for remark in report.found if remark not in before.found]
+        report = replace(again, found=(*again.found, *remarks))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     look_closer(robot, choices, limits_of(config), stride)
-    report = check_scan(read.cameras, config.frames)
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
     shares = {read.cameras[index].name: item.share for index, item in ego_masks.items()}
     points, views, choice_of_view = read.points, read.views, read.choice_of_view

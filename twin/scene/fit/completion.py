@@ -5,7 +5,7 @@ starts from depth leaves black holes there. Each pixel of a training view in whi
 shows nothing asks along its ray: which distance looks alike in the other views (a plane sweep,
 Collins 1996), contradicts none of their measurements, and goes on where the surface beside it ends?
 Where no other view helps, the surface beside it decides. No depth loss ever applies to these
-Gaussians. They are kept separate from measured ones, so that renders can say what was seen.
+Gaussians. They are marked as completed, so that renders can say what was seen.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ def complete_holes(
     config: InitialiseConfig,
     raster: RasterConfig | None = None,
 ) -> GaussianCloud:
-    """Gaussians that close the holes of the training views; none where there are no holes.
+    """Gaussians that close the holes of the training views, marked; none without holes.
 
     Args:
         cloud: The fitted scene.
@@ -88,7 +88,7 @@ def complete_holes(
         if hole.mask.any():
             closed = _closed(hole, views, config, most - len(added))
             added = concatenate([added, closed])
-    return added
+    return added.as_completed()
 
 
 def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _Hole:

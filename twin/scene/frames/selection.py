@@ -233,6 +233,8 @@ class FrameChoice:
     """Neither chosen nor held out: the background does not need them, the robot may."""
     corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """``T_new_old`` in the root frame for frames whose pose was improved, by stamp."""
+    focal_scale: float = 1.0
+    """True focal length divided by the recorded one, of both images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -484,6 +486,12 @@ def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
 def _corrected(frame: RgbdFrame, choice: FrameChoice) -> RgbdFrame:
     if choice.poses.depth_scale != 1.0:
         frame = replace(frame, depth_m=frame.depth_m * choice.poses.depth_scale)
+    if choice.focal_scale != 1.0:
+        color, depth = (
+            replace(each, fx=each.fx * choice.focal_scale, fy=each.fy * choice.focal_scale)
+            for each in (frame.color_camera, frame.depth_camera)
+        )
+        frame = replace(frame, color_camera=color, depth_camera=depth)
     T_new_old = choice.corrections.get(frame.stamp_ns)
     if T_new_old is None:
         return frame

@@ -1,15 +1,16 @@
 """Decompose a fitted scene into background and objects, and compose it again.
 
-The background plus objects in their own frames: an object can be put anywhere. Gaussians are cut
-along the reconstructed shape (``assign_splats``). The mesh is reconstructed from the views where
-they allow it; otherwise it is the known shape of the task file, and ``shape_source`` says so. Table
+The background plus objects in their own frames: an object can be put anywhere. The mesh is
+reconstructed from the views where they allow it; otherwise it is the known shape of the task file,
+and ``shape_source`` says so. Gaussians are cut along the reconstructed shape (``assign_splats``)
+out of the background, and the object's own are set anew on its mesh, all around it. Table
 under the objects that nobody saw is filled with the distance-weighted mean of the table around: a
 guess that keeps renders free of black holes, counted separately in ``scene.json``.
 """
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +48,13 @@ from twin.scene.objects.assignment import (
     hidden_table,
     object_poses,
 )
-from twin.scene.shape.files import MESH, TASK_SHAPE, remove_shape, write_shape
+from twin.scene.objects.closing import closed_object
+from twin.scene.settings import InitialiseConfig
+from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, remove_shape, write_shape
 from twin.scene.shape.from_training import Poses, shapes_of, write_static
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
+from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.folder import UnreadableSceneError
 
 SPACING_M = 0.004
@@ -73,7 +77,8 @@ def fill_footprint(
         T_base_object: Where it stood.
 
     Returns:
-        The filling alone; empty where the table was seen, or where none is around.
+        The filling alone, marked as completed; empty where the table was seen, or where there is
+        none around.
     """
     half = np.array(model.size_m[:2]) / 2 + GROWN_M
     steps = [np.arange(-h, h + SPACING_M / 2, SPACING_M) for h in half]
@@ -100,10 +105,10 @@ def fill_footprint(
         scales_log=as_float32(np.tile(scales, (count, 1))),
         opacities_logit=as_float32(np.full(count, OPACITY_LOGIT)),
         colors=as_float32(colors),
-    )
+    ).as_completed()
 
 
-OBJECT_VERSION = 3
+OBJECT_VERSION = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +117,10 @@ class ObjectSplats:
 
     cloud: GaussianCloud
     T_base_object: Float[np.ndarray, "4 4"]
-    """Where they were in the scene: the localised pose laid onto the Gaussians themselves."""
+    """Where it was scanned: as localised, like in every trial; of objects without a reconstructed
+    shape that pose laid onto the Gaussians themselves."""
+    sdf: SdfGrid | None = None
+    """Distances to its reconstructed surface; None where there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +152,8 @@ def split_objects(
         localised: Where the objects were while it was scanned.
         task: Their shapes and colours.
         config: Settings; the defaults when None.
-        shapes: Reconstructed at ``object_poses``; without one the task's shape decides, which for
-            a toy is the box around it.
+        shapes: Reconstructed, in the frames of the objects; without one the task's shape decides,
+            which for a toy is the box around it.
     """
     config = SplitConfig() if config is None else config
     poses = object_poses(cloud, localised, task, config)
@@ -162,6 +170,33 @@ def split_objects(
     return SceneParts(
         background=background, objects=objects, filling=concatenate([nothing, *filling])
     )
+
+
+def closed_parts(
+    parts: SceneParts,
+    poses: Poses,
+    shapes: Mapping[str, ObjectShape | str],
+    views: Sequence[TrainingView],
+    config: InitialiseConfig,
+) -> SceneParts:
+    """Set the Gaussians of objects with a reconstructed shape anew, on all of its surface.
+
+    Args:
+        parts: As cut out of the scene; objects without such a shape stay as they are.
+        poses: Where the shapes stand.
+        shapes: In the frames of the objects.
+        views: What the scene was fitted to, with the objects' colours.
+        config: The shape of new Gaussians.
+    """
+    objects = dict(parts.objects)
+    for key in parts.objects:
+        shape = shapes.get(key)
+        if isinstance(shape, ObjectShape):
+            mesh = (shape.vertices_m, shape.faces)
+            closed = closed_object(mesh, views, poses[key], config)
+            if closed is not None:
+                objects[key] = ObjectSplats(cloud=closed, T_base_object=poses[key])
+    return replace(parts, objects=objects)
 
 
 def shape_mesh(
@@ -220,6 +255,7 @@ def write_objects(
         record[key] = {
             "folder": f"objects/{key}",
             "num_splats": len(item.cloud),
+            "num_completed": about["num_completed"],
             "T_base_object": about["T_base_object"],
             "shape_source": about["shape_source"],
             "files": {
@@ -257,6 +293,7 @@ def _object_record(
         "fixed": model.fixed,
         "frame": "all files of this folder are in the object frame",
         "num_splats": len(item.cloud),
+        "num_completed": int(item.cloud.completed.sum()),
         "T_base_object": se3.pose_record(item.T_base_object),
         "localisation": localised.to_record(),
     }
@@ -359,6 +396,7 @@ def decompose(
     views: Sequence[TrainingView] = (),
     complete: Complete | None = None,
     output: Output | None = None,
+    initialise: InitialiseConfig | None = None,
 ) -> Decomposition:
     """Cut the tasks' objects out of the scene where the first episode of each task shows them.
 
@@ -369,6 +407,7 @@ def decompose(
         views: What the scene was fitted to; objects are reconstructed from them.
         complete: Asks a shape generator about them; None: nobody is asked.
         output: How to talk; None: say nothing.
+        initialise: The shape of new Gaussians; the defaults when None.
 
     Raises:
         UsageError: When two task files define one object differently, or one is no task.
@@ -392,13 +431,16 @@ def decompose(
                     localised[key] = item
     except GstError as error:
         return Decomposition(background=cloud, remark=f"objects not taken out: {error}")
-    poses = object_poses(cloud, localised, task)
+    poses = {
+        key: item.T_base_object for key, item in localised.items() if item.T_base_object is not None
+    }
     with output.progress("reconstruct objects", len(poses)) as advance:
         shapes = shapes_of(views, task.objects, poses, advance=advance)
     asked = Completed(shapes=shapes, record={})
     if complete is not None:
         asked = complete(views, task.objects, poses, shapes)
     parts = split_objects(cloud, localised, task, shapes=asked.shapes)
+    parts = closed_parts(parts, poses, asked.shapes, views, initialise or InitialiseConfig())
     missing = {key: item.reason for key, item in localised.items() if not item.found}
     remarks = [f"{key} not found: {reason}" for key, reason in missing.items()]
     remark = "; ".join([*tasks.missing, *remarks])
@@ -437,14 +479,17 @@ def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectS
     Raises:
         PathNotFoundError: When a splat file is gone.
         UnreadablePlyError: When one is damaged.
+        UnreadableArraysError: When distances are damaged.
         UnreadableSceneError: When ``scene.json`` or ``object.json`` cannot be understood.
     """
     objects = {}
     for key in record.get("objects", {}):
         folder = run.scene_dir / "objects" / check_episode_id(key)
+        has_sdf = SDF in record["objects"][key].get("files", {})
         objects[key] = ObjectSplats(
             cloud=read_ply(folder / "gaussians.ply"),
             T_base_object=_read_pose(folder / "object.json"),
+            sdf=SdfGrid.load(folder / SDF) if has_sdf else None,
         )
     return objects
 

@@ -70,7 +70,7 @@ def make_record(
         fitted: The cloud, and what fitting it took.
         views: Numbers of the held-out views.
         num_background: Gaussians that belong to no object.
-        num_completed: The last of them, which stand for what nobody measured.
+        num_completed: Those of them that stand for what nobody measured.
         cost: Of the whole rebuild.
     """
     settings = asdict(config)
@@ -197,6 +197,11 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         f"{item['holdout_frames']} held out; poses from {SAYS[item['poses_from']]}"
         for item in record["cameras"]
     ]
+    lines += [
+        f"{key}: {item['num_splats']} Gaussians, {item['num_completed']} where no view saw it"
+        for key, item in record.get("objects", {}).items()
+        if item.get("num_completed")
+    ]
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     lines += _view_lines(record["views"])
@@ -229,6 +234,9 @@ def _view_lines(views: Mapping[str, Any]) -> list[str]:
         line = f"{what} ({count}): PSNR {raw:.2f} dB raw, {gain:.2f} dB with a gain per channel"
         if views[f"static_psnr_db{ending}"] is not None:
             line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
+        if views.get(f"seen_psnr_db{ending}") is not None:
+            share = 100 * views[f"seen_fraction{ending}"]
+            line += f", {views[f'seen_psnr_db{ending}']:.2f} dB in the {share:.0f} % that was seen"
         line += f"; SSIM {views[f'ssim{ending}']:.3f}"
         for name in ("median", "mean"):
             value = views.get(f"depth_{name}_abs_m{ending}")  # older scenes have no median

@@ -5,7 +5,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,7 @@ from twin.scene.raster.rasteriser import RasterConfig, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
-from twin.scene.robot.extraction import DrivenRobot, write_robot
+from twin.scene.robot.extraction import DrivenRobot, LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import (
@@ -54,7 +54,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 21
+METHOD_VERSION = 22
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -128,7 +128,13 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
     decomposed = decompose(
-        sources, fitted.cloud, training.choices, training.views, complete, output
+        sources,
+        fitted.cloud,
+        training.choices,
+        training.views,
+        complete,
+        output,
+        config.initialise,
     )
     if decomposed.remark:
         output.say(decomposed.remark)
@@ -150,7 +156,6 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
-        num_completed=len(completed),
     )
     clock.end("objects_and_semantics")
     record = make_record(
@@ -163,7 +168,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         fitted=fitted,
         views=views,
         num_background=len(decomposed.background),
-        num_completed=len(completed),
+        num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
     record |= extras
@@ -195,7 +200,7 @@ def _hold_out(
     training: TrainingSet,
     fitted: FitResult,
     decomposed: Decomposition,
-    links: Mapping[str, GaussianCloud],
+    links: LitLinks,
     config: RebuildConfig,
     clock: _Clock,
     output: Output,

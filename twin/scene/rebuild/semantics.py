@@ -44,7 +44,6 @@ def add_semantics(
     features: SceneFeatures | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
-    num_completed: int = 0,
     threads: int = 0,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, Any]:
@@ -54,7 +53,8 @@ def add_semantics(
 
     Args:
         folder: The scene folder.
-        background: What ``background.ply`` holds.
+        background: What ``background.ply`` holds. Those that nobody measured are guessed surfaces:
+            without masks no thing is looked for in them.
         objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned; without
             masks each is an instance of that name.
         viewpoints: Training frames, to count in how many an instance shows.
@@ -63,8 +63,6 @@ def add_semantics(
         robot_m: Points on the robot where it stood, to leave it out.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
-        num_completed: The background's last Gaussians, which nobody measured: they are guessed
-            surfaces, and without masks no thing is looked for in them.
         threads: For drawing; 0: all cores.
         advance: Told the percentage done.
 
@@ -82,7 +80,7 @@ def add_semantics(
             sizes = list(rows.values())
             known = {key: np.repeat([name == key for name in rows], sizes) for key in objects}
             measured = np.ones(len(cloud), dtype=bool)
-            measured[len(background) - num_completed : len(background)] = False
+            measured[: len(background)] = ~background.completed
             scene = scene_by_default(
                 cloud.take(measured),
                 viewpoints[::step],
@@ -195,7 +193,6 @@ def write_scene_semantics(
     models: ModelConfig | None = None,
     choices: Sequence[FrameChoice] = (),
     task: Task | None = None,
-    num_completed: int = 0,
 ) -> dict[str, Any]:
     """Say what is what in a decomposed scene.
 
@@ -208,7 +205,6 @@ def write_scene_semantics(
         models: Large models to ask beside the default segmenter; None: none.
         choices: Training frames that these look at.
         task: Names what they look for.
-        num_completed: The background's last Gaussians, which nobody measured.
 
     Returns:
         ``{"semantics": ...}`` for ``scene.json``.
@@ -231,7 +227,6 @@ def write_scene_semantics(
             masks=found.masks,
             features=found.features,
             surfaces_m=decomposed.surfaces_m(),
-            num_completed=num_completed,
             threads=threads,
             advance=advance,
         )

@@ -34,17 +34,19 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, trai
 from twin.scene.frames.selection import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
+from twin.scene.render import seen_mask
 from twin.scene.robot.extraction import DrivenRobot
 
 VIEWS_NOTE = (
     "held out from initialisation, poses, exposure, fit and objects; means of the images' values; "
     "native resolution; raw: no colour alignment; gain_: one factor per image and channel, fitted "
-    "to the recorded image; static_: without pixels that show something that moved; the "
+    "to the recorded image; static_: without pixels that show something that moved; "
+    "seen_: only pixels that show what was measured in the scan, not what was completed; the "
     "evaluator computes the official numbers from the views episode"
 )
 MOST_DB = 100.0
 AVERAGED = (
-    *("psnr_db", "static_psnr_db", "gain_psnr_db", "ssim"),
+    *("psnr_db", "static_psnr_db", "seen_psnr_db", "seen_fraction", "gain_psnr_db", "ssim"),
     *("depth_mean_abs_m", "depth_median_abs_m"),
 )
 
@@ -64,6 +66,10 @@ class ViewNumbers:
     """Over the pixels that show nothing that moved; None when there are none."""
     static_fraction: float
     """Share of those pixels."""
+    seen_psnr_db: float | None
+    """Over the pixels that show what was measured in the scan, and not what was completed."""
+    seen_fraction: float
+    """Share of those pixels."""
     gain_psnr_db: float
     """Over the whole image, each channel brightened by the factor that fits best."""
     ssim: float
@@ -81,6 +87,7 @@ def rate_view(
     recorded: TrainingView,
     view: View,
     static_mask: Bool[np.ndarray, "height width"],
+    seen: Bool[np.ndarray, "height width"],
     *,
     episode: str,
     stationary: bool,
@@ -92,6 +99,7 @@ def rate_view(
         recorded: The same frame as the fit would have seen it; gives depth.
         view: What was rendered from the same pose.
         static_mask: True where nothing moved.
+        seen: True where the view shows what was measured, and not what was completed.
         episode: Id of the recorded episode.
         stationary: The camera stands still.
     """
@@ -107,6 +115,8 @@ def rate_view(
         psnr_db=finite_psnr_db(wanted, rendered),
         static_psnr_db=finite_psnr_db(wanted, rendered, static_mask) if static_mask.any() else None,
         static_fraction=float(static_mask.mean()),
+        seen_psnr_db=finite_psnr_db(wanted, rendered, seen) if seen.any() else None,
+        seen_fraction=float(seen.mean()),
         gain_psnr_db=finite_psnr_db(wanted, aligned(frame.image_u8, rendered_u8, "gain")),
         ssim=ssim(wanted, rendered, padding="zero"),
         depth_mean_abs_m=float(difference.mean()) if both.any() else None,
@@ -218,6 +228,8 @@ class HeldOutViews:
     recorded: TrainingView
     """The frame with what moved masked; nothing is trained on it."""
     view: View
+    seen_mask: Bool[np.ndarray, "height width"]
+    """Where the view shows what was measured in the scan."""
     masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
     aligned_u8: np.ndarray | None = None
 
@@ -261,6 +273,7 @@ def write_views(
                             item.recorded,
                             item.view,
                             item.masks["static"],
+                            item.seen_mask,
                             episode=choice.episode.info.id,
                             stationary=choice.stationary,
                         )
@@ -276,6 +289,8 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         if job.robot is not None:
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
         recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
+        view = rasteriser.view(cloud, camera, T)
+        seen = seen_mask(rasteriser, view.alpha, cloud)
         masks = {"static": recorded.full.static_mask}
         if job.marked is not None:
             planes = rasteriser.draw_planes(job.marked, camera, T)
@@ -289,7 +304,8 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
             choice=choice,
             frame=frame,
             recorded=recorded,
-            view=rasteriser.view(cloud, camera, T),
+            view=view,
+            seen_mask=seen,
             masks=masks,
             aligned_u8=aligned,
         )

@@ -21,14 +21,16 @@ from bridge.geometry.camera import Camera
 from bridge.terminal import Output
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, distinct_postures, posture_track
-from twin.robot.surface import LinkSurface, PosedSurface, link_poses, link_surfaces
+from twin.robot.surface import PosedSurface, link_poses, link_surfaces
 from twin.scene.align.align import Alignment, align_robot
 from twin.scene.align.view import RobotView
 from twin.scene.fit.initialise import NoSurfaceError, fuse
+from twin.scene.fit.on_mesh import Triangles, surface_area_m2
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView
 from twin.scene.frames.selection import FrameChoice, load, root_frame, spread
 from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
-from twin.scene.robot.link_surface import on_surface, surface_area_m2
+from twin.scene.robot.lighting import EVEN, Lighting
+from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.robot.splats import posed, surface_links, write_links
 from twin.scene.settings import InitialiseConfig
 
@@ -46,6 +48,16 @@ ROBOT_SHARE = 0.25
 class _Tracked:
     robot: RobotModel
     track: PostureTrack
+
+
+@dataclass(frozen=True, kw_only=True)
+class LitLinks:
+    """The robot's links as Gaussians."""
+
+    clouds: Mapping[str, GaussianCloud] = field(default_factory=dict)
+    """Each in its link's frame and its own colours."""
+    lighting: Lighting = EVEN
+    """Makes of them the colours that a camera sees."""
 
 
 class RobotFrames:
@@ -76,7 +88,7 @@ class RobotFrames:
             self._tracked[str(episode.path)] = _Tracked(robot=robot, track=track)
         self.remark = "; ".join(remarks)
         """Why the robot is not told apart in some episodes; empty when it is in all."""
-        self._points: dict[str, list[PointSet]] = {}
+        self._seen: dict[str, list[SeenLink]] = {}
 
     def knows(self, episode: Episode) -> bool:
         """Say whether joints tell where the robot is in the frames of an episode."""
@@ -157,21 +169,24 @@ class RobotFrames:
                     p_m=as_float32(se3.apply(T_link_root, own.p_m.astype(np.float64))),
                     normals=as_float32(own.normals @ T_link_root[:3, :3].T),
                 )
-                self._points.setdefault(link, []).append(moved)
+                seen = SeenLink(points=moved, R_base_link=poses[link][:3, :3])
+                self._seen.setdefault(link, []).append(seen)
         return owner
 
-    def links(self, config: InitialiseConfig) -> dict[str, GaussianCloud]:
-        """Gaussians of each link that was seen, in the link's frame.
+    def links(self, config: InitialiseConfig) -> LitLinks:
+        """Gaussians of each link that was seen, in the link's frame, and the light on them.
 
         They lie on the shapes of the description where these fit what was measured; else what was
         measured is fused.
         """
-        total = sum(len(item.p_m) for sets in self._points.values() for item in sets)
+        total = sum(len(item.points.p_m) for seen in self._seen.values() for item in seen)
         clouds = {}
         shapes = self._shapes()
-        area_m2 = sum(surface_area_m2(shapes.get(link, [])) for link in self._points)
+        lighting = link_lighting(shapes, self._seen)
+        area_m2 = sum(surface_area_m2(shapes.get(link, [])) for link in self._seen)
         spacing_m = float(np.sqrt(area_m2 / (ROBOT_SHARE * config.max_splats)))
-        for link, sets in sorted(self._points.items()):
+        for link, seen in sorted(self._seen.items()):
+            sets = own_colors(shapes.get(link, []), seen, lighting)
             count = sum(len(item.p_m) for item in sets)
             if count < MIN_POINTS:
                 continue
@@ -185,22 +200,22 @@ class RobotFrames:
                 clouds[link] = fuse(sets, replace(config, max_splats=budget))
             except NoSurfaceError:
                 continue
-        return clouds
+        return LitLinks(clouds=clouds, lighting=lighting)
 
-    def _shapes(self) -> dict[str, list[LinkSurface]]:
+    def _shapes(self) -> dict[str, list[Triangles]]:
         """Shapes of the links by name, where all episodes have one description."""
         robots = {tracked.robot for tracked in self._tracked.values()}
         if len(robots) != 1:
             return {}
-        shapes: dict[str, list[LinkSurface]] = {}
+        shapes: dict[str, list[Triangles]] = {}
         for item in link_surfaces(next(iter(robots))):
-            shapes.setdefault(item.link, []).append(item)
+            shapes.setdefault(item.link, []).append((item.vertices_m, item.triangles))
         return shapes
 
     def joined(
         self,
         cloud: GaussianCloud,
-        links: Mapping[str, GaussianCloud],
+        links: LitLinks,
         episode: Episode,
         stamp_ns: int,
     ) -> GaussianCloud:
@@ -208,15 +223,21 @@ class RobotFrames:
 
         Args:
             cloud: The scene, in the frames' root.
-            links: Per link its Gaussians, in the link's frame.
+            links: As ``links`` gives them.
             episode: Whose joints count.
             stamp_ns: When.
         """
         tracked = self._tracked.get(str(episode.path))
-        if tracked is None or not links or not tracked.track.covers(stamp_ns):
+        if tracked is None or not links.clouds or not tracked.track.covers(stamp_ns):
             return cloud
         posture = tracked.track.at(stamp_ns)
-        robot = posed(links, posture.joints_rad, tracked.track.urdf, width_m=posture.width_m)
+        robot = posed(
+            links.clouds,
+            posture.joints_rad,
+            tracked.track.urdf,
+            width_m=posture.width_m,
+            lighting=links.lighting,
+        )
         return concatenate([cloud, moved_cloud(robot, se3.invert(self.T_base_root))])
 
 
@@ -260,7 +281,7 @@ class DrivenRobot:
     """Links that stand where the joints of an episode put them."""
 
     frames: RobotFrames
-    links: Mapping[str, GaussianCloud] = field(default_factory=dict)
+    links: LitLinks = field(default_factory=LitLinks)
 
     def joined(self, cloud: GaussianCloud, episode: Episode, stamp_ns: int) -> GaussianCloud:
         """The scene with the robot in it as it stood at an instant."""
@@ -333,17 +354,19 @@ def _aligned(choices: Sequence[FrameChoice]) -> Alignment:
     return align_robot(views, load_robot(track.urdf))
 
 
-def write_robot(
-    run: RunFolder, found: FoundRobot, links: Mapping[str, GaussianCloud]
-) -> dict[str, Any]:
+def write_robot(run: RunFolder, found: FoundRobot, links: LitLinks) -> dict[str, Any]:
     """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot.
 
     Args:
         run: Whose scene folder is written.
         found: Where the robot is in the scene.
-        links: Gaussians of each link, in its own frame.
+        links: Gaussians of each link, in its own frame, and the light on them.
     """
-    record: dict[str, Any] = {"remark": found.remark, "links": write_links(run, links)}
+    record: dict[str, Any] = {
+        "remark": found.remark,
+        "links": write_links(run, links.clouds),
+        "lighting": links.lighting.to_record(),
+    }
     if found.alignment is not None:
         record["T_base_root"] = se3.pose_record(found.frames.T_base_root)
         record["alignment"] = found.alignment.to_record()

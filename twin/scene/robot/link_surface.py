@@ -6,38 +6,120 @@ takes the colour of the points near it that face the same way; a side that nobod
 link's own middle colour. A shape that does not fit reality is not used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from bridge.geometry.mesh import sample_triangles
-from twin.robot.surface import LinkSurface
 from twin.scene.fit.initialise import flat_gaussians
+from twin.scene.fit.on_mesh import WIDER, Triangles, even_points
 from twin.scene.frames.rgbd import PointSet
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.robot.lighting import EVEN, Lighting, Patches, fit_lighting
 from twin.scene.settings import InitialiseConfig
 
 FITS_M = 0.006
 """Half of the measured points lie nearer to a shape that is the link's."""
-PER_CELL = 12
-"""Samples for each that is kept: nearly every cell of the surface then has one."""
 REACH_M = 0.03
 """Colours of points farther away are not the surface's."""
 NEIGHBOURS = 16
 BLUR_M = 0.006
-WIDER = 1.15
-"""Gaussians are wider than their spacing by this, so that nothing shows through."""
+PATCH_M, PATCH_NEIGHBOURS = 0.012, 4
+"""Pieces of a link's surface whose light is compared between postures, and how many are looked at
+to find the one that a point lies on."""
+FACES_ALIKE = 0.7
+"""Cosine between a measured normal and that of the surface it is of."""
+MOST_WEIGHT = 10
+"""More points on one piece count no more."""
 
 
-def surface_area_m2(surfaces: Sequence[LinkSurface]) -> float:
-    """Area of all triangles of a link."""
-    return float(sum(_areas(item).sum() for item in surfaces))
+@dataclass(frozen=True, kw_only=True)
+class SeenLink:
+    """What one frame measured of a link."""
+
+    points: PointSet
+    """In the link's frame."""
+    R_base_link: Float[np.ndarray, "3 3"]
+    """How the link was turned."""
+
+
+def link_lighting(
+    shapes: Mapping[str, Sequence[Triangles]], seen: Mapping[str, Sequence[SeenLink]]
+) -> Lighting:
+    """The light on a robot, from links that were seen turned in several ways.
+
+    Args:
+        shapes: Of the links, in their frames.
+        seen: What was measured of each.
+    """
+    patches: list[Patches] = []
+    first = 0
+    for link, items in sorted(seen.items()):
+        if not shapes.get(link):
+            continue
+        p, normals = even_points(shapes[link], PATCH_M)
+        tree = cKDTree(p)
+        for item in items:
+            piece, is_on = _pieces(item.points, tree, normals)
+            ids, inverse = np.unique(piece[is_on], return_inverse=True)
+            count = np.maximum(np.bincount(inverse, minlength=len(ids)), 1)
+            colors = [
+                np.bincount(inverse, item.points.colors[is_on, k], len(ids)) / count
+                for k in range(3)
+            ]
+            patches.append(
+                Patches(
+                    ids=first + ids,
+                    colors=np.stack(colors, axis=1),
+                    normals=normals[ids] @ item.R_base_link.T,
+                    weights=np.minimum(count, MOST_WEIGHT).astype(np.float64),
+                )
+            )
+        first += len(p)
+    return fit_lighting(patches)
+
+
+def own_colors(
+    shapes: Sequence[Triangles], seen: Sequence[SeenLink], lighting: Lighting
+) -> list[PointSet]:
+    """What was measured of a link with its own colours, as in even light.
+
+    Args:
+        shapes: Of the link, in its frame: measured normals are noisy, theirs are not; may be none.
+        seen: What was measured.
+        lighting: In which it was.
+    """
+    if lighting == EVEN:
+        return [item.points for item in seen]
+    p, normals = even_points(shapes, PATCH_M) if shapes else (np.zeros((1, 3)), np.zeros((1, 3)))
+    tree = cKDTree(p)
+    result = []
+    for item in seen:
+        piece, is_on = _pieces(item.points, tree, normals)
+        facing = np.where(is_on[:, None], normals[piece], item.points.normals)
+        light = lighting.brightness(facing @ item.R_base_link.T)
+        colors = as_float32(item.points.colors / light[:, None])
+        result.append(replace(item.points, colors=colors))
+    return result
+
+
+def _pieces(
+    points: PointSet, tree: cKDTree, normals: Float[np.ndarray, "num_pieces 3"]
+) -> tuple[Int[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+    """The piece of surface each point lies on, and whether it does."""
+    count = min(PATCH_NEIGHBOURS, tree.n)
+    distance, ids = tree.query(points.p_m, k=count)
+    distance, ids = distance.reshape(-1, count), ids.reshape(-1, count)
+    alike = np.einsum("pkc,pc->pk", normals[ids], points.normals)
+    rows, best = np.arange(len(ids)), alike.argmax(axis=1)
+    is_on = (alike[rows, best] > FACES_ALIKE) & (distance[rows, best] < 2 * PATCH_M)
+    return ids[rows, best], is_on
 
 
 def on_surface(
-    surfaces: Sequence[LinkSurface],
+    shapes: Sequence[Triangles],
     sets: Sequence[PointSet],
     spacing_m: float,
     config: InitialiseConfig,
@@ -45,50 +127,28 @@ def on_surface(
     """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured.
 
     Args:
-        surfaces: All shapes of the link.
+        shapes: All shapes of the link.
         sets: What was measured of it, in its frame.
         spacing_m: From one Gaussian to the next.
         config: How flat and how opaque.
     """
-    p, normals = _samples(surfaces, spacing_m)
+    p, normals = even_points(shapes, spacing_m)
     seen_m, seen_normals, seen_colors = (
         np.concatenate([getattr(item, name) for item in sets])
         for name in ("p_m", "normals", "colors")
     )
-    away_m, _ = cKDTree(p).query(seen_m)
-    if np.median(away_m) > FITS_M + spacing_m / 2:
+    if not _fits(p, seen_m, spacing_m):
         return None
     colors = _colors(p, normals, seen_m, seen_normals, seen_colors)
     sizes = np.full(len(p), WIDER * spacing_m)
     return flat_gaussians(p, normals, colors, sizes, config)
 
 
-def _areas(item: LinkSurface) -> Float[np.ndarray, " num_triangles"]:
-    a, b, c = (item.vertices_m[item.triangles[:, k]] for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-
-
-def _samples(
-    surfaces: Sequence[LinkSurface], spacing_m: float
-) -> tuple[Float[np.ndarray, "num_points 3"], Float[np.ndarray, "num_points 3"]]:
-    """One point in each cell of the surface, with its outward normal; the same ones each time."""
-    rng = np.random.default_rng(0)
-    points, normals = [], []
-    for item in surfaces:
-        areas = _areas(item)
-        count = max(int(PER_CELL * areas.sum() / spacing_m**2), 1)
-        chosen, u, v = sample_triangles(areas, count, rng)
-        a, b, c = (item.vertices_m[item.triangles[chosen, k]] for k in range(3))
-        points.append(a + u * (b - a) + v * (c - a))
-        normal = np.cross(b - a, c - a)
-        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-    p, n = np.concatenate(points), np.concatenate(normals)
-    cells = np.floor((p - p.min(axis=0)) / spacing_m).astype(np.int64)
-    facing = (n[np.arange(len(n)), np.abs(n).argmax(axis=1)] > 0).astype(np.int64)
-    axis = np.abs(n).argmax(axis=1)
-    keys = np.column_stack([cells, axis, facing])  # both sides of a thin plate are kept
-    _, first = np.unique(keys, axis=0, return_index=True)
-    return p[np.sort(first)], n[np.sort(first)]
+def _fits(
+    p: Float[np.ndarray, "num_points 3"], seen_m: Float[np.ndarray, "num_seen 3"], spacing_m: float
+) -> bool:
+    away_m, _ = cKDTree(p).query(seen_m)
+    return bool(np.median(away_m) <= FITS_M + spacing_m / 2)
 
 
 def _colors(

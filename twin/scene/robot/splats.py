@@ -16,6 +16,7 @@ from bridge.episode.run_folder import RunFolder, check_episode_id
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.surface import PosedSurface, fixed_links
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
+from twin.scene.robot.lighting import EVEN, Lighting
 
 FOLDER = "robot"
 BOUND_M = 0.015
@@ -30,6 +31,7 @@ def posed(
     urdf: str,
     *,
     width_m: float = 0.0,
+    lighting: Lighting = EVEN,
 ) -> GaussianCloud:
     """Put the Gaussians of all links where forward kinematics puts the links.
 
@@ -38,6 +40,7 @@ def posed(
         joints_rad: Where the arm is to be.
         urdf: The robot's description.
         width_m: Opening of the gripper.
+        lighting: In which the links' own colours are drawn.
 
     Returns:
         One cloud in the base frame, links in the order of the mapping; empty without links.
@@ -50,7 +53,7 @@ def posed(
         moved_cloud(cloud, robot.T_base_link(link, joints_rad, width_m))
         for link, cloud in links.items()
     ]
-    return concatenate(placed) if placed else _empty()
+    return lighting.on(concatenate(placed)) if placed else _empty()
 
 
 def surface_links(

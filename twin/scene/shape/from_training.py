@@ -129,7 +129,7 @@ def masked_view(
     camera = target.camera
     model, T = models[key], Ts_base_object[key]
     reach = float(np.linalg.norm(model.size_m)) + MASK_MARGIN_M
-    rows, columns = _window(camera, se3.invert(view.T_base_color) @ T[:, 3], reach)
+    rows, columns = image_window(camera, se3.invert(view.T_base_color) @ T[:, 3], reach)
     row, column = np.nonzero(depth[rows, columns] > 0)
     row, column = row + rows.start, column + columns.start
     z = depth[row, column].astype(np.float64)
@@ -155,10 +155,16 @@ def masked_view(
     )
 
 
-def _window(
+def image_window(
     camera: Camera, p_camera: Float[np.ndarray, "4"], reach_m: float
 ) -> tuple[slice, slice]:
-    """Rows and columns that can show something within reach of a point; none behind the camera."""
+    """Rows and columns that can show something within reach of a point; none behind the camera.
+
+    Args:
+        camera: Size of the image and intrinsics.
+        p_camera: The point in the camera's frame [m]; homogeneous.
+        reach_m: How far from the point.
+    """
     x, y, z = p_camera[:3]
     if z + reach_m <= 0:
         return slice(0, 0), slice(0, 0)

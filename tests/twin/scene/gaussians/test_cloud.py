@@ -134,3 +134,16 @@ def test_degree_one_is_found_in_files_of_higher_degree(tmp_path: Path, degree: i
         head + names.encode() + b"end_header\n" + wider.astype("<f4").tobytes()
     )
     np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").harmonics, cloud.harmonics)
+
+
+def test_marks_of_what_nobody_measured_go_with_the_gaussians(tmp_path: Path) -> None:
+    plain, guessed = shiny_cloud(4), plain_cloud(3).as_completed()
+    both = moved_cloud(concatenate([plain, guessed]), some_motion())
+    np.testing.assert_array_equal(both.completed, [False] * 4 + [True] * 3)
+    np.testing.assert_array_equal(both.take(np.array([6, 0])).completed, [True, False])
+    assert with_harmonics(both, 0).completed.sum() == 3
+    for cloud in (both, plain):
+        write_ply(tmp_path / "a.ply", cloud)
+        np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").completed, cloud.completed)
+        # A file without guesses has the columns that it always had.
+        assert (b"property float completed" in (tmp_path / "a.ply").read_bytes()) == (cloud is both)

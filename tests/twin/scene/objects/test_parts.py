@@ -1,5 +1,6 @@
 """A scene in parts: reading gives the parts back, and putting together gives the scene."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import read_objects, split_objects, write_objects
+from twin.scene.shape.sdf import SdfGrid
 
 
 def cube_on_table(T_base_cube: np.ndarray) -> GaussianCloud:
@@ -85,3 +87,35 @@ def test_an_object_name_cannot_leave_the_scene_folder(tmp_path: Path) -> None:
 
     with pytest.raises(UsageError, match="not usable as a file name"):
         read_objects(RunFolder(tmp_path), {"objects": {"../../etc": {}}})
+
+
+def test_a_table_just_under_a_closed_object_is_not_drawn_and_one_beside_it_is(
+    written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
+) -> None:
+    run, record, background, T = written
+    cube = read_objects(run, record)["cube"]
+    centres = np.arange(-0.03, 0.0301, 0.001)
+    from_middle = np.abs(np.stack(np.meshgrid(centres, centres, centres, indexing="ij"), axis=-1))
+    sdf = SdfGrid(
+        values_m=(from_middle.max(axis=-1) - 0.02).astype(np.float32),
+        origin_m=np.full(3, -0.03),
+        voxel_m=0.001,
+    )
+    closed = replace(cube, T_base_object=T, sdf=sdf)
+    scene = MovableScene(
+        background=background, objects={"cube": closed}, links={}, T_root_base=np.eye(4)
+    )
+    p = se3.apply(se3.invert(T), background.means_m.astype(np.float64))
+    under = (np.abs(p[:, :2]) < 0.0195).all(axis=1)
+    beside = (np.abs(p[:, :2]) > 0.0205).any(axis=1)
+    added = background.take(np.flatnonzero(beside)[:1])
+    added = replace(added, means_m=as_float32(T[:3, 3][None] - [[0.0, 0.0, 0.026]]))
+    scene = replace(scene, background=concatenate([background, added]))
+    before, drawn = scene.background.opacities(), scene.at({}).opacities()[: len(background) + 1]
+    hidden = drawn < 1e-6
+    assert hidden[-1]  # 6 mm below the cube
+    assert hidden[:-1][under].all()
+    np.testing.assert_array_equal(drawn[:-1][beside], before[:-1][beside])
+    elsewhere = T.copy()
+    elsewhere[:3, 3] += [0.0, 0.2, 0.1]
+    np.testing.assert_array_equal(scene.at({"cube": elsewhere}).opacities()[: len(before)], before)

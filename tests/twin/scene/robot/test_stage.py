@@ -25,7 +25,7 @@ from bridge.robots.default import ARM_JOINTS, ROBOT
 from bridge.terminal import Output
 from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.selection import choose_frames, find_sources
-from twin.scene.robot.extraction import find_robot, write_robot
+from twin.scene.robot.extraction import LitLinks, find_robot, write_robot
 from twin.scene.settings import FrameConfig, InitialiseConfig, RebuildConfig
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "align"))
@@ -92,9 +92,10 @@ def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None
     assert training.robot.alignment is None
     assert training.robot.remark == ""
     links = training.robot.frames.links(InitialiseConfig())
-    assert {"base_link", "upper_arm_link"} <= set(links)
+    assert {"base_link", "upper_arm_link"} <= set(links.clouds)
     record = write_robot(run, training.robot, links)["robot"]
-    assert set(record["links"]) == set(links)
+    assert set(record["links"]) == set(links.clouds)
+    assert len(record["lighting"]["brightness_sh2"]) == 9
     assert "T_base_root" not in record
     assert all((run.scene_dir / item["file"]).is_file() for item in record["links"].values())
 
@@ -109,7 +110,7 @@ def test_in_a_foreign_frame_the_robot_is_found_by_what_it_looks_like(run: RunFol
     change = found.frames.T_base_root @ T_root_base
     assert np.linalg.norm(change[:3, 3]) < 0.003
     assert se3.rotation_angle_rad(change[:3, :3]) < 0.003
-    record = write_robot(run, found, {})["robot"]
+    record = write_robot(run, found, LitLinks())["robot"]
     assert record["alignment"]["yaw_margin"] > 1.3
     np.testing.assert_allclose(record["T_base_root"]["p_m"], found.frames.T_base_root[:3, 3])
 
@@ -121,4 +122,4 @@ def test_without_joints_everything_stays_and_the_record_says_why(run: RunFolder)
     assert found.alignment is None
     assert "joint states" in found.remark
     assert "'room'" in found.remark
-    assert found.frames.links(InitialiseConfig()) == {}
+    assert found.frames.links(InitialiseConfig()).clouds == {}

@@ -116,7 +116,7 @@ def test_the_folder_holds_what_object_json_says(
     for key in POSES:
         folder = tmp_path / "objects" / key
         about = json.loads((folder / "object.json").read_text())
-        assert about["schema_version"] == 3
+        assert about["schema_version"] == 4
         assert about["shape_source"].startswith("reconstructed from 24")
         assert about["geometry"]["watertight"] is True
         assert about["geometry"]["mass_prior"]["material"] == "plastic"

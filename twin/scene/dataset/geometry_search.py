@@ -1,0 +1,305 @@
+"""Which one number of the geometry is wrong: depth scale, focal length, or when poses were taken.
+
+Depth of one image is carried into others while one number is changed and the rest stays as
+recorded. Where much more of it then falls on what the others measured, that number is off, and
+the best value says by how much. Never more than one number is changed: two together explain
+almost anything.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import streams
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.errors import TwinError
+from twin.scene.dataset.scan_check import CLEARLY_BETTER, CameraCheck, ScanReport
+from twin.scene.frames.downscaled import DownscaledDepth, thinned_camera
+from twin.scene.frames.pairing import paired_stamps_ns
+from twin.scene.frames.selection import FrameChoice, spread
+from twin.scene.settings import FrameConfig
+
+FACTORS = np.geomspace(0.4, 2.5, 25)
+"""Depth scales and focal lengths that are tried first."""
+MOST_LATE_FRAMES = 8
+REFINEMENTS = 8
+"""Halvings of the step around the best."""
+GAPS = (1, 2, 4, 8, 16, 32)
+"""Pairs are this many frames apart: far ones say most of scale, near ones of time."""
+MAX_PAIRS = 24
+MAX_COLUMNS = 48
+SIGMA = 0.01
+"""Depths that differ by this share of the distance count exp(-1/2)."""
+LEAST_OVERLAP = 0.15
+"""Of what one image measured, on measurements of the other; readings with less do not count."""
+ENOUGH = 0.9
+"""With this agreement nothing is looked for."""
+LEAST_GAIN = 0.02
+"""A number is wrong when this much more of the depth agrees with another."""
+LEAST_AGREEMENT = 0.35
+"""With less agreement even at the best, one number does not explain it."""
+SMALLEST = {"depth": 0.03, "focal": 0.03, "delay": 0.6}
+"""Deviations below are within what cameras and clocks do; of the delay in frames."""
+
+PoseAt = Callable[[int], Float[np.ndarray, "4 4"]]
+"""``T_base_depth`` of the camera at an instant."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correction:
+    """One number that makes depth agree."""
+
+    kind: str
+    """``depth``, ``focal`` or ``delay``."""
+    value: float
+    """True over recorded: of depth, of focal length; how late the poses are, in nanoseconds."""
+    frames: float
+    """Of the delay, in frames of the camera; else 0."""
+    before: float
+    """How much of the depth agrees as recorded, 0..1."""
+    after: float
+
+    def describe(self) -> str:
+        """What is wrong, with the agreement before and after."""
+        if self.kind == "depth":
+            far = "far" if self.value < 1 else "near"
+            text = f"its depth reads {1 / self.value:.3g} x the true one, too {far}"
+        elif self.kind == "focal":
+            text = f"its focal length is {1 / self.value:.3g} x the true one"
+        else:
+            late = "late" if self.value > 0 else "early"
+            milliseconds = abs(self.value) / 1e6
+            text = f"its poses are {abs(self.frames):.1f} frames {late} ({milliseconds:.0f} ms)"
+        return (
+            f"{text}: of the depth {100 * self.before:.0f} % agrees to about {100 * SIGMA:.0f} % "
+            f"as recorded, {100 * self.after:.0f} % without that"
+        )
+
+
+def search_geometry(
+    images: Sequence[DownscaledDepth], pose_at: PoseAt | None = None, frame_ns: int = 0
+) -> Correction | None:
+    """The one number whose change makes depth agree clearly better, or None.
+
+    Args:
+        images: Small depth images of one moving camera in time order, with poses as recorded.
+        pose_at: Where the camera was at other instants; None: no delay is looked for.
+        frame_ns: Time from one frame of the camera to the next.
+    """
+    pairs = _pairs([_thinned(image) for image in images])
+    if len(pairs) < 3:
+        return None
+    recorded = _agreement(pairs)
+    if recorded >= ENOUGH:
+        return None
+    found = [
+        _best("depth", lambda s: _agreement(pairs, depth=s), recorded),
+        _best("focal", lambda s: _agreement(pairs, focal=s), recorded),
+    ]
+    if pose_at is not None and frame_ns > 0:
+        moved = _Delayed(pairs=pairs, pose_at=pose_at)
+        found.append(_latest(moved.agreement, recorded, frame_ns))
+    best = max(found, key=lambda item: item.after)
+    off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
+    is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
+    return best if is_clear and off >= SMALLEST[best.kind] else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pair:
+    """Points of one image and the depth of another."""
+
+    first: DownscaledDepth
+    second: DownscaledDepth
+
+    def agreement(
+        self, T_second_first: Float[np.ndarray, "4 4"], depth: float, focal: float
+    ) -> tuple[float, float]:
+        """Share of the overlap that agrees, and the overlap."""
+        camera = _with_focal(self.first.camera, focal)
+        z = depth * self.first.depth_m.astype(np.float64)
+        p = se3.apply(T_second_first, camera.unproject(z)[z > 0])
+        front = p[:, 2] > 0.02
+        uv, z_second = camera.project(np.where(front[:, None], p, 1.0))
+        u, v = (np.floor(np.clip(uv[:, k], -1, 1e6)).astype(np.int64) for k in (0, 1))
+        inside = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        measured = depth * self.second.depth_m[v[inside], u[inside]]
+        met = measured > 0
+        if not met.any():
+            return 0.0, 0.0
+        off = z_second[inside][met] / measured[met] - 1.0
+        return float(np.exp(-0.5 * (off / SIGMA) ** 2).mean()), float(met.sum() / len(p))
+
+
+def _agreement(pairs: Sequence[_Pair], depth: float = 1.0, focal: float = 1.0) -> float:
+    return _mean(
+        [
+            pair.agreement(
+                se3.invert(pair.second.T_base_depth) @ pair.first.T_base_depth, depth, focal
+            )
+            for pair in pairs
+        ]
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Delayed:
+    pairs: Sequence[_Pair]
+    pose_at: PoseAt
+
+    def agreement(self, late_ns: float) -> float:
+        """With poses that were stated this much too late."""
+        poses = {
+            image.stamp_ns: self.pose_at(image.stamp_ns + round(late_ns))
+            for pair in self.pairs
+            for image in (pair.first, pair.second)
+        }
+        return _mean(
+            [
+                pair.agreement(
+                    se3.invert(poses[pair.second.stamp_ns]) @ poses[pair.first.stamp_ns], 1.0, 1.0
+                )
+                for pair in self.pairs
+            ]
+        )
+
+
+def _mean(scores: Sequence[tuple[float, float]]) -> float:
+    """Agreement over pairs by their overlap; 0 where views hardly meet."""
+    overlap = float(np.mean([each[1] for each in scores]))
+    if overlap < LEAST_OVERLAP:
+        return 0.0
+    return float(np.average([each[0] for each in scores], weights=[each[1] for each in scores]))
+
+
+def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correction:
+    logs = np.log(FACTORS)
+    at, after = _climbed(logs, lambda x: score(float(np.exp(x))))
+    return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
+
+
+def _latest(score: Callable[[float], float], recorded: float, frame_ns: int) -> Correction:
+    steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
+    at, after = _climbed(steps, lambda frames: score(frames * frame_ns))
+    return Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
+
+
+def _climbed(
+    grid: Float[np.ndarray, " num_steps"], score: Callable[[float], float]
+) -> tuple[float, float]:
+    """The best place: on a grid first, then with ever smaller steps around the best."""
+    scores = [score(float(x)) for x in grid]
+    at, best = float(grid[int(np.argmax(scores))]), max(scores)
+    step = float(grid[1] - grid[0]) / 2
+    for _ in range(REFINEMENTS):
+        for x in (at - step, at + step):
+            found = score(x)
+            if found > best:
+                at, best = x, found
+        step /= 2
+    return at, best
+
+
+def _pairs(images: Sequence[DownscaledDepth]) -> list[_Pair]:
+    """Pairs near in time and farther apart, so that small and large motions count."""
+    pairs = [
+        _Pair(first=images[start], second=images[start + gap])
+        for gap in GAPS
+        for start in range(len(images) - gap)
+        if images[start].depth_m.any() and images[start + gap].depth_m.any()
+    ]
+    return [pairs[index] for index in spread(np.arange(len(pairs)), MAX_PAIRS)]
+
+
+def _thinned(image: DownscaledDepth) -> DownscaledDepth:
+    step = max(1, round(image.camera.width / MAX_COLUMNS))
+    return replace(
+        image, camera=thinned_camera(image.camera, step), depth_m=image.depth_m[::step, ::step]
+    )
+
+
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+class WrongGeometryError(TwinError):
+    """One number of a camera's geometry is off, or nothing makes its depth agree."""
+
+
+def check_geometry(
+    cameras: Sequence[CameraCheck], report: ScanReport, config: FrameConfig
+) -> tuple[ScanReport, list[FrameChoice]]:
+    """Look for a wrong number in each moving camera; refuse, remark, or correct it.
+
+    Args:
+        cameras: What the training frames of each showed.
+        report: Of what was checked before; cameras whose poses are read wrongly are left alone.
+        config: Whether wrong geometry is refused, or corrected.
+
+    Returns:
+        The report with what was found, and the choices, corrected where that was asked for.
+
+    Raises:
+        WrongGeometryError: When depth agrees much better with another number and nobody said what
+            to do; or when correction was asked for and depth agrees under no number.
+    """
+    choices, remarks = [], []
+    for camera in cameras:
+        choice, poses = camera.choice, report.poses.get(camera.name)
+        choices.append(choice)
+        if choice.stationary or poses is None or poses.better is not None:
+            continue
+        images = sorted(camera.images, key=lambda image: image.stamp_ns)
+        found = search_geometry(images, camera_pose_at(choice), frame_ns_of(choice))
+        if found is None and config.correct_geometry and not poses.fits:
+            message = (
+                f"--correct-geometry: {camera.name}: {poses.remark()}; nor does any depth scale, "
+                "focal length or delay of its poses. Use --poses odometry, or record it again."
+            )
+            raise WrongGeometryError(message)
+        if found is None:
+            continue
+        if config.correct_geometry:
+            choices[-1] = corrected(choice, found)
+            remarks.append(f"{camera.name}: {found.describe()}; corrected")
+            continue
+        message = f"{camera.name}: {found.describe()}. Correct it with --correct-geometry"
+        if config.check_poses and found.after >= found.before + CLEARLY_BETTER:
+            raise WrongGeometryError(f"{message}, or insist with --no-check-poses.")
+        remarks.append(message)
+    return replace(report, found=(*report.found, *remarks)), choices
+
+
+def corrected(choice: FrameChoice, found: Correction) -> FrameChoice:
+    """A camera with one number of its geometry changed, in all its frames.
+
+    Args:
+        choice: As recorded.
+        found: From ``search_geometry``.
+    """
+    if found.kind == "depth":
+        scale = choice.poses.depth_scale * found.value
+        return replace(choice, poses=replace(choice.poses, depth_scale=scale))
+    if found.kind == "focal":
+        return replace(choice, focal_scale=choice.focal_scale * found.value)
+    pose_at, late_ns = camera_pose_at(choice), round(found.value)
+    moved = dict(choice.corrections)
+    for stamp_ns in choice.train_ns | choice.holdout_ns | choice.spare_ns:
+        T_new_old = pose_at(stamp_ns + late_ns) @ se3.invert(pose_at(stamp_ns))
+        moved[stamp_ns] = T_new_old @ moved.get(stamp_ns, np.eye(4))
+    return replace(choice, corrections=moved)
+
+
+def camera_pose_at(choice: FrameChoice) -> PoseAt:
+    """Where a choice's poses put its depth camera at any instant."""
+    frame_id = streams.camera_info(choice.episode, choice.camera_id, "depth").frame_id
+    return lambda stamp_ns: choice.poses.tree.T_root_frame(frame_id, stamp_ns)
+
+
+def frame_ns_of(choice: FrameChoice) -> int:
+    """Time from one image of a camera to the next: the median; 0 with fewer than two."""
+    stamps = sorted(paired_stamps_ns(choice.episode, choice.camera_id))
+    return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0

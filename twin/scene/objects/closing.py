@@ -1,0 +1,232 @@
+"""Objects that are closed: Gaussians on all of the reconstructed surface, undersides included.
+
+What a fit leaves of an object is a ragged shell: open where nobody looked, mixed with table where
+object and table touch. Here Gaussians are set evenly on the closed mesh. Each takes the colour it
+shows in the training views, away from the object's outline and from edges, where a camera that
+stands a few millimetres wrong sees something else. What no view shows takes the colour of the
+surface next to it that was seen, and is marked as completed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import open3d
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from twin.scene.fit.initialise import flat_gaussians
+from twin.scene.fit.on_mesh import WIDER, Triangles, even_points, surface_area_m2
+from twin.scene.frames.rgbd import TrainingView
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.settings import InitialiseConfig
+from twin.scene.shape.from_training import image_window
+
+FOOTPRINTS = 1.6
+"""Spacing of the Gaussians in pixels of the views that come nearest."""
+NEAREST_SHARE = 0.25
+"""Of the views, for that spacing."""
+LEAST_SPACING_M, MOST_SPLATS = 0.001, 20_000
+FACING = 0.25
+"""Cosine from which on a surface is seen; flatter, it is all edge."""
+SAME_M, SAME_FRACTION = 0.008, 0.01
+"""Depth measured this near to the surface measured the surface."""
+EDGE_PX = 1
+"""Pixels this near to an outline or an edge may show what is beside it."""
+EDGE_M, EDGE_COSINE = 0.006, 0.8
+"""Pixels two apart whose depths, or normals, differ by more have an edge between them."""
+NEAR_BEND, NEAR_OUTLINE = 1e-3, 1e-6
+"""Weights of such pixels: they count where there are no others. Near an edge all colours are still
+the object's own, near its outline they may be the table's."""
+NEIGHBOURS = 24
+BLUR_M = 0.006
+SIDEWAYS = 0.2
+"""Share that a surface facing elsewhere has in the colour of a side that nobody saw."""
+
+
+def closed_object(
+    mesh: Triangles,
+    views: Sequence[TrainingView],
+    T_base_object: Float[np.ndarray, "4 4"],
+    config: InitialiseConfig,
+) -> GaussianCloud | None:
+    """Gaussians on a closed mesh in the object's frame; None where no view shows it.
+
+    Args:
+        mesh: In the object's frame, closed.
+        views: What the scene was fitted to, in the base frame.
+        T_base_object: Where the object was.
+        config: How flat and how opaque.
+    """
+    surface = _ClosedSurface(mesh)
+    looks = [_Look.of(view, surface, T_base_object) for view in views]
+    looks = [look for look in looks if look.shown.any()]
+    if not looks:
+        return None
+    spacing_m = _spacing_m(mesh, looks)
+    p, normals = even_points([mesh], spacing_m)
+    colors, weights = (
+        np.stack(rows) for rows in zip(*(look.at(p, normals) for look in looks), strict=True)
+    )
+    most = weights.max(axis=0)
+    is_seen, is_own = most > 0, most > NEAR_OUTLINE
+    if not is_seen.any():
+        return None
+    known = is_own if is_own.any() else is_seen
+    color = weighted_median(colors, weights)
+    color[~known] = _beside(p, normals, known, color)
+    cloud = flat_gaussians(p, normals, color, np.full(len(p), WIDER * spacing_m), config)
+    return replace(cloud, completed=~is_seen)
+
+
+class _ClosedSurface:
+    """A mesh that rays can be cast at, in the object's frame."""
+
+    def __init__(self, mesh: Triangles) -> None:
+        make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
+        tensor: Any = open3d.core.Tensor
+        self._scene = make()
+        vertices_m, triangles = mesh
+        self._scene.add_triangles(
+            tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32))
+        )
+        self.reach_m = float(np.linalg.norm(vertices_m, axis=1).max())
+
+    def hit(
+        self, rays: Float[np.ndarray, "height width 3"], T_object_camera: Float[np.ndarray, "4 4"]
+    ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
+        """Depth along the camera's axis, infinite beside the mesh, and normals."""
+        directions = rays @ T_object_camera[:3, :3].T
+        origins = np.broadcast_to(T_object_camera[:3, 3], directions.shape)
+        both = np.concatenate([origins, directions], axis=-1).astype(np.float32)
+        tensor: Any = open3d.core.Tensor
+        found = self._scene.cast_rays(tensor(np.ascontiguousarray(both)))
+        return found["t_hit"].numpy(), found["primitive_normals"].numpy()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """The part of a view in which an object shows."""
+
+    camera: Camera
+    T_camera_object: Float[np.ndarray, "4 4"]
+    corner: tuple[int, int]
+    """First row and column of the part."""
+    colors: Float[np.ndarray, "height width 3"]
+    expected_m: Float[np.ndarray, "height width"]
+    """Depth of the surface; infinite beside it."""
+    shown: Bool[np.ndarray, "height width"]
+    """Pixels in which the surface was measured."""
+    trust: Float[np.ndarray, "height width"]
+    """How surely a pixel shows this place: 1 away from outlines and edges."""
+
+    @staticmethod
+    def of(
+        view: TrainingView, surface: _ClosedSurface, T_base_object: Float[np.ndarray, "4 4"]
+    ) -> "_Look":
+        target = view.full
+        T_camera_object = se3.invert(view.T_base_color) @ T_base_object
+        rows, columns = image_window(target.camera, T_camera_object[:, 3], surface.reach_m)
+        rays = target.camera.rays()[rows, columns]
+        expected, normals = surface.hit(rays, se3.invert(T_camera_object))
+        measured = target.depth_m[rows, columns]
+        slack = SAME_M + SAME_FRACTION * measured
+        shown = np.isfinite(expected) & target.static_mask[rows, columns] & (measured > 0)
+        shown &= np.abs(measured - np.where(np.isfinite(expected), expected, 0.0)) < slack
+        return _Look(
+            camera=target.camera,
+            T_camera_object=T_camera_object,
+            corner=(rows.start, columns.start),
+            colors=np.moveaxis(target.planes_u8[:, rows, columns], 0, -1) / 255.0,
+            expected_m=expected,
+            shown=shown,
+            trust=_trust(expected, normals),
+        )
+
+    def at(
+        self, p: Float[np.ndarray, "num_points 3"], normals: Float[np.ndarray, "num_points 3"]
+    ) -> tuple[Float[np.ndarray, "num_points 3"], Float[np.ndarray, " num_points"]]:
+        """Colours of points of the surface, and how much they count; 0 where they are hidden."""
+        seen_m = se3.apply(self.T_camera_object, p)
+        towards = -seen_m / np.linalg.norm(seen_m, axis=1, keepdims=True)
+        cosine = np.einsum("ij,ij->i", normals @ self.T_camera_object[:3, :3].T, towards)
+        uv, z = self.camera.project(np.where(seen_m[:, 2:] > 0, seen_m, 1.0))
+        row = np.floor(uv[:, 1]).astype(np.int64) - self.corner[0]
+        column = np.floor(uv[:, 0]).astype(np.int64) - self.corner[1]
+        height, width = self.shown.shape
+        inside = (seen_m[:, 2] > 0) & (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        inside &= cosine > FACING
+        row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+        inside &= self.shown[row, column] & (z < self.expected_m[row, column] + SAME_M)
+        weight = self.trust[row, column] * cosine**2
+        return self.colors[row, column], np.where(inside, weight, 0.0)
+
+
+def _trust(
+    depth_m: Float[np.ndarray, "height width"], normals: Float[np.ndarray, "height width 3"]
+) -> Float[np.ndarray, "height width"]:
+    """How surely pixels show what is expected there: less near bends, steps and the outline."""
+    beside = ~np.isfinite(depth_m)
+    level = np.where(beside, 0.0, depth_m)
+    smooth = ndimage.uniform_filter(normals, size=(3, 3, 1))
+    smooth /= np.maximum(np.linalg.norm(smooth, axis=-1, keepdims=True), 1e-9)
+    bends = np.zeros(depth_m.shape, dtype=bool)
+    for axis in (0, 1):
+        middle, first, second = (
+            tuple(part if k == axis else slice(None) for k in (0, 1))
+            for part in (slice(1, -1), slice(None, -2), slice(2, None))
+        )
+        bends[middle] |= np.einsum("ijk,ijk->ij", smooth[first], smooth[second]) < EDGE_COSINE
+        step = EDGE_M + SAME_FRACTION * level[first]
+        bends[middle] |= np.abs(level[first] - level[second]) > step
+    around = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), dtype=bool)
+    trust = np.where(ndimage.binary_dilation(bends, around), NEAR_BEND, 1.0)
+    return np.where(ndimage.binary_dilation(beside, around), NEAR_OUTLINE, trust)
+
+
+def _spacing_m(mesh: Triangles, looks: Sequence[_Look]) -> float:
+    """As fine as the views that come nearest resolve, and not too many."""
+    footprints = [float(np.median(look.expected_m[look.shown])) / look.camera.fx for look in looks]
+    fine_m = FOOTPRINTS * float(np.quantile(footprints, NEAREST_SHARE))
+    return max(fine_m, LEAST_SPACING_M, float(np.sqrt(surface_area_m2([mesh]) / MOST_SPLATS)))
+
+
+def weighted_median(
+    values: Float[np.ndarray, "num_views num_points num_channels"],
+    weights: Float[np.ndarray, "num_views num_points"],
+) -> Float[np.ndarray, "num_points num_channels"]:
+    """Median over views of each channel; 0 where nothing has weight.
+
+    Args:
+        values: What each view says.
+        weights: How much it counts, at least 0.
+    """
+    order = np.argsort(values, axis=0)
+    ranked = np.take_along_axis(values, order, axis=0)
+    heavy = np.take_along_axis(np.broadcast_to(weights[..., None], values.shape), order, axis=0)
+    total = np.cumsum(heavy, axis=0)
+    middle = (total >= total[-1] / 2).argmax(axis=0)
+    found = np.take_along_axis(ranked, middle[None], axis=0)[0]
+    return np.where(total[-1] > 0, found, 0.0)
+
+
+def _beside(
+    p: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    known: Bool[np.ndarray, " num_points"],
+    colors: Float[np.ndarray, "num_points 3"],
+) -> Float[np.ndarray, "num_other 3"]:
+    """Colours of the nearest surface that was seen, for all other points."""
+    known_ids = np.flatnonzero(known)
+    count = min(NEIGHBOURS, len(known_ids))
+    distance, ids = cKDTree(p[known_ids]).query(p[~known], k=count)
+    distance, ids = distance.reshape(-1, count), known_ids[ids.reshape(-1, count)]
+    alike = np.einsum("pkc,pc->pk", normals[ids], normals[~known]).clip(0.0)
+    nearest = distance.min(axis=1, keepdims=True)
+    weight = (SIDEWAYS + alike) * np.exp(-0.5 * ((distance - nearest) / BLUR_M) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.asarray(np.einsum("pk,pkc->pc", weight, colors[ids]))
