@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -24,11 +24,14 @@ from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
-from dashboards.loading import LOADING
+from dashboards.loading import LOADING, late
 from dashboards.overview_page import build_overview, neighbours
 from dashboards.review_routes import review_routes
 from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
+
+if TYPE_CHECKING:  # reads episodes
+    from dashboards.trial_routes import TrialPages
 
 HERE = Path(__file__).parent
 SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
@@ -156,6 +159,7 @@ class Pages:
         """
         self._library = library
         self._environment = _environment()
+        self._behind_trial: TrialPages | None = None
         self.studies = StudyPages(
             self._run,
             self._page,
@@ -241,10 +245,23 @@ class Pages:
         return review_routes(self._run, self._page)
 
     def trial(self) -> list[Route]:
-        """``/episode/<id>/scene``: what is behind a trial's page."""
-        from dashboards.trial_routes import trial_routes  # noqa: PLC0415  # reads episodes
+        """What is behind a trial's page: its 3D scene, all pictures of a camera, and what-if."""
+        load = self._trial_pages
+        return [
+            Route("/episode/{id}/scene", late(load, "scene"), middleware=SMALL),
+            Route("/episode/{id}/scene.jpg", late(load, "picture")),
+            Route("/episode/{id}/frames/{camera}", late(load, "frames")),
+            Route("/episode/{id}/what_if", late(load, "what_if")),
+            Route("/episode/{id}/what_if", late(load, "ask"), methods=["POST"]),
+            Route("/episode/{id}/what_if/cancel", late(load, "cancel"), methods=["POST"]),
+        ]
 
-        return trial_routes(self._run, SMALL)
+    def _trial_pages(self) -> "TrialPages":
+        with LOADING:
+            from dashboards.trial_routes import TrialPages  # noqa: PLC0415  # reads episodes
+
+            self._behind_trial = self._behind_trial or TrialPages(self._run)
+            return self._behind_trial
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -3,16 +3,14 @@
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.concurrency import run_in_threadpool
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
-from starlette.routing import Route
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
@@ -21,6 +19,7 @@ from dashboards.episode_page import read_replays, sent_plan_of
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, pack_frames
 from dashboards.library import derived_path, derived_paths, episode_path
+from dashboards.loading import LOADING
 from dashboards.recording import Problems, read_recording
 from dashboards.trial_plots import shown_replays
 from dashboards.what_if import QUANTITIES, BusyError, Question, WhatIfJobs, read_change
@@ -39,26 +38,11 @@ _GATHERING = threading.Lock()
 """Robot models keep scratch memory: one answer at a time uses them."""
 
 
-def trial_routes(run_of: RunOf, small: Sequence[Middleware]) -> list[Route]:
-    """Return the addresses.
+class TrialPages:
+    """Answers behind a trial's page; one object, because it has the one job of what-if."""
 
-    Args:
-        run_of: The run that a request is about.
-        small: Compresses answers.
-    """
-    pages = _TrialPages(run_of)
-    return [
-        Route("/episode/{id}/scene", pages.scene, middleware=small),
-        Route("/episode/{id}/scene.jpg", pages.picture),
-        Route("/episode/{id}/frames/{camera}", pages.frames),
-        Route("/episode/{id}/what_if", pages.what_if),
-        Route("/episode/{id}/what_if", pages.ask, methods=["POST"]),
-        Route("/episode/{id}/what_if/cancel", pages.cancel, methods=["POST"]),
-    ]
-
-
-class _TrialPages:
     def __init__(self, run_of: RunOf) -> None:
+        """``run_of``: the run that a request is about."""
         self._run = run_of
         self._jobs = WhatIfJobs()
 
@@ -192,19 +176,22 @@ def _stamps(run: RunFolder, path: Path, *kinds: str) -> Stamps:
 
 @lru_cache(maxsize=2)
 def _packed(path: Path, run_path: Path, _stamps: Stamps) -> bytes:
-    from dashboards.scene_file import pack_scene  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from dashboards.scene_file import pack_scene  # noqa: PLC0415  # loads the twin
 
     return pack_scene(_gathered(path, run_path))
 
 
 def _drawn(path: Path, run_path: Path, t_s: float) -> bytes:
-    from dashboards.scene_file import draw_picture  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from dashboards.scene_file import draw_picture  # noqa: PLC0415  # loads the twin
 
     return draw_picture(_gathered(path, run_path), t_s)
 
 
 def _gathered(path: Path, run_path: Path) -> "TrialScene":
-    from dashboards.trial_scene import gather_scene  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from dashboards.trial_scene import gather_scene  # noqa: PLC0415  # loads the twin
 
     run = RunFolder(run_path)
     recording = read_recording(path)

@@ -17,6 +17,7 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, Worker, WorkerLostError
 from bridge.whole_file import write_whole
 from dashboards.errors import DashboardError
+from dashboards.loading import LOADING
 from twin.replay.config import ChangeConfig
 
 FOLDER = "what_if"
@@ -181,7 +182,8 @@ def replay_one(asked: tuple[Question, ChangeConfig]) -> dict[str, Any]:
     Args:
         asked: The question, and what is otherwise this time.
     """
-    from twin.replay.what_if import WhatIf, replay_changed  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from twin.replay.what_if import WhatIf, replay_changed  # noqa: PLC0415  # loads the twin
 
     question, change = asked
     return replay_changed(
