@@ -141,6 +141,7 @@ class View {
     this.number = 0;
     this.moved = 0;
     this.frameMs = 0;
+    this.isFirst = true; // the first picture is coarse, and there soon
     this.worker = new Worker("/static/splat_sort.js");
     this.worker.onmessage = ({ data }) => this.ordered(data);
     this.worker.onerror = () => this.fail("the sorting thread ended");
@@ -212,7 +213,8 @@ class View {
     if (this.lost) return;
     const { gl, painter } = this;
     const resting = performance.now() - this.moved > REST_MS;
-    const coarse = !resting && this.frameMs > SLOW_MS ? 0.5 : 1;
+    const coarse = this.isFirst || (!resting && this.frameMs > SLOW_MS) ? 0.5 : 1;
+    this.isFirst = false;
     const box = this.canvas.getBoundingClientRect();
     const density = Math.min(devicePixelRatio, 2) * coarse;
     const width = Math.max(1, Math.round(box.width * density));
