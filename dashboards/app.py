@@ -24,6 +24,7 @@ from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
+from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview, neighbours
 from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
@@ -193,7 +194,8 @@ class Pages:
 
     def episode(self, request: Request) -> Response:
         """``/episode/<id>``: one trial and its replays."""
-        from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         episode_id = request.path_params["id"]
@@ -207,8 +209,9 @@ class Pages:
 
     def frame(self, request: Request) -> Response:
         """``/episode/<id>/frame/<camera>?t=``: the nearest camera image, as recorded."""
-        from dashboards.frames import read_frame  # noqa: PLC0415
-        from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
+        with LOADING:
+            from dashboards.frames import read_frame  # noqa: PLC0415
+            from dashboards.recording import PageClock, read_recording  # noqa: PLC0415
 
         path = episode_path(self._run(request), request.path_params["id"])
         clock = PageClock.of(read_recording(path))
@@ -232,14 +235,16 @@ class Pages:
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""
-        from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.twin_page import build_twin  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         return self._page("twin.html", request, page=build_twin(run, judge(run)))
 
     def twin_image(self, request: Request) -> Response:
         """``/twin/<file>/<side>/<camera>?stamp=``: one held-out image."""
-        from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
+        with LOADING:
+            from dashboards.twin_page import view_image  # noqa: PLC0415  # reads episodes
 
         run = self._run(request)
         path = derived_path(run, request.path_params["name"])
