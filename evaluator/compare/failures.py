@@ -25,7 +25,8 @@ class FailureKind:
     """How a failure is sorted; an empty part is not known."""
 
     cause: str
-    """Of the first factor that failed in the twin; else that the twin did not fail."""
+    """Of the first factor that failed in the twin; else that the twin did not fail, and in what
+    planned, executed and recorded part first."""
     stage: str
     """Labelled as the first that failed; else the one in which the twin failed."""
     bodies: str
@@ -38,6 +39,8 @@ def failure_kind(row: TrialRow) -> FailureKind | None:
         cause = row.failing_cause or row.first_failing or UNNAMED
     elif row.recorded is False:
         cause = TWIN_SUCCEEDS if row.sim_planned else NO_ANSWER
+        if row.sim_planned and row.divergence is not None:
+            cause = f"{TWIN_SUCCEEDS}: {row.divergence.attribution}"
     else:
         return None
     foretold = row.sim_planned is False
