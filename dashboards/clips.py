@@ -18,6 +18,7 @@ from bridge.errors import GstError
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, camera_tracks, read_span
 from dashboards.library import derived_paths, episode_path
+from dashboards.loading import LOADING
 from dashboards.queue_page import Moment, drawn_once, main_camera, moment_of
 from evaluator.review_index import IndexedTrial, stamp_of
 
@@ -166,7 +167,8 @@ def _nearest(drawn: Sequence[tuple[int, Image]], stamp_ns: int, beside: Image) -
 
 
 def _scaled(image: Image, height_px: int) -> Image:
-    from PIL import Image as pillow  # noqa: PLC0415  # only when a picture is made
+    with LOADING:
+        from PIL import Image as pillow  # noqa: PLC0415  # only when a picture is made
 
     height, width = image.shape[:2]
     size = (max(2, round(width * height_px / height) // 2 * 2), height_px)
@@ -208,7 +210,8 @@ def as_jpeg(image: Image, quality: int) -> bytes:
         image: The picture, sRGB.
         quality: 1 to 100.
     """
-    from PIL import Image as pillow  # noqa: PLC0415  # only when a picture is made
+    with LOADING:
+        from PIL import Image as pillow  # noqa: PLC0415  # only when a picture is made
 
     buffer = io.BytesIO()
     pillow.fromarray(image).save(buffer, format="jpeg", quality=quality)
@@ -225,7 +228,8 @@ def as_video(found: Footage, config: ClipConfig) -> bytes:
     Raises:
         MissingDependencyError: Without PyAV.
     """
-    from bridge.exchange.lerobot.video import VideoWriter  # noqa: PLC0415  # the extra [video]
+    with LOADING:
+        from bridge.exchange.lerobot.video import VideoWriter  # noqa: PLC0415  # the extra [video]
 
     height, width = found.frames[0].shape[:2]
     with TemporaryDirectory(prefix="robot-gst-") as folder:

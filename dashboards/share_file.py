@@ -29,6 +29,7 @@ from dashboards.config import SHARE_LIMITS, ShareConfig
 from dashboards.episode_page import build_page
 from dashboards.figures import TimePlot
 from dashboards.library import episode_path
+from dashboards.loading import LOADING
 from evaluator.compare.rows import Comparison
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
 from evaluator.report.figures.selection import drawable, drawings_of
@@ -252,7 +253,8 @@ def _figure(comparison: Comparison | None) -> tuple[Drawing | None, str | None]:
     if first is None:
         return None, None
     try:
-        from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
+        with LOADING:
+            from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
     except ModuleNotFoundError:
         return None, None
     return first, render.render(first).inline

@@ -202,9 +202,10 @@ def divergence_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
     """
     counts: Counter[tuple[str, ...]] = Counter()
     for row in rows:
-        if (apart := row.divergence) is not None:
-            step = apart.stage or "outside the steps"
-            where = (row.task, step, apart.attribution, apart.quantity, apart.body, apart.between)
+        if (diverged := row.divergence) is not None:
+            step = diverged.stage or "outside the steps"
+            key = diverged.attribution, diverged.quantity, diverged.body, diverged.between
+            where = (row.task, step, *key)
             counts[where] += row.count
     if not counts:
         return ()

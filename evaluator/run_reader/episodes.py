@@ -470,8 +470,8 @@ def read_derived(path: Path) -> DerivedFacts:
                 decided for _, decided in verdicts(episode) if decided.plan_id == derived.plan_id
             ]
             last = summarise_verdict(mine[-1]) if mine else None
-            apart = first_divergence(episode) if derived.trajectory == "executed" else None
-            return DerivedFacts(info=info, derived=derived, verdict=last, divergence=apart)
+            first = first_divergence(episode) if derived.trajectory == "executed" else None
+            return DerivedFacts(info=info, derived=derived, verdict=last, divergence=first)
         if derived.kind == "localised":
             topics = episode.topics_of_type(schema.LOCALISATION)
             places = localised_positions(message.data for message in episode.messages(topics))

@@ -43,6 +43,16 @@ anything = st.recursive(
 )
 
 
+def _ways(schema: Any) -> list[Any]:
+    """The schemas of which one has to fit, where there are several."""
+    if "oneOf" in schema:
+        return list(schema["oneOf"])
+    if "if" in schema and "type" not in schema:  # a name, or numbers
+        return [schema["then"], schema["else"]]
+    # What an object may be, by its kind: a closed record for each.
+    return [part["then"] for part in schema.get("allOf", ()) if "$ref" in part["then"]]
+
+
 @st.composite
 def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
     """Draw a value that fits a schema; with ``odd``, one that here and there may not."""
@@ -56,11 +66,8 @@ def like(draw: st.DrawFn, schema: Any, root: Any, *, odd: bool) -> Any:
         return schema["const"]
     if "enum" in schema:
         return draw(st.sampled_from(schema["enum"]))
-    if "oneOf" in schema:
-        return draw(like(draw(st.sampled_from(schema["oneOf"])), root, odd=odd))
-    if "allOf" in schema:  # what an object may be, by its kind: a closed record for each
-        kept = [part["then"] for part in schema["allOf"] if "$ref" in part["then"]]
-        return draw(like(draw(st.sampled_from(kept)), root, odd=odd))
+    if ways := _ways(schema):
+        return draw(like(draw(st.sampled_from(ways)), root, odd=odd))
     kinds = schema.get("type", "null")
     kind = draw(st.sampled_from([kinds] if isinstance(kinds, str) else kinds))
     if kind == "object":

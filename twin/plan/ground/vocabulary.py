@@ -199,8 +199,8 @@ def vocabulary_of(
         colour = colour_name(np.array(model.color_srgb) / 255)
         by_task = label_of(key, colour, is_open=is_container, shape=_shape_word(model))
         label = str(about.get("label") or by_task)
-        said = next(filter(None, map(colour_of, words_of(label))), None)
-        colour = said or colour  # what it is called, whatever its colour looks like
+        spoken = next(filter(None, map(colour_of, words_of(label))), None)
+        colour = spoken or colour  # what it is called, whatever its colour looks like
         things[key] = Thing(
             id=key,
             label=label,

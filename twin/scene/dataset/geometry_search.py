@@ -24,7 +24,8 @@ from twin.scene.settings import FrameConfig
 
 FACTORS = np.geomspace(0.4, 2.5, 25)
 """Depth scales and focal lengths that are tried first."""
-MOST_LATE_FRAMES = 8
+MOST_LATE_FRAMES, MOST_LATE_SHARE = 8, 0.2
+"""Poses are later by at most so many frames, and by no larger share of the recording."""
 REFINEMENTS = 8
 """Halvings of the step around the best."""
 GAPS = (1, 2, 4, 8, 16, 32)
@@ -101,7 +102,10 @@ def search_geometry(
     ]
     if pose_at is not None and frame_ns > 0:
         moved = _Delayed(pairs=pairs, pose_at=pose_at)
-        found.append(_latest(moved.agreement, recorded, frame_ns))
+        # Beyond the ends of a recording its camera stands still, which agrees with anything.
+        span = (images[-1].stamp_ns - images[0].stamp_ns) / frame_ns
+        most = min(MOST_LATE_FRAMES, int(span * MOST_LATE_SHARE))
+        found += [_latest(moved.agreement, recorded, frame_ns, most)] if most else []
     best = max(found, key=lambda item: item.after)
     off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
     is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
@@ -181,8 +185,10 @@ def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correc
     return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
 
 
-def _latest(score: Callable[[float], float], recorded: float, frame_ns: int) -> Correction:
-    steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
+def _latest(
+    score: Callable[[float], float], recorded: float, frame_ns: int, most: int
+) -> Correction:
+    steps = np.arange(-most, most + 1).astype(np.float64)
     at, after = _climbed(steps, lambda frames: score(frames * frame_ns))
     return Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
 
