@@ -24,8 +24,9 @@ from twin.scene.settings import FrameConfig
 
 FACTORS = np.geomspace(0.4, 2.5, 25)
 """Depth scales and focal lengths that are tried first."""
-MOST_LATE_FRAMES, MOST_LATE_SHARE = 8, 0.2
-"""Poses are later by at most so many frames, and by no larger share of the recording."""
+MOST_LATE_FRAMES = 8
+LEAST_LEFT = 1 / 3
+"""Share of the pairs that have to lie within the recording when poses are moved in time."""
 REFINEMENTS = 8
 """Halvings of the step around the best."""
 GAPS = (1, 2, 4, 8, 16, 32)
@@ -101,11 +102,9 @@ def search_geometry(
         _best("focal", lambda s: _agreement(pairs, focal=s), recorded),
     ]
     if pose_at is not None and frame_ns > 0:
-        moved = _Delayed(pairs=pairs, pose_at=pose_at)
-        # Beyond the ends of a recording its camera stands still, which agrees with anything.
-        span = (images[-1].stamp_ns - images[0].stamp_ns) / frame_ns
-        most = min(MOST_LATE_FRAMES, int(span * MOST_LATE_SHARE))
-        found += [_latest(moved.agreement, recorded, frame_ns, most)] if most else []
+        ends_ns = images[0].stamp_ns, images[-1].stamp_ns
+        moved = _Delayed(pairs=pairs, pose_at=pose_at, ends_ns=ends_ns)
+        found.append(_latest(moved.agreement, recorded, frame_ns))
     best = max(found, key=lambda item: item.after)
     off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
     is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
@@ -153,22 +152,36 @@ def _agreement(pairs: Sequence[_Pair], depth: float = 1.0, focal: float = 1.0) -
 class _Delayed:
     pairs: Sequence[_Pair]
     pose_at: PoseAt
+    ends_ns: tuple[int, int]
+    """Of the recording."""
 
     def agreement(self, late_ns: float) -> float:
-        """With poses that were stated this much too late."""
-        poses = {
-            image.stamp_ns: self.pose_at(image.stamp_ns + round(late_ns))
-            for pair in self.pairs
-            for image in (pair.first, pair.second)
-        }
+        """With poses that were stated this much too late.
+
+        Beyond the ends of a recording its camera stands still, which agrees with anything: pairs
+        that would come to lie there do not count.
+        """
+        kept = [pair for pair in self.pairs if self._within(pair, late_ns)]
+        if len(kept) < LEAST_LEFT * len(self.pairs):
+            return 0.0
         return _mean(
             [
                 pair.agreement(
-                    se3.invert(poses[pair.second.stamp_ns]) @ poses[pair.first.stamp_ns], 1.0, 1.0
+                    se3.invert(self._pose(pair.second, late_ns)) @ self._pose(pair.first, late_ns),
+                    1.0,
+                    1.0,
                 )
-                for pair in self.pairs
+                for pair in kept
             ]
         )
+
+    def _within(self, pair: _Pair, late_ns: float) -> bool:
+        start_ns, end_ns = self.ends_ns
+        moved_ns = (each.stamp_ns + late_ns for each in (pair.first, pair.second))
+        return all(start_ns <= t_ns <= end_ns for t_ns in moved_ns)
+
+    def _pose(self, image: DownscaledDepth, late_ns: float) -> Float[np.ndarray, "4 4"]:
+        return self.pose_at(image.stamp_ns + round(late_ns))
 
 
 def _mean(scores: Sequence[tuple[float, float]]) -> float:
@@ -185,10 +198,8 @@ def _best(kind: str, score: Callable[[float], float], recorded: float) -> Correc
     return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
 
 
-def _latest(
-    score: Callable[[float], float], recorded: float, frame_ns: int, most: int
-) -> Correction:
-    steps = np.arange(-most, most + 1).astype(np.float64)
+def _latest(score: Callable[[float], float], recorded: float, frame_ns: int) -> Correction:
+    steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
     at, after = _climbed(steps, lambda frames: score(frames * frame_ns))
     return Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
 
