@@ -19,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from dashboards import wording
+from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
@@ -135,11 +136,6 @@ def _seconds(request: Request) -> float | None:
     return value if value is not None and abs(value) < 1e9 else None
 
 
-def _image(data: bytes, media_type: str) -> Response:
-    headers = {"Cache-Control": "private, max-age=600"}
-    return Response(data, media_type=media_type, headers=headers)
-
-
 def _download(path: Path) -> Response:
     return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
@@ -230,7 +226,7 @@ class Pages:
         clock = PageClock.of(read_recording(path))
         stamp_ns = clock.stamp_ns(clock.clamp(_seconds(request) or 0.0))
         data, media_type = read_frame(path, request.path_params["camera"], stamp_ns)
-        return _image(data, media_type)
+        return kept(data, media_type)
 
     def episode_file(self, request: Request) -> Response:
         """``/episode/<id>/file``: the recorded file itself."""
@@ -285,7 +281,7 @@ class Pages:
         data, media_type = view_image(
             run, path, request.path_params["side"], request.path_params["camera"], int(stamp)
         )
-        return _image(data, media_type)
+        return kept(data, media_type)
 
     def failed(self, request: Request, error: Exception) -> Response:
         """Show one of our errors as a page.

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from bridge.clock import NS_PER_S
-from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -19,7 +18,7 @@ from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, camera_tracks, read_span
 from dashboards.library import derived_paths, episode_path
 from dashboards.loading import LOADING
-from dashboards.queue_page import Moment, drawn_once, main_camera, moment_of
+from dashboards.queue_page import Moment, drawn_once, main_camera, moment_of, recorded_ns
 from evaluator.review_index import IndexedTrial, stamp_of
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -116,9 +115,9 @@ def _instant(run: RunFolder, row: IndexedTrial) -> tuple[Path, Moment | None, in
     path = episode_path(run, row.file.removesuffix(".mcap") or row.episode)
     moment = moment_of(run, row)
     if moment is not None:
-        start_ns, _ = streams.execution_ns(streams.events(Episode.open(path)), moment.plan_id)
-        if start_ns is not None:
-            return path, moment, start_ns + moment.t_ns
+        at_ns = recorded_ns(path, moment)
+        if at_ns is not None:
+            return path, moment, at_ns
     return path, None, main_camera(path).stamps_ns[-1]
 
 

@@ -285,17 +285,25 @@ def drawn_once(
 
 def _drawn(path: Path, moment: Moment | None) -> bytes:
     track = main_camera(path)
-    stamp_ns = track.stamps_ns[-1]
-    if moment is not None:
-        start_ns, _ = streams.execution_ns(streams.events(Episode.open(path)), moment.plan_id)
-        stamp_ns = stamp_ns if start_ns is None else start_ns + moment.t_ns
-    data, _ = read_frame(path, track.camera_id, stamp_ns)
+    at_ns = None if moment is None else recorded_ns(path, moment)
+    data, _ = read_frame(path, track.camera_id, track.stamps_ns[-1] if at_ns is None else at_ns)
     with open_image(data) as image:
         small = image.convert("RGB")
         small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
         buffer = io.BytesIO()
         small.save(buffer, format="jpeg", quality=78)
     return buffer.getvalue()
+
+
+def recorded_ns(path: Path, moment: Moment) -> int | None:
+    """Return when a moment is on the recording's clock; None where its plan was not executed.
+
+    Args:
+        path: The recorded episode.
+        moment: What its replays tell.
+    """
+    start_ns, _ = streams.execution_ns(streams.events(Episode.open(path)), moment.plan_id)
+    return None if start_ns is None else start_ns + moment.t_ns
 
 
 def main_camera(path: Path) -> CameraTrack:

@@ -1,6 +1,5 @@
 """Addresses of the queue, of blind labelling and of its summary; the only ones that write."""
 
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ from starlette.routing import Route
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.exchange.reviews import ReviewConflictError, SavedReview, readable_reviews
+from dashboards.answers import kept, posted, refused
 from dashboards.comparison import judge
 from dashboards.errors import NotHereError
 from dashboards.loading import LOADING
@@ -73,8 +73,7 @@ class _ReviewPages:
         if row is None:
             message = "no such trial in this run."
             raise NotHereError(message)
-        headers = {"Cache-Control": "private, max-age=600"}
-        return Response(thumbnail(run, row), media_type="image/jpeg", headers=headers)
+        return kept(thumbnail(run, row), "image/jpeg")
 
     def label(self, request: Request) -> Response:
         """``/label?rater=&set=&at=``: one trial, blind; without ``at`` the next to label."""
@@ -106,19 +105,9 @@ class _ReviewPages:
 
     async def save(self, request: Request) -> Response:
         """``POST /label?rater=&set=``: keep one label, and say which trial is next."""
-        body = bytearray()
-        async for part in request.stream():
-            body += part
-            if len(body) > MAX_BODY:
-                return _refused(413, "a label has at most 64 kB.")
-        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            return _refused(415, "a label is sent as application/json.")
-        try:
-            record = json.loads(body)
-        except (ValueError, RecursionError):
-            return _refused(400, "a label is a JSON object.")
-        if not isinstance(record, dict):
-            return _refused(400, "a label is a JSON object.")
+        record = await posted(request, "a label", MAX_BODY)
+        if isinstance(record, Response):
+            return record
         return await run_in_threadpool(self._keep, request, record)
 
     def _keep(self, request: Request, record: dict[str, Any]) -> Response:
@@ -132,9 +121,9 @@ class _ReviewPages:
         except ReviewConflictError as error:
             return JSONResponse({"message": str(error), **_told(error.saved)}, status_code=409)
         except NotHereError as error:
-            return _refused(404, str(error))
+            return refused(404, str(error))
         except (GstError, OSError) as error:
-            return _refused(400 if isinstance(error, UsageError) else 500, str(error))
+            return refused(400 if isinstance(error, UsageError) else 500, str(error))
         order = labels.trials_to_label(judge(run), request.query_params.get("set", ""), rater)
         found, _ = readable_reviews(run.path)
         after = labels.next_unrated(order, labels.rated_by(found, rater), record["trial_id"])
@@ -158,7 +147,3 @@ def _told(saved: SavedReview) -> dict[str, Any]:
     parts = ("result", "cause", "note", "flag", "time")
     label = None if saved.review is None else {name: getattr(saved.review, name) for name in parts}
     return {"version": saved.version, "saved": label}
-
-
-def _refused(status: int, message: str) -> Response:
-    return JSONResponse({"message": message}, status_code=status)

@@ -11,6 +11,7 @@ from starlette.routing import Route
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, MissingDependencyError, UsageError
+from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig, ShareConfig
 from dashboards.errors import NotHereError
@@ -97,7 +98,7 @@ class StudyPages:
         with LOADING:
             from dashboards.clips import picture  # noqa: PLC0415  # reads episodes
 
-        return _kept(picture(self._run(request), self._trial(request)), "image/jpeg")
+        return kept(picture(self._run(request), self._trial(request)), "image/jpeg")
 
     def clip(self, request: Request) -> Response:
         """``/failures/clip/<id>``: a trial around its moment, as MP4."""
@@ -108,7 +109,7 @@ class StudyPages:
             data = clip(self._run(request), self._trial(request))
         except MissingDependencyError as error:
             raise NotHereError(str(error)) from error
-        return _kept(data, "video/mp4")
+        return kept(data, "video/mp4")
 
     def compare(self, request: Request) -> Response:
         """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
@@ -185,8 +186,3 @@ class StudyPages:
             message = "no such recorded trial in this run."
             raise NotHereError(message)
         return row
-
-
-def _kept(data: bytes, media_type: str) -> Response:
-    headers = {"Cache-Control": "private, max-age=600"}
-    return Response(data, media_type=media_type, headers=headers)

@@ -1,7 +1,6 @@
 """Addresses behind a trial's page: its 3D scene, pictures of a camera, and what-if."""
 
 import hashlib
-import json
 import threading
 from collections.abc import Callable
 from functools import lru_cache
@@ -14,12 +13,13 @@ from starlette.responses import JSONResponse, Response
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
-from bridge.whole_file import write_whole
+from dashboards.answers import kept, posted, refused
 from dashboards.episode_page import read_replays, sent_plan_of
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, pack_frames
 from dashboards.library import derived_path, derived_paths, episode_path
 from dashboards.loading import LOADING
+from dashboards.queue_page import drawn_once
 from dashboards.recording import Problems, read_recording
 from dashboards.trial_plots import shown_replays
 from dashboards.what_if import QUANTITIES, BusyError, Question, WhatIfJobs, read_change
@@ -61,9 +61,7 @@ class TrialPages:
         camera_id, name = request.path_params["camera"], request.query_params.get("file")
         if name:
             path, camera_id = derived_path(run, name), RENDERED + camera_id
-        headers = {"Cache-Control": "private, max-age=600"}
-        data = pack_frames(path, camera_id)
-        return Response(data, media_type="application/octet-stream", headers=headers)
+        return kept(pack_frames(path, camera_id), "application/octet-stream")
 
     def what_if(self, request: Request) -> Response:
         """``/episode/<id>/what_if``: what was answered, and whether a job runs."""
@@ -73,19 +71,11 @@ class TrialPages:
 
     async def ask(self, request: Request) -> Response:
         """``POST /episode/<id>/what_if``: replay the plan otherwise."""
-        body = bytearray()
-        async for part in request.stream():
-            body += part
-            if len(body) > MAX_BODY:
-                return _refused(413, "a question has at most 4 kB.")
-        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            return _refused(415, "a question is sent as application/json.")
-        try:
-            record = json.loads(body)
-        except (ValueError, RecursionError):
-            return _refused(400, "a question is a JSON object.")
-        if not isinstance(record, dict) or not set(record) <= {"change", "sweep", "plan"}:
-            return _refused(400, "a question has change, sweep and plan.")
+        record = await posted(request, "a question", MAX_BODY)
+        if isinstance(record, Response):
+            return record
+        if not set(record) <= {"change", "sweep", "plan"}:
+            return refused(400, "a question has change, sweep and plan.")
         return await run_in_threadpool(self._ask, request, record)
 
     def _ask(self, request: Request, record: dict[str, Any]) -> Response:
@@ -108,11 +98,11 @@ class TrialPages:
             )
             return JSONResponse(self._jobs.start(question), status_code=202)
         except BusyError as error:
-            return _refused(409, str(error))
+            return refused(409, str(error))
         except NotHereError as error:
-            return _refused(404, str(error))
+            return refused(404, str(error))
         except GstError as error:
-            return _refused(400, str(error))
+            return refused(400, str(error))
 
     def cancel(self, request: Request) -> Response:
         """``POST /episode/<id>/what_if/cancel``: end the job, whichever it is."""
@@ -128,27 +118,13 @@ class TrialPages:
             t_s = round(float(request.query_params.get("t", "0")), 2)
         except ValueError:
             t_s = 0.0
-        what = repr((path.stem, _stamps(run, path, *SHOWN), t_s))
-        name = hashlib.sha256(path.stem.encode("utf-8", "surrogatepass")).hexdigest()[:16]
-        key = hashlib.sha256(what.encode(errors="surrogatepass")).hexdigest()[:16]
-        kept = run.results_dir / PICTURES / f"{name}-{key}.jpg"
-        headers = {"Cache-Control": "private, max-age=600"}
-        with _GATHERING:
-            if kept.is_file():
-                return Response(kept.read_bytes(), media_type="image/jpeg", headers=headers)
-            data = _drawn(path, run.path, t_s)
-            try:
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                for old in kept.parent.glob(f"{name}-*.jpg"):
-                    old.unlink()
-                write_whole(kept, data)
-            except OSError:  # a run that only can be read is drawn anew each time
-                pass
-        return Response(data, media_type="image/jpeg", headers=headers)
+        what = (path.stem, _stamps(run, path, *SHOWN), t_s)
 
+        def draw() -> bytes:
+            with _GATHERING:
+                return _drawn(path, run.path, t_s)
 
-def _refused(status: int, message: str) -> Response:
-    return JSONResponse({"message": message}, status_code=status)
+        return kept(drawn_once(run.results_dir / PICTURES, path.stem, what, draw), "image/jpeg")
 
 
 Stamps = tuple[tuple[str, int, int], ...]

@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bridge.episode.catalogue_store import printable
 from bridge.episode.provenance import software
@@ -130,13 +130,35 @@ and blank is turned round."""
 FACETS = ("task", "condition", "policy")
 
 
+Chosen = TypeVar("Chosen", bound="_Selected")
+
+
 @dataclass(frozen=True, kw_only=True)
-class Selection:
-    """Which trials are listed, in which order; empty means all. Tasks and so on are slugs."""
+class _Selected:
+    """What lists of trials are selected by; empty means all. Tasks and so on are slugs."""
 
     task: str = ""
     condition: str = ""
     policy: str = ""
+
+    @classmethod
+    def of(cls: type[Chosen], query: Mapping[str, str]) -> Chosen:
+        """Read the query of an address; unknown values simply select nothing."""
+        return cls(**{item.name: query.get(item.name, "") for item in fields(cls)})
+
+    def query(self, **changes: str) -> dict[str, str]:
+        """Return this selection as a query, with some fields changed, from its first page."""
+        return {**vars(self), "page": "", **changes}
+
+    def _where_facets(self) -> tuple[list[str], list[Any]]:
+        chosen = [name for name in FACETS if getattr(self, name)]
+        return [f"{name}_slug = ?" for name in chosen], [getattr(self, name) for name in chosen]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection(_Selected):
+    """Which trials are listed, and in which order."""
+
     show: str = ""
     clause: str = ""
     """The first factor that failed in the twin."""
@@ -149,15 +171,6 @@ class Selection:
     sort: str = ""
     page: str = ""
     """Number of the page, from 1."""
-
-    @staticmethod
-    def of(query: Mapping[str, str]) -> "Selection":
-        """Read the query of an address; unknown values simply select nothing."""
-        return Selection(**{item.name: query.get(item.name, "") for item in fields(Selection)})
-
-    def query(self, **changes: str) -> dict[str, str]:
-        """Return this selection as a query, with some fields changed, from its first page."""
-        return {**vars(self), "page": "", **changes}
 
     def takes_group(self, task: str, condition: str, policy: str) -> bool:
         """Say whether a group is selected.
@@ -181,11 +194,7 @@ class Selection:
 
     def where(self) -> tuple[str, list[Any]]:
         """Return the SQL of the filters, and its values."""
-        terms, values = [], list[Any]()
-        for name in FACETS:
-            if getattr(self, name):
-                terms.append(f"{name}_slug = ?")
-                values.append(getattr(self, name))
+        terms, values = self._where_facets()
         if self.show:
             terms.append(_SHOW.get(self.show, "0"))
         if self.clause or self.cause:
@@ -235,12 +244,9 @@ NOT_KNOWN = "-"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FailureSelection:
-    """Which failures are shown, and by what they are grouped; empty means all."""
+class FailureSelection(_Selected):
+    """Which failures are shown, and by what they are grouped."""
 
-    task: str = ""
-    condition: str = ""
-    policy: str = ""
     failed: str = ""
     """One of ``FAILED``."""
     cause: str = ""
@@ -250,16 +256,6 @@ class FailureSelection:
     by: str = ""
     """Names of ``FAILURE_PARTS`` joined by dots."""
     page: str = ""
-
-    @staticmethod
-    def of(query: Mapping[str, str]) -> "FailureSelection":
-        """Read the query of an address; unknown values simply select nothing."""
-        names = (item.name for item in fields(FailureSelection))
-        return FailureSelection(**{name: query.get(name, "") for name in names})
-
-    def query(self, **changes: str) -> dict[str, str]:
-        """Return this selection as a query, with some fields changed, from its first page."""
-        return {**vars(self), "page": "", **changes}
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -273,13 +269,10 @@ class FailureSelection:
         Args:
             but: One of ``FAILURE_PARTS`` whose filter is left out.
         """
-        terms, values = ["fail_cause != ''"], list[Any]()
+        terms, values = self._where_facets()
+        terms.append("fail_cause != ''")
         if self.failed:
             terms.append(_FAILED.get(self.failed, "0"))
-        for name in FACETS:
-            if getattr(self, name):
-                terms.append(f"{name}_slug = ?")
-                values.append(getattr(self, name))
         for name, column in FAILURE_PARTS.items():
             wanted = getattr(self, name)
             if wanted and name != but:
