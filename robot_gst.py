@@ -214,6 +214,12 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "An RGB-D folder: scene.json, TUM, 7-Scenes.",
                 "DIR runs/x",
             ),
+            (
+                "images",
+                f"{EXCHANGE}:import_images",
+                "Posed images without depth: COLMAP, transforms.json.",
+                "DIR runs/x",
+            ),
             ("kinova", f"{EXCHANGE}:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
             (
                 "rosbag2",

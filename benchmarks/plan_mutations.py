@@ -101,7 +101,8 @@ def faster(plan: Record, rng: Rng, solve: Solver) -> Record:
     for k in range(start + 1, len(times)):
         step = max(1, round((times[k] - times[k - 1]) / factor))
         plan["tau"][k]["t_ns"] = plan["tau"][k - 1]["t_ns"] + step
-    later = [w["t_ns"] for w in plan["tau"]]
+    later = [float(w["t_ns"]) for w in plan["tau"]]
+    times = [float(time) for time in times]  # giant ones are no int64
     for stage in plan["stages"]:
         for key in ("t_start_ns", "t_end_ns"):
             stage[key] = round(float(np.interp(stage[key], times, later)))

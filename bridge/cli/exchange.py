@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from bridge.clock import ClockChoice
 from bridge.episode.schema import StampedMessage
 from bridge.exchange.lerobot.layout import LeRobotConfig
-from bridge.sources.folder.config import FolderConfig
+from bridge.sources.folder.config import FolderConfig, PosedConfig
 from bridge.terminal import Output
 
 OUTPUT = Output()
@@ -339,6 +339,60 @@ def import_rgbd(
         "assumed": index.assumed,
     }
     output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
+    return 0
+
+
+POSED = PosedConfig()
+
+
+def import_images(
+    folder: Path,
+    run: Path,
+    /,
+    *,
+    episode: str = "scan",
+    config: Annotated[PosedConfig, Parameter(name="*")] = POSED,
+    output: Output = OUTPUT,
+) -> int:
+    """Turn posed images without depth into a scan episode: COLMAP's text model, transforms.json.
+
+    rebuild finds depth by comparing the images. Lengths are metric only with --metres-per-unit.
+    Example: robot-gst import images data/garden runs/garden
+
+    Args:
+        folder: Folder of one of the two layouts (docs/rgbd_folder.md).
+        run: Run folder; made where needed.
+        episode: Id of the new episode.
+        config: Names, rate and scale.
+        output: How to talk.
+    """
+    from bridge.episode.metadata import EpisodeInfo
+    from bridge.episode.run_folder import RunFolder
+    from bridge.exchange.rgbd import write_scan
+    from bridge.sources.folder.posed_index import read_posed_index
+    from bridge.sources.folder.posed_messages import describe_posed, posed_messages
+
+    index = read_posed_index(folder)
+    source = describe_posed(index, config)
+    output.say(f"{index.path}: {index.layout}, {len(index.images)} images")
+    for name, value in index.assumed.items():
+        output.say(f"  assumed {name}: {value}")
+    if not source["is_metric"]:
+        output.say(
+            "  not metric: lengths are scaled so that the cameras look at what is 1 m away; "
+            "--metres-per-unit says how long a unit of the folder is"
+        )
+    info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
+    with output.progress("import", len(index.images)) as advance:
+
+        def messages() -> Iterator[StampedMessage]:
+            for done, image in enumerate(posed_messages(index, config), start=1):
+                yield from image
+                advance(done, "")
+
+        path = write_scan(RunFolder.create(run), info, messages(), source=source)
+    data = {"file": str(path), "images": len(index.images), **source}
+    output.result(data, f"{path}: {len(index.images)} posed images without depth")
     return 0
 
 

@@ -282,7 +282,8 @@ def find_sources(run: RunFolder) -> Sources:
     if not usable:
         message = (
             f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
-            "Record a scan, or import an RGB-D folder: robot-gst import rgbd FOLDER RUN."
+            "Record a scan, or import a folder: robot-gst import rgbd FOLDER RUN, or posed images "
+            "without depth: robot-gst import images FOLDER RUN."
         )
         raise NoFramesError(message)
     kinds = sorted({episode.info.kind for episode in usable})

@@ -29,7 +29,8 @@ from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
 from twin.scene.foundation.stage import check_models
-from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
+from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
+from twin.scene.frames.swept_episode import find_or_sweep_sources
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
@@ -91,7 +92,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         output: Shows progress and remarks.
 
     Raises:
-        NoFramesError: When the run has no RGB-D frames.
+        NoFramesError: When the run has no RGB-D frames, and no posed images without depth.
         UnusableCameraError: When no camera can be used or followed.
         NoDepthError: When the depth images hold nothing usable.
         PoseConventionError: When poses fit the depth only if read in another convention.
@@ -101,7 +102,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         MissingDependencyError: When the extra ``foundation`` is needed and not installed.
     """
     load_native()
-    sources = find_sources(run)
+    sources = find_or_sweep_sources(run, config.frames, output)
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)
