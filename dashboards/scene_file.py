@@ -28,10 +28,12 @@ from twin.scene.render import sized_camera
 MAGIC, VERSION = b"GS3D", 1
 HEAD = 16
 """Bytes before the header."""
-MAX_SPLATS = 60_000
+MAX_SPLATS = 100_000
 """What software WebGL draws in time; the largest and most opaque are kept."""
 OBJECTS = 10.0
 """How much more the Gaussians of objects count."""
+TIE = 1e-6
+"""Gaussians that close an object are all alike: within so much, which of them stay is drawn."""
 STILL_M = 1e-6
 """A track whose poses differ by less is one pose."""
 SPLAT = np.dtype(
@@ -243,9 +245,10 @@ def _by_node(
 
 
 def _weights(cloud: GaussianCloud) -> Float[np.ndarray, " num_splats"]:
-    """Opacity times the area of the two largest axes."""
+    """Opacity times the area of the two largest axes; of equal ones some, all over the surface."""
     scales = np.sort(cloud.scales_log.astype(np.float64), axis=1)
-    return np.asarray(cloud.opacities() * np.exp(scales[:, 1] + scales[:, 2]))
+    weights = np.asarray(cloud.opacities() * np.exp(scales[:, 1] + scales[:, 2]))
+    return weights * (1 + TIE * np.random.default_rng(0).random(len(cloud)))
 
 
 def _splat_table(
