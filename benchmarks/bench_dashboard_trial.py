@@ -113,7 +113,6 @@ def rasterised(run: RunFolder, trial: str, t_s: float, width: int, height: int) 
         parts=read_movable_scene(run, scene),
         urdf="" if postures is None else postures.urdf,
         camera=sized_camera(info.camera, f"{width}x{height}"),
-        scene=scene,
     )
     frame = Frame(
         stamp_ns=stamp_ns,
@@ -192,7 +191,14 @@ def main() -> None:
                 measured=middle("cpu_s"),
                 limit=10.0,
                 unit="s CPU",
-                reference=f"browser and server together; {middle('first_s'):.1f} s on the clock",
+                reference="browser and server together",
+            ),
+            Target(
+                what="the same on the clock",
+                measured=middle("first_s"),
+                limit=10.0,
+                unit="s",
+                reference="loaded: the machine did other work, too",
             ),
             Target(
                 what="3D from the recorded camera against the rasteriser with all Gaussians, PSNR",

@@ -22,6 +22,7 @@ from dashboards import wording
 from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
+from dashboards.console_door import ConsoleDoor
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path
@@ -32,6 +33,7 @@ from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
 
 if TYPE_CHECKING:  # reads episodes
+    from dashboards.console_page import ConsolePages
     from dashboards.trial_routes import TrialPages
 
 HERE = Path(__file__).parent
@@ -40,7 +42,10 @@ SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 
 
 def create_app(
-    library: Library, admission: Admission | None = None, live: DashboardConfig | None = None
+    library: Library,
+    admission: Admission | None = None,
+    live: DashboardConfig | None = None,
+    door: ConsoleDoor | None = None,
 ) -> Starlette:
     """Build the application over some run folders.
 
@@ -48,9 +53,11 @@ def create_app(
         library: The runs that are shown.
         admission: Which host and token are answered; None answers only on the loopback address.
         live: Where the page Live finds the recorder; None asks at the usual place.
+        door: Lets phones in at the operator's console; None leaves it closed.
     """
     admission = admission or Admission()
-    pages = Pages(library, live or DashboardConfig(), looks_beside=is_loopback(admission.host))
+    live = live or DashboardConfig()
+    pages = Pages(library, live, door, looks_beside=is_loopback(admission.host))
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -61,6 +68,7 @@ def create_app(
         *pages.reviews(),
         *pages.trial(),
         *pages.studies.routes(),
+        *(() if door is None else pages.console()),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
@@ -74,6 +82,7 @@ def create_app(
         },
     )
     app.state.studies = pages.studies
+    app.state.end_console = pages.end_console
     return app
 
 
@@ -144,15 +153,23 @@ class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
     def __init__(
-        self, library: Library, live: DashboardConfig, *, looks_beside: bool = True
+        self,
+        library: Library,
+        live: DashboardConfig,
+        door: ConsoleDoor | None = None,
+        *,
+        looks_beside: bool = True,
     ) -> None:
         """Remember the runs and load the templates.
 
         Args:
             library: The runs that are shown.
             live: Where the recorder is.
+            door: Lets phones in at the operator's console, where it is open.
             looks_beside: Whether runs in the same folder may be compared with them.
         """
+        self._live, self._door = live, door
+        self._console: ConsolePages | None = None
         self._library = library
         self._environment = _environment()
         self._behind_trial: TrialPages | None = None
@@ -165,7 +182,7 @@ class Pages:
         )
 
     def _part(self, name: str, state: object) -> str:
-        return self._environment.get_template(f"live_{name}.html").render(state=state)
+        return self._rendered(f"live_{name}.html", state=state)
 
     def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
         name = request.query_params.get("run", "")
@@ -258,6 +275,39 @@ class Pages:
 
             self._behind_trial = self._behind_trial or TrialPages(self._run)
             return self._behind_trial
+
+    def console(self) -> list[Route]:
+        """``/console``: starts, stops and answers trials from a phone, where it is open."""
+        load = self._console_pages
+        return [
+            Route("/console", late(load, "page")),
+            Route("/console/enter", late(load, "enter"), methods=["POST"]),
+            Route("/console/state", late(load, "state")),
+            Route("/console/act", late(load, "act"), methods=["POST"]),
+            Route("/console/start/{number:int}", late(load, "start_picture")),
+            Route("/console/now/{camera}", late(load, "live_picture")),
+        ]
+
+    def _console_pages(self) -> "ConsolePages":
+        if self._door is None:
+            message = "The console is closed. To open it: robot-gst dashboard RUN --console"
+            raise NotHereError(message)
+        with LOADING:
+            from dashboards.console_page import ConsolePages  # noqa: PLC0415  # loads zenoh
+
+            run = self._library.pick(None)
+            self._console = self._console or ConsolePages(
+                run, self._door, self._live, self._rendered
+            )
+            return self._console
+
+    def _rendered(self, name: str, **values: object) -> str:
+        return self._environment.get_template(name).render(values)
+
+    def end_console(self) -> None:
+        """Close what the console holds open."""
+        if self._console is not None:
+            self._console.end()
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -1,6 +1,5 @@
 """Recorded beside twin around the moment of a trial: one picture, a short clip, or a strip."""
 
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -14,11 +13,19 @@ from bridge.clock import NS_PER_S
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.media.color import encode_jpeg
 from dashboards.errors import NotHereError
 from dashboards.frames import RENDERED, camera_tracks, read_span
 from dashboards.library import derived_paths, episode_path
 from dashboards.loading import LOADING
-from dashboards.queue_page import Moment, drawn_once, main_camera, moment_of, recorded_ns
+from dashboards.queue_page import (
+    SUBSAMPLING,
+    Moment,
+    drawn_once,
+    main_camera,
+    moment_of,
+    recorded_ns,
+)
 from evaluator.review_index import IndexedTrial, stamp_of
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -202,21 +209,6 @@ def contact_sheet(frames: Sequence[Image], columns: int) -> Image:
     return sheet
 
 
-def as_jpeg(image: Image, quality: int) -> bytes:
-    """Compress a picture for a page.
-
-    Args:
-        image: The picture, sRGB.
-        quality: 1 to 100.
-    """
-    with LOADING:
-        from PIL import Image as pillow  # noqa: PLC0415  # only when a picture is made
-
-    buffer = io.BytesIO()
-    pillow.fromarray(image).save(buffer, format="jpeg", quality=quality)
-    return buffer.getvalue()
-
-
 def as_video(found: Footage, config: ClipConfig) -> bytes:
     """Make an MP4 file (H.264) of the frames.
 
@@ -264,7 +256,7 @@ def picture(run: RunFolder, row: IndexedTrial) -> bytes:
 
     def draw() -> bytes:
         found = footage(run, row, ClipConfig(before_s=0.1, after_s=0.1))
-        return as_jpeg(found.frames[found.key], CONFIG.quality)
+        return encode_jpeg(found.frames[found.key], CONFIG.quality, subsampling=SUBSAMPLING)
 
     return drawn_once(run.results_dir / PICTURES, row.episode, _what(run, row), draw)
 

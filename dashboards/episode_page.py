@@ -146,6 +146,7 @@ def build_page(
     failure_t_s = next(iter(failures_s), None)
     moment = None if row is None else moment_of(run, row)
     divergence_t_s = None if moment is None else clock.of_plan_time(moment.plan_id, moment.t_ns)
+    shown = shown_replays(replays, sent_plan)
     known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
     cursor = clock.clamp(next(known, clock.end_s))
     return EpisodePage(
@@ -155,10 +156,10 @@ def build_page(
         label=problems.attempt(lambda: outcome_of(run, Episode.open(path)), recording.outcome),
         verdicts=verdicts,
         gated=any(view.title == GATE_BEFORE and view.of_sent_plan for view in verdicts),
-        stages=trial_lanes(recording, shown_replays(replays, sent_plan), clock, failure_t_s),
+        stages=trial_lanes(recording, shown, clock, failure_t_s),
         replans=replans(recording, clock),
         plots=main_plots(recording, replays, sent_plan, row, clock),
-        joint_plots=plots_of_joints(recording, clock),
+        joint_plots=plots_of_joints(recording, shown, clock),
         cameras=tuple(
             _camera(track, replays, clock, cursor)
             for name, track in recording.cameras.items()

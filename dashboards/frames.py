@@ -124,17 +124,15 @@ def pack_frames(path: Path, camera_id: str) -> bytes:
         camera_id: Id of the camera, without the parts of its topic.
     """
     track = _track_of(path, camera_id)
-    episode = Episode.open(path)
-    places = {stamp_ns: index for index, stamp_ns in enumerate(track.stamps_ns)}
-    step = -(-len(places) // MAX_PACKED)
+    count = len(track.stamps_ns)
+    step = -(-count // MAX_PACKED)
     files: dict[int, bytes] = {}
-    for message in image_messages(episode, [track.topic]):
-        index = places.get(message.publish_time_ns)
-        if index is None or index in files or index % step:
+    for index, message in _in_one_pass(path, track, 0, count - 1):
+        if index in files or index % step:
             continue
         files[index] = color_file_from_message(message.type_name, message.data).data
         if len(files) == 1:
-            step = max(step, -(-len(places) * len(files[index]) // MAX_PACKED_BYTES))
+            step = max(step, -(-count * len(files[index]) // MAX_PACKED_BYTES))
     head = {
         "indices": list(files),
         "sizes": [len(data) for data in files.values()],
@@ -164,22 +162,36 @@ def read_span(
         start_ns: Source time of the first wanted [ns].
         end_ns: Source time of the last wanted [ns].
     """
-    track = camera_tracks(path)[camera_id]
+    track = _track_of(path, camera_id)
     places = [i for i, stamp in enumerate(track.stamps_ns) if start_ns <= stamp <= end_ns]
     if not places:
         return
-    episode = Episode.open(path)
+    for index, message in _in_one_pass(path, track, places[0], places[-1]):
+        color = color_file_from_message(message.type_name, message.data)
+        yield track.stamps_ns[index], decode_color(color.data)
+
+
+def _is_video(episode: Episode, track: CameraTrack) -> bool:
     summary = episode.topics().get(track.topic)
-    is_video = summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
-    first = max(0, places[0] - FRAMES_BEFORE[0]) if is_video else places[0]
-    log_ns = track.log_times_ns[first : places[-1] + 1]
-    wanted = {track.stamps_ns[place] for place in places}
-    for message in image_messages(
-        episode, [track.topic], start_ns=min(log_ns), end_ns=max(log_ns) + 1
-    ):
-        if message.publish_time_ns in wanted:
-            color = color_file_from_message(message.type_name, message.data)
-            yield message.publish_time_ns, decode_color(color.data)
+    return summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
+
+
+def _in_one_pass(
+    path: Path, track: CameraTrack, first: int, last: int
+) -> Iterator[tuple[int, RawMessage]]:
+    """Yield the frames from one place in a track to another, with their places.
+
+    A video is read from some frames before the first, which it may need to be decoded.
+    """
+    episode = Episode.open(path)
+    begin = max(0, first - FRAMES_BEFORE[0]) if _is_video(episode, track) else first
+    log_ns = track.log_times_ns[begin : last + 1]
+    places = {track.stamps_ns[place]: place for place in range(first, last + 1)}
+    span = {"start_ns": min(log_ns), "end_ns": max(log_ns) + 1}
+    for message in image_messages(episode, [track.topic], **span):
+        place = places.get(message.publish_time_ns)
+        if place is not None:
+            yield place, message
 
 
 def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:
@@ -188,9 +200,7 @@ def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None
     Its frames need those since the last whole picture, which most cameras send once a second.
     """
     wanted_ns = track.stamps_ns[index]
-    summary = episode.topics().get(track.topic)
-    is_video = summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
-    for before in FRAMES_BEFORE if is_video else (0,):
+    for before in FRAMES_BEFORE if _is_video(episode, track) else (0,):
         first = max(0, index - before)
         last = index if first else max(index, min(before, len(track.stamps_ns) - 1))
         span = {

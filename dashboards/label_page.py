@@ -214,7 +214,7 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
         NotHereError: When the run has no such trial.
         ReviewConflictError: When another tab changed the label meanwhile.
     """
-    trial_id, seen = (_text(record, name, 1000) for name in ("trial_id", "seen"))
+    trial_id, seen = (text_of(record, name, 1000) for name in ("trial_id", "seen"))
     episode_path(run, trial_id)
     result = record.get("result", "")
     flag = record.get("flag", False)
@@ -228,14 +228,24 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
         rater=rater,
         time=datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
         result=result,
-        cause=_text(record, "cause", MAX_LENGTH["cause"]) if result == "failure" else "",
-        note=_text(record, "note", MAX_LENGTH["note"]),
+        cause=text_of(record, "cause", MAX_LENGTH["cause"]) if result == "failure" else "",
+        note=text_of(record, "note", MAX_LENGTH["note"]),
         flag=flag,
     )
     return save_review(run.path, trial_id, rater, review, seen=seen)
 
 
-def _text(record: Mapping[str, Any], name: str, longest: int) -> str:
+def text_of(record: Mapping[str, Any], name: str, longest: int) -> str:
+    """Read a text that a page sent; empty where it sent none.
+
+    Args:
+        record: What it sent.
+        name: Of the text.
+        longest: Characters that it may have.
+
+    Raises:
+        UsageError: When it is something else, or longer.
+    """
     text = record.get(name, "")
     if not isinstance(text, str) or len(text) > longest:
         message = f"{name} is a text of at most {longest} characters."

@@ -1,12 +1,13 @@
 """The queue: which trial to look at first, why, and a picture of the moment it went wrong."""
 
 import hashlib
-import io
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
@@ -14,7 +15,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.exchange.reviews import Review
-from bridge.media.color import open_image
+from bridge.media.color import encode_jpeg, open_image
 from bridge.task.record import parse_record
 from bridge.whole_file import write_whole
 from dashboards.comparison import Judgement
@@ -42,6 +43,9 @@ THUMBNAILS = "thumbnails"
 """Folder in the run's ``results/``."""
 THUMBNAIL_PX = 360
 """Width of a thumbnail: twice what a card shows, for dense screens."""
+THUMBNAIL_QUALITY = 78
+SUBSAMPLING = "420"
+"""Of small pictures: colour half as fine as brightness, as in the videos."""
 _DRAWING = threading.Lock()
 
 
@@ -290,9 +294,7 @@ def _drawn(path: Path, moment: Moment | None) -> bytes:
     with open_image(data) as image:
         small = image.convert("RGB")
         small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
-        buffer = io.BytesIO()
-        small.save(buffer, format="jpeg", quality=78)
-    return buffer.getvalue()
+        return encode_jpeg(np.asarray(small), THUMBNAIL_QUALITY, subsampling=SUBSAMPLING)
 
 
 def recorded_ns(path: Path, moment: Moment) -> int | None:

@@ -19,6 +19,7 @@ from bridge.terminal import Output
 from dashboards.app import create_app
 from dashboards.comparison import judge, stop_updates
 from dashboards.config import DashboardConfig
+from dashboards.console_door import ConsoleDoor, claim_console, spaced
 from dashboards.errors import AddressTakenError
 from dashboards.guard import Admission, is_loopback
 from dashboards.library import Library
@@ -38,10 +39,19 @@ class Address:
     @property
     def url(self) -> str:
         """The address to open."""
+        query = f"?token={self.token}" if self.token else ""
+        return f"{self._origin}/{query}"
+
+    @property
+    def console_url(self) -> str:
+        """The address to open on a phone; it asks for a code."""
+        return f"{self._origin}/console"
+
+    @property
+    def _origin(self) -> str:
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         shown = f"[{host}]" if ":" in host else host
-        query = f"?token={self.token}" if self.token else ""
-        return f"http://{shown}:{self.port}/{query}"
+        return f"http://{shown}:{self.port}"
 
     @property
     def ssh_line(self) -> str:
@@ -87,10 +97,14 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         output: Gets the address, and the command for another computer.
     """
     library = Library.open(runs)
+    if config.console:
+        claim_console(library.pick(None).path)
     listener = listen(config)
     token = None if is_loopback(config.host) else secrets.token_urlsafe(24)
     address = Address(host=config.host, port=listener.getsockname()[1], token=token)
-    app = create_app(library, Admission(host=config.host, token=token), config)
+    door = ConsoleDoor(output.say) if config.console else None
+    admission = Admission(host=config.host, token=token, has_console=config.console)
+    app = create_app(library, admission, config, door)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
@@ -101,13 +115,18 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         )
     )
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
+    record = {"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}
+    if door is not None:
+        record |= {"console": address.console_url, "code": door.code}
+        text += f"\nConsole: {address.console_url} code {spaced(door.code)}, for one phone."
     others = set(threading.enumerate())
     threading.Thread(target=_ask_ahead, args=(library,), daemon=True).start()
     app.state.studies.is_ending = lambda: server.should_exit
     with listener, _ending_on_signals(server):
-        output.result({"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}, text)
+        output.result(record, text)
         server.run(sockets=[listener])
     app.state.studies.end()
+    app.state.end_console()
     stop_updates()
     if _are_at_work(set(threading.enumerate()) - others):
         # Python waits for threads that make a page, a minute for a large run, and ends others by

@@ -13,12 +13,12 @@ from markupsafe import Markup
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
+from bridge.media.color import encode_jpeg
 from bridge.whole_file import write_whole
 from dashboards import wording
 from dashboards.clips import (
     ClipConfig,
     Footage,
-    as_jpeg,
     as_video,
     can_film,
     contact_sheet,
@@ -30,6 +30,7 @@ from dashboards.episode_page import build_page
 from dashboards.figures import TimePlot
 from dashboards.library import episode_path
 from dashboards.loading import LOADING
+from dashboards.queue_page import SUBSAMPLING
 from evaluator.compare.rows import Comparison
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
 from evaluator.report.figures.selection import drawable, drawings_of
@@ -320,7 +321,7 @@ def _clip(found: Footage, config: ClipConfig, level: Level, trial: SharedTrial) 
     at = f"around the moment when {trial.moment_text}" if trial.moment_text else "at the end"
     words = f"{trial.row.episode} {sides} {at}"
     if level.is_video and len(found.frames) > 1:
-        key = as_jpeg(found.frames[found.key], config.quality)
+        key = encode_jpeg(found.frames[found.key], config.quality, subsampling=SUBSAMPLING)
         return Clip(
             picture=_data("image/jpeg", key),
             video=_data("video/mp4", as_video(found, config)),
@@ -334,7 +335,7 @@ def _clip(found: Footage, config: ClipConfig, level: Level, trial: SharedTrial) 
     frames = [found.frames[place] for place in places]
     picture = contact_sheet(frames, columns=2 if found.has_twin else 3)
     return Clip(
-        picture=_data("image/jpeg", as_jpeg(picture, config.quality)),
+        picture=_data("image/jpeg", encode_jpeg(picture, config.quality, subsampling=SUBSAMPLING)),
         video="",
         words=f"{words}, {len(frames)} pictures in reading order",
         width=picture.shape[1],

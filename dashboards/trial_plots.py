@@ -1,27 +1,35 @@
 """Plots of a trial on the page's clock: tool, gripper, clearance, objects, joints."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from bridge.clock import NS_PER_S
 from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from dashboards.figures import Signal, TimePlot, time_plot
 from dashboards.recording import PageClock, Recording
 from evaluator.compare.trial import read_tcp_errors
+from evaluator.errors import UndefinedStatisticError
+from evaluator.metrics.trajectory import JointErrors, joint_errors
 from evaluator.review_index import IndexedTrial
 
 RECORDED, PLANNED = "recorded", "planned"
 REPLAY_STYLES = {"planned": "twin-planned", "executed": "twin-executed"}
-LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05}
+LEAST_SPAN = {"m": 0.02, "mm": 5.0, "rad": 0.05, "mrad": 5.0}
 """A value axis covers at least this much of its unit."""
 MARGIN_SETTING = "eps_col_m"
 """The replay setting that holds the safety distance."""
 MM = 1000.0
 """Millimetres per metre."""
+MRAD = 1000.0
+"""Milliradians per radian."""
+SMALL: dict[str, Any] = {"width": 370, "height": 130}
+"""Size of a joint's plot [px]."""
 
 Samples = tuple[np.ndarray, np.ndarray]
 """Stamps [ns] and values."""
@@ -152,26 +160,78 @@ def _height(replay: Recording, name: str) -> Samples | None:
     return _position(replay.objects.get(name), 2, scale=MM)
 
 
-def plots_of_joints(recording: Recording, clock: PageClock) -> tuple[TimePlot, ...]:
-    """Draw one small plot per joint: planned and recorded.
+def plots_of_joints(
+    recording: Recording, shown: dict[str, Recording], clock: PageClock
+) -> tuple[TimePlot, ...]:
+    """Draw each joint as planned, recorded and replayed, and how far recording and twin are apart.
 
     Args:
         recording: The recorded episode; joints are named by it, or by its first plan that names
             them.
-        clock: Converts its stamps to the page's time.
+        shown: The replay that is drawn for each trajectory, planned and executed.
+        clock: Converts stamps to the page's time.
     """
     track = recording.joints
     planned = (plan.joint_names for _, plan in recording.plans if plan.joint_names)
     names = next(planned, ()) if track is None else track.names
+    errors = _joint_errors(track, shown, clock)
     plots = []
     for index, name in enumerate(names):
         signals = [
             _plan_signal(recording, clock, partial(_planned_joint, name=name)),
+            *_twin_signals(shown, clock, partial(_replayed_joint, name=name)),
             _recorded_signal(_column(track, index), clock),
         ]
         title = name.removesuffix("_joint").replace("_", " ")
-        plots.append(_plot(title, "rad", signals, clock, width=370, height=150))
+        note = _most_apart(errors, name)
+        plots.append(_plot(title, "rad", signals, clock, note=note, **SMALL))
+    apart = [
+        Signal(
+            name=f"to twin, {trajectory}",
+            style=REPLAY_STYLES.get(trajectory, "twin-executed"),
+            t_s=clock.all_seconds(each.stamps_ns),
+            values=MRAD * each.over_time_rad(),
+        )
+        for trajectory, each in errors.items()
+    ]
+    title, note = "All joints: recorded to replayed, root mean square", "computed by the evaluator"
+    plots.append(_plot(title, "mrad", apart, clock, level=0.0, note=note, **SMALL))
     return tuple(plot for plot in plots if plot is not None)
+
+
+def _joint_errors(
+    track: JointTrack | None, shown: dict[str, Recording], clock: PageClock
+) -> dict[str, JointErrors]:
+    """Let the evaluator compare recorded joints with each replay's, where they share instants."""
+    found = {}
+    for trajectory, replay in shown.items():
+        replayed = replay.joints
+        t_s = None if replayed is None else clock.replay_seconds(replay, replayed.stamps_ns)
+        if track is None or replayed is None or t_s is None:
+            continue
+        stamps_ns = clock.zero_ns + np.round(NS_PER_S * t_s).astype(np.int64)
+        try:
+            found[trajectory] = joint_errors(track, replace(replayed, stamps_ns=stamps_ns))
+        except UndefinedStatisticError:  # they share no joint or no instant
+            continue
+    return found
+
+
+def _most_apart(errors: Mapping[str, JointErrors], name: str) -> str:
+    """Say how far a joint is from each replay's at most."""
+    told = [
+        f"{MRAD * np.abs(each.error_rad[:, each.names.index(name)]).max():.1f} mrad, {trajectory}"
+        for trajectory, each in errors.items()
+        if name in each.names
+    ]
+    return f"recorded and twin apart by at most {'; '.join(told)}" if told else ""
+
+
+def _replayed_joint(replay: Recording, name: str) -> Samples | None:
+    track = replay.joints
+    if track is None or name not in track.names:
+        return None
+    return _column(track, track.names.index(name))
 
 
 def _planned_joint(plan: Plan, name: str) -> np.ndarray:

@@ -118,11 +118,12 @@ class TrialPages:
             t_s = round(float(request.query_params.get("t", "0")), 2)
         except ValueError:
             t_s = 0.0
-        what = (path.stem, _stamps(run, path, *SHOWN), t_s)
+        stamps = _stamps(run, path, *SHOWN)
+        what = (path.stem, stamps, t_s)
 
         def draw() -> bytes:
             with _GATHERING:
-                return _drawn(path, run.path, t_s)
+                return _drawn(path, run.path, stamps, t_s)
 
         return kept(drawn_once(run.results_dir / PICTURES, path.stem, what, draw), "image/jpeg")
 
@@ -151,21 +152,23 @@ def _stamps(run: RunFolder, path: Path, *kinds: str) -> Stamps:
 
 
 @lru_cache(maxsize=2)
-def _packed(path: Path, run_path: Path, _stamps: Stamps) -> bytes:
+def _packed(path: Path, run_path: Path, stamps: Stamps) -> bytes:
     with LOADING:
         from dashboards.scene_file import pack_scene  # noqa: PLC0415  # loads the twin
 
-    return pack_scene(_gathered(path, run_path))
+    return pack_scene(_gathered(path, run_path, stamps))
 
 
-def _drawn(path: Path, run_path: Path, t_s: float) -> bytes:
+def _drawn(path: Path, run_path: Path, stamps: Stamps, t_s: float) -> bytes:
     with LOADING:
         from dashboards.scene_file import draw_picture  # noqa: PLC0415  # loads the twin
 
-    return draw_picture(_gathered(path, run_path), t_s)
+    return draw_picture(_gathered(path, run_path, stamps), t_s)
 
 
-def _gathered(path: Path, run_path: Path) -> "TrialScene":
+@lru_cache(maxsize=1)
+def _gathered(path: Path, run_path: Path, _stamps: Stamps) -> "TrialScene":
+    """Gather once for the picture and for the 3D view, which are asked for together."""
     with LOADING:
         from dashboards.trial_scene import gather_scene  # noqa: PLC0415  # loads the twin
 

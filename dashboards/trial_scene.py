@@ -6,12 +6,14 @@ where the replay has them, taken back to where cameras see them. Nothing is loca
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from bridge.episode import streams
+from bridge.episode.cdr.messages import PointCloudSample
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -22,13 +24,14 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
 from dashboards.recording import PageClock, Problems, Recording
-from twin.replay.rebuilt_scene import correction_of
+from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.render import poses_in_scene
+from twin.scene.skinning import NUM_NEIGHBOURS, NUM_NODES, node_rotations
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
 
@@ -37,6 +40,21 @@ RATE_HZ = 20.0
 MAX_SAMPLES = 600
 """A long trial is sampled less often."""
 RECORDED = "recorded"
+MAX_NODE_POSES = 40_000
+"""Of one soft object in one replay, 28 bytes each: with many nodes they are sampled less often."""
+MAX_NODES = 1500
+"""A finer lattice is not drawn bent: the page tells no more parts than that from each other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bend:
+    """How a soft object is bent: the rigid motion of each node of its lattice."""
+
+    rest_nodes_m: Float[np.ndarray, "num_nodes 3"]
+    """In the object's frame, unbent: as the replay began."""
+    Ts_base_node: Float[np.ndarray, "num_samples num_nodes 4 4"]
+    """Take what is near a node from the object's frame to where it is. Samples are evenly spaced
+    over the page's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +68,8 @@ class Side:
     Ts_base_object: Mapping[str, Float[np.ndarray, "num_samples 4 4"]]
     skeleton_m: Float[np.ndarray, "num_samples num_points 3"] | None
     """The arm as a line from base to tool; None where its joints are not known."""
+    bends: Mapping[str, Bend] = field(default_factory=dict)
+    """Of soft objects whose nodes the replay holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,9 +178,6 @@ def gather_scene(
     robot = None if postures is None else problems.attempt(lambda: load_robot(postures.urdf), None)
     tracks = problems.attempt(lambda: _localised(gathering, postures), ObjectTracks())
     problems.texts.extend(tracks.notes)
-    soft = [] if gathering.task is None else list(gathering.task.soft_objects)
-    if soft and replays:
-        problems.texts.append(f"{', '.join(soft)}: as replayed drawn without being bent")
     sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():
         side = _replayed_side(gathering, trajectory, replay, robot)
@@ -238,8 +255,81 @@ def _replayed_side(
         order = [joints.names.index(name) for name in robot.joints]
         points = [robot.skeleton_m(row) for row in joints.at(own_ns)[:, order]]
         skeleton = se3.apply(gathering.T_root_base, np.stack(points))
-    span_s = (float(ends[0]), float(ends[1]))
-    return Side(name=trajectory, span_s=span_s, Ts_base_object=objects, skeleton_m=skeleton)
+    bends = {}
+    for name in () if gathering.task is None else gathering.task.soft_objects:
+        track = replay.objects.get(name)
+        nodes = None if track is None else _nodes(gathering, replay, name)
+        if track is None or nodes is None:
+            text = f"{name}: as replayed ({trajectory}) drawn without being bent"
+            gathering.problems.texts.append(text)
+            continue
+        bends[name] = _bend(nodes, track, own_ns, correction)
+    return Side(
+        name=trajectory,
+        span_s=(float(ends[0]), float(ends[1])),
+        Ts_base_object=objects,
+        skeleton_m=skeleton,
+        bends=bends,
+    )
+
+
+Nodes = tuple[Int[np.ndarray, " num_states"], Float[np.ndarray, "num_states num_nodes 3"]]
+"""When, on the replay's clock, and where."""
+
+
+def _nodes(gathering: _Gathering, replay: Recording, name: str) -> Nodes | None:
+    """Read the nodes of a soft object; None where the replay holds none that can be drawn."""
+    episode = gathering.problems.attempt(lambda: Episode.open(replay.path), None)
+    topic = None if episode is None else streams.object_pose_topics(episode).get(name)
+    if episode is None or topic is None:
+        return None
+    messages = episode.messages([f"{topic.removesuffix('pose')}nodes"])
+    found: list[PointCloudSample] = []
+    samples = gathering.problems.attempt(
+        lambda: [PointCloudSample.from_cdr(message.data) for message in messages], found
+    )
+    sizes = {len(sample.points_m) for sample in samples}
+    if len(sizes) != 1 or not NUM_NODES + 1 < max(sizes) <= MAX_NODES:
+        return None
+    points_m = np.stack([sample.points_m for sample in samples])
+    whole = np.isfinite(points_m).all(axis=(1, 2))  # later states of one that burst are left out
+    if not whole[0]:
+        return None
+    count = len(whole) if whole.all() else int(whole.argmin())
+    return np.array([sample.stamp_ns for sample in samples[:count]]), points_m[:count]
+
+
+def _bend(
+    nodes: Nodes, track: PoseTrajectory, own_ns: Int[np.ndarray, " num_samples"], found: Correction
+) -> Bend:
+    """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
+
+    Args:
+        nodes: As ``_nodes`` returns them.
+        track: Poses of the object as the robot finds it.
+        own_ns: The page's samples on the replay's clock, evenly spaced.
+        found: Takes what is replayed to where cameras see it.
+    """
+    stamps_ns, points_m = nodes
+    num_nodes = points_m.shape[1]
+    T_rest = track.at(stamps_ns[:1]).transforms()[0]
+    rest_m = se3.apply(se3.invert(T_rest), points_m[0])
+    _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
+    count = int(np.clip(MAX_NODE_POSES // num_nodes, 2, len(own_ns)))
+    times_ns = np.linspace(own_ns[0], own_ns[-1], count)
+    Ts = np.tile(np.eye(4), (count, num_nodes, 1, 1))
+    for row, (time_ns, T) in enumerate(
+        zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
+    ):
+        at = float(np.interp(time_ns, stamps_ns, np.arange(len(stamps_ns))))
+        before, share = int(at), at - int(at)
+        after = min(before + 1, len(stamps_ns) - 1)
+        now_m = (1 - share) * points_m[before] + share * points_m[after]
+        seen_m = found.nodes_as_seen(now_m, T)
+        R = node_rotations(rest_m, seen_m, around[:, 1:])
+        Ts[row, :, :3, :3] = R
+        Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)
+    return Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
 
 
 def _links(

@@ -133,6 +133,7 @@ function playerKey(event) {
   else if (event.key === "ArrowRight") setTime(Number(clock.value) + 0.1);
   else if (event.key === "c") document.getElementById("camera")?.click();
   else if (event.key === "v") document.getElementById("mode")?.dispatchEvent(new Event("next"));
+  else if (event.key === "j") document.querySelector(".joints > summary")?.click();
   else if (event.key === "d") document.getElementById("divergence")?.click();
   else return;
   event.preventDefault();

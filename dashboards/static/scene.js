@@ -125,13 +125,12 @@ class Eye {
 }
 
 class View {
-  constructor(panel, file) {
+  constructor(painter, file) {
     this.file = file;
-    this.canvas = panel.querySelector("canvas");
-    const gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false });
-    if (!gl) throw new Error("no WebGL 2 here");
-    this.gl = gl;
-    this.painter = new Painter(gl, file.splats, file.count, file.parts.length, file.harmonics);
+    this.painter = painter;
+    this.gl = painter.gl;
+    this.canvas = painter.gl.canvas;
+    painter.load(file.splats, file.count, file.parts.length, file.harmonics);
     this.eye = new Eye(file);
     this.t = Number(clock.value);
     this.side = "";
@@ -386,10 +385,13 @@ async function open() {
   try {
     state.textContent = "Loading the scene …";
     const began = performance.now();
-    const answer = await fetch(panel.dataset.source);
+    const asked = fetch(panel.dataset.source);
+    const gl = panel.querySelector("canvas").getContext("webgl2", { alpha: false, antialias: false });
+    if (!gl) throw new Error("no WebGL 2 here");
+    const painter = new Painter(gl);
+    const [answer] = await Promise.all([asked, painter.ready()]);
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
-    const view = new View(panel, read(await answer.arrayBuffer()));
-    await view.painter.compiled();
+    const view = new View(painter, read(await answer.arrayBuffer()));
     document.addEventListener("page-time", ({ detail }) => { view.t = detail; view.changed(); });
     steer(view);
     buttons(panel, view);

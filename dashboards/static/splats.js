@@ -144,6 +144,7 @@ async function compiled(gl, made) {
 
 function texture(gl, unit) {
   gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.deleteTexture(gl.getParameter(gl.TEXTURE_BINDING_2D));
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
   for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
     gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
@@ -158,22 +159,10 @@ function attribute(gl, place, size, stride, offset) {
 
 // One canvas. A view is { x, y, z, eye, lens }: rows of R_camera_root, centre, fx fy cx cy.
 export class Painter {
-  constructor(gl, splats, count, numParts, harmonics) {
+  constructor(gl) {
     this.gl = gl;
-    this.harmonics = harmonics;
-    this.drawn = 0;
-    this.numLines = 0;
     this.splats = program(gl, SPLATS, SPLATS_COLOR);
     this.lines = program(gl, LINES, LINES_COLOR);
-    const rows = Math.max(1, Math.ceil(count / PER_ROW));
-    const padded = new Uint32Array(rows * PER_ROW * 12);
-    padded.set(splats);
-    texture(gl, 0);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, 3 * PER_ROW, rows, 0,
-      gl.RGBA_INTEGER, gl.UNSIGNED_INT, padded);
-    texture(gl, 1);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 4, Math.max(1, numParts), 0, gl.RGBA, gl.FLOAT, null);
-    this.numParts = numParts;
     this.order = this.inputs(() => {
       gl.enableVertexAttribArray(0);
       gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
@@ -189,8 +178,32 @@ export class Painter {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  async compiled() {
+  // Compile, and draw one Gaussian and one stroke of nothing: drivers translate a program when it
+  // first draws. That takes a second in software, best spent while the scene is on its way.
+  async ready() {
     for (const { made } of [this.splats, this.lines]) await compiled(this.gl, made);
+    this.load(new Uint32Array(12), 1, 1, 1);
+    this.place(new Float32Array(16));
+    this.sorted(new Uint32Array(1));
+    this.stroke(new Float32Array(10));
+    this.draw({ x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1], eye: [0, 0, 0], lens: [1, 1, 0, 0] }, 1);
+    this.gl.flush();
+  }
+
+  load(splats, count, numParts, harmonics) {
+    const { gl } = this;
+    const rows = Math.max(1, Math.ceil(count / PER_ROW));
+    const padded = new Uint32Array(rows * PER_ROW * 12);
+    padded.set(splats);
+    texture(gl, 0);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32UI, 3 * PER_ROW, rows, 0,
+      gl.RGBA_INTEGER, gl.UNSIGNED_INT, padded);
+    texture(gl, 1);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 4, Math.max(1, numParts), 0, gl.RGBA, gl.FLOAT, null);
+    this.numParts = numParts;
+    this.harmonics = harmonics;
+    this.drawn = 0;
+    this.numLines = 0;
   }
 
   inputs(describe) {

@@ -17,6 +17,15 @@ def dashboard(
     run: RunFolder, port: int = 0, *options: str
 ) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Start the real command and wait for its address."""
+    with serving(run, port, *options) as (process, record):
+        yield process, str(record["url"])
+
+
+@contextmanager
+def serving(
+    run: RunFolder, port: int = 0, *options: str
+) -> Iterator[tuple[subprocess.Popen[str], dict[str, object]]]:
+    """Start the real command and wait for all that it prints when it is ready."""
     command = [
         sys.executable,
         "-m",
@@ -39,7 +48,7 @@ def dashboard(
             line = process.stdout.readline()
             assert line, process.stderr.read()
             text += line
-        yield process, json.loads(text)["url"]
+        yield process, json.loads(text)
     finally:
         if process.poll() is None:
             process.kill()

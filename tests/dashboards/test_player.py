@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
 from serving import dashboard
@@ -183,6 +184,26 @@ def write_divergence(run: RunFolder, planned: Path, plan_id: str) -> None:
         )
 
 
+def test_each_joint_is_drawn_as_planned_recorded_and_replayed_and_how_far_apart(
+    run: RunFolder, synthetic: ModuleType
+) -> None:
+    *joints, apart = page(run).joint_plots
+    assert len(joints) == 6
+    t_s = np.arange(0, 6, 0.05)  # the recording
+    recorded = [synthetic._joints(min(max(t - 1.12, 0.0), 4.5)) for t in t_s]
+    t_twin_s = np.arange(110) / 20 + 1.0  # the replay begins with its plan
+    replayed = np.array([synthetic._joints(min(t - 1.0, 4.5)) for t in t_twin_s])
+    both = (t_s >= t_twin_s[0]) & (t_s <= t_twin_s[-1] + 1e-9)
+    for index, plot in enumerate(joints):
+        assert [line.name for line in plot.lines] == ["commanded", "twin, planned", "recorded"]
+        assert all(line.pieces for line in plot.lines)
+        twin = np.interp(t_s[both], t_twin_s, replayed[:, index])
+        most = np.abs(np.array(recorded)[both, index] - twin).max()
+        assert f"at most {1000 * most:.1f} mrad, planned" in plot.note
+    assert [line.name for line in apart.lines] == ["to twin, planned"]
+    assert apart.unit == "mrad"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
 def test_keys_move_all_pictures_and_they_never_differ_in_time(
@@ -200,6 +221,14 @@ def test_keys_move_all_pictures_and_they_never_differ_in_time(
             tab.ask_when("frames.every((f) => !f.loading && f.shown === f.wanted)")
             times = tab.ask(shown)
             assert times[0] == times[1]
+        tab.press("j")
+        values = "[...document.querySelectorAll('.joints output')].map(o => o.value).join(' ')"
+        angles = tab.ask(values)
+        assert tab.ask("document.querySelector('.joints .cursor').getBBox().height") > 50
+        tab.press("ArrowRight")
+        assert tab.ask(values) != angles
+        tab.press("ArrowLeft")
+        tab.press("j")
         before = tab.picture()
         for _ in range(3):
             tab.press("ArrowRight")

@@ -25,6 +25,7 @@ LIGHT_ROOMS = (
     "twin.cli",
     "evaluator.cli",
     "dashboards.cli",
+    "dashboards.scene_file",
     "evaluator.result",
     "robot_gst",
 )

@@ -12,7 +12,6 @@ from typing import Any
 
 import coal
 import numpy as np
-import open3d
 import pinocchio as pin
 from jaxtyping import Float, Float32, Int, Int64
 
@@ -104,6 +103,8 @@ class PosedSurface:
         """Pose all links."""
         poses = link_poses(robot, posture)
         self.links: tuple[str, ...] = tuple(item.link for item in link_surfaces(robot))
+        import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
+
         make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
         self._scene = make()
         boxes = []
@@ -192,6 +193,8 @@ def sample_surface(
 
 
 def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
+    import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
+
     shape = item.geometry
     if isinstance(shape, coal.Box):
         corners = np.array(list(product((-1.0, 1.0), repeat=3))) * np.array(shape.halfSide)
@@ -222,5 +225,7 @@ def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tensor(array: np.ndarray) -> Any:
+    import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
+
     make: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough
     return make(np.ascontiguousarray(array))

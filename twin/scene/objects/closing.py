@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import open3d
 from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -87,9 +86,11 @@ class _ClosedSurface:
     """A mesh that rays can be cast at, in the object's frame."""
 
     def __init__(self, mesh: Triangles) -> None:
+        import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
+
         make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
         tensor: Any = open3d.core.Tensor
-        self._scene = make()
+        self._scene, self._tensor = make(), tensor
         vertices_m, triangles = mesh
         self._scene.add_triangles(
             tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32))
@@ -103,8 +104,7 @@ class _ClosedSurface:
         directions = rays @ T_object_camera[:3, :3].T
         origins = np.broadcast_to(T_object_camera[:3, 3], directions.shape)
         both = np.concatenate([origins, directions], axis=-1).astype(np.float32)
-        tensor: Any = open3d.core.Tensor
-        found = self._scene.cast_rays(tensor(np.ascontiguousarray(both)))
+        found = self._scene.cast_rays(self._tensor(np.ascontiguousarray(both)))
         return found["t_hit"].numpy(), found["primitive_normals"].numpy()
 
 
