@@ -306,8 +306,9 @@ class RenderConfig:
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
-    """File to write; default: RUN/results/render.png. A whole episode: an .mp4 file, or a folder
-    for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
+    """File to write; default: RUN/results/render.png. With .ply: the Gaussians themselves, so that
+    other viewers show at this distance what the image would. A whole episode: an .mp4 file, or a
+    folder for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
@@ -322,7 +323,7 @@ class RenderConfig:
     @property
     def is_sequence(self) -> bool:
         """Whether a whole episode is drawn, and not one image."""
-        if self.out is not None and self.out.suffix.lower() == ".png":
+        if self.out is not None and self.out.suffix.lower() in (".png", ".ply"):
             return False
         one = self.at_s is not None or self.joints is not None
         return not one and bool(self.episode)

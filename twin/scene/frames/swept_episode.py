@@ -178,15 +178,16 @@ def _images(scan: _PosedScan, config: FrameConfig, output: Output) -> list[_Imag
     found: list[_Image] = []
     for camera_id in scan.camera_ids:
         info = streams.camera_info(scan.episode, camera_id)
-        topic = streams.find_camera_topic(scan.episode, camera_id, "color/image")
+        found_topic = streams.find_camera_topic(scan.episode, camera_id, "color/image")
+        topics = [found_topic] if found_topic else []
         stamps = np.array(
-            [stamp_of(decode(m.type_name, m.data)) for m in scan.episode.messages([topic])]
+            [stamp_of(decode(m.type_name, m.data)) for m in scan.episode.messages(topics)]
         )
         posed = stamps[~unknown_mask(scan.tree, [info.frame_id], stamps)]
         chosen = spread(np.unique(posed), max(1, most // len(scan.camera_ids))).tolist()
         held = set(chosen[config.first_holdout :: config.holdout_every])
         wanted = set(chosen)
-        for message in streams.image_messages(scan.episode, [topic] if topic else []):
+        for message in streams.image_messages(scan.episode, topics):
             color = color_from_message(message.type_name, message.data)
             if color.stamp_ns not in wanted:
                 continue
