@@ -206,9 +206,9 @@ def _images(scan: _PosedScan, config: FrameConfig, output: Output) -> list[_Imag
 
 def _range(scan: _PosedScan, views: Sequence[PosedView]) -> tuple[float, float]:
     """Least and most depth to try [m]."""
-    said = scan.source.get("depth_range_m")
-    if said:
-        return float(said[0]) / SLACK, float(said[1]) * SLACK
+    imported = scan.source.get("depth_range_m")
+    if imported:
+        return float(imported[0]) / SLACK, float(imported[1]) * SLACK
     Ts = np.stack([view.T_world_camera for view in views])
     distance = distance_to_what_is_seen(Ts)
     if distance is None:
