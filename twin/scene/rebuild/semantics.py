@@ -245,10 +245,10 @@ def write_scene_semantics(
                 threads=threads,
                 advance=advance,
             )
-    labels = ", ".join(item["label"] for item in record["instances"])
+    names = "; ".join(item["name"] for item in record["instances"])
     output.say(
-        f"{len(record['instances'])} things ({record['source']}): {labels}"
-        if labels
+        f"{len(record['instances'])} things ({record['source']}): {names}"
+        if names
         else f"no things named: {record['remark']}"
     )
     return {"semantics": record}

@@ -25,6 +25,10 @@ class Mask:
     """The segmenter's confidence, 0..1."""
 
 
+UNKNOWN_SHAPE = "toy"
+"""Word in labels for a shape that is no box, cylinder, ball or container."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MaskSet:
     """All masks of one frame; ids need not agree between frames, masks may overlap."""
@@ -69,6 +73,14 @@ class Instance:
     parts: Mapping[str, Bool[np.ndarray, " num_splats"]] = field(default_factory=dict)
     keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
     """Named points in the root frame."""
+
+    @property
+    def name(self) -> str:
+        """What people are told: size and number too, and no shape where none is known."""
+        size = " x ".join(f"{100 * extent:.0f}" for extent in self.size_m)
+        colour, _, shape = self.label.rpartition(" ")
+        known = self.label if shape != UNKNOWN_SHAPE else colour
+        return f"object {self.id}, {known or 'no name'}, {size} cm"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,8 @@ SOURCE = "default segmenter"
 MAX_FOOT_ROUNDS = 8
 MIN_FRAGMENT = 8
 """Voxels of the smallest fragment that may be joined to a thing."""
+PLANE_COLOURS = 0.75
+"""This share of the plane's points says how much its colour varies."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +66,9 @@ class SegmentConfig:
     """Points this near to the robot's surface are robot."""
     foot_colour_gap: float = 12.0
     """Lab distance up to which low points belong to the thing above them."""
+    relief_score: float = 0.25
+    """What rises so little (``Thing.score``) and has the plane's own colour is the plane: noise of
+    its depth, not a thing. So is a flat thing of exactly the plane's colour."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +125,7 @@ def segment_points(
     labels = _largest_first(labels)
     low = free & (np.abs(height) <= config.min_height_m)
     _add_feet(labels, points, low, height, voxel_m, config)
+    labels = _without_relief(labels, points, low, height, config)
     things = tuple(
         _thing(points.take(labels == number), height[labels == number], voxel_m, config)
         for number in range(1, int(labels.max(initial=0)) + 1)
@@ -252,14 +258,43 @@ def _add_feet(
         labels[feet[mine]] = labels[thing[mine]]
 
 
+def _without_relief(
+    labels: Int[np.ndarray, " num_points"],
+    points: SurfacePoints,
+    low: Bool[np.ndarray, " num_points"],
+    height_m: np.ndarray,
+    config: SegmentConfig,
+) -> Int[np.ndarray, " num_points"]:
+    """Give back to the plane what hardly rises above it and looks like it."""
+    plane = low & (labels == 0)
+    if not plane.any():
+        return labels
+    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+    middle = np.median(lab[plane], axis=0)
+    own = float(np.quantile(np.linalg.norm(lab[plane] - middle, axis=1), PLANE_COLOURS))
+    kept = np.zeros_like(labels)
+    for number in range(1, int(labels.max(initial=0)) + 1):
+        mine = labels == number
+        away = float(np.linalg.norm(np.median(lab[mine], axis=0) - middle))
+        is_flat = _firmness(height_m[mine], config) < config.relief_score
+        if not (is_flat and away < max(own, config.foot_colour_gap)):
+            kept[mine] = kept.max() + 1
+    return kept
+
+
+def _firmness(height_m: np.ndarray, config: SegmentConfig) -> float:
+    """Share of points that noise of the plane does not explain."""
+    return float((height_m > 2 * config.min_height_m).mean())
+
+
 def _thing(
     points: SurfacePoints, height_m: np.ndarray, voxel_m: float, config: SegmentConfig
 ) -> Thing:
     xyh = np.concatenate([points.p_m[:, :2], height_m[:, None]], axis=1)
     shape = measure_shape(xyh, voxel_m)
     color = np.median(points.colors, axis=0).astype(np.float64)
-    firm = float((height_m > 2 * config.min_height_m).mean())
-    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=firm)
+    score = _firmness(height_m, config)
+    return Thing(label=f"{colour_name(color)} {shape.word}", shape=shape, score=score)
 
 
 MIN_OPACITY = 0.3

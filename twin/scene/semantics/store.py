@@ -81,6 +81,7 @@ def _about(item: Instance, rows: Mapping[str, int]) -> dict[str, Any]:
     return {
         "id": item.id,
         "label": item.label,
+        "name": item.name,
         "object": _object_of(item, rows),
         "num_splats": int(item.mask.sum()),
         "support": item.support,

@@ -4,6 +4,7 @@ import table_scene
 from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.lift import render_labels
 from twin.scene.semantics.segment import (
@@ -44,6 +45,9 @@ def test_the_fused_scene_gives_masks_of_every_frame(tabletop: World) -> None:
     viewpoints = [shot.viewpoint for shot in tabletop.train]
     scene = scene_by_default(tabletop.cloud, viewpoints, rasteriser)
     assert all(item.support == len(viewpoints) for item in scene.instances)
+    names = {item.label: item.name.split(", ")[1:] for item in scene.instances}
+    assert names["red cube"] == ["red cube", "4 x 4 x 4 cm"]
+    assert names["yellow toy"][0] == "yellow"  # a shape nobody knows is not called one
     shot = tabletop.held_out[0]
     ids = render_labels(rasteriser, tabletop.cloud, scene.labels, shot.viewpoint)
     for index, item in enumerate(scene.instances, start=1):
@@ -127,3 +131,23 @@ def test_the_answer_does_not_depend_on_where_the_table_stands(tabletop: World) -
     first, second = (segment_points(item, SegmentConfig()) for item in (points, moved))
     assert [t.label for t in first.things] == [t.label for t in second.things]
     assert (first.labels == second.labels).mean() > 0.99
+
+
+def test_relief_of_the_table_is_no_thing_and_a_flat_card_is_one() -> None:
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(-0.3, 0.3, (40_000, 2))
+    bump = np.exp(-np.sum((xy - [0.1, 0.1]) ** 2, axis=1) / (2 * 0.03**2))
+    ridge = np.exp(-((xy[:, 0] + 0.15) ** 2) / (2 * 0.02**2)) * (np.abs(xy[:, 1]) < 0.1)
+    card = (np.abs(xy[:, 0] - 0.15) < 0.04) & (np.abs(xy[:, 1] + 0.15) < 0.03)
+    z = np.where(card, 0.010, 0.012 * bump + 0.011 * ridge) + rng.normal(0, 0.0005, len(xy))
+    wood = np.array([0.72, 0.56, 0.38]) + rng.normal(0, 0.04, (len(xy), 3))
+    points = SurfacePoints(
+        p_m=np.column_stack([xy, z]),
+        normals=np.tile([0.0, 0.0, 1.0], (len(xy), 1)),
+        colors=np.clip(np.where(card[:, None], [0.8, 0.1, 0.1], wood), 0, 1),
+    )
+    found = segment_points(points, SegmentConfig())
+    assert [thing.label.split()[0] for thing in found.things] == ["red"]
+    assert iou(found.labels == 1, card) > 0.9
+    everything = segment_points(points, SegmentConfig(relief_score=0.0))
+    assert len(everything.things) == 3
