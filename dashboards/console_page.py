@@ -7,6 +7,7 @@ import hashlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -358,18 +359,18 @@ class ConsolePages:
             causes=CAUSES,
             none_done=NONE_DONE,
             not_executed=NOT_EXECUTED,
-            result_of=result_of,
+            result_of=partial(_said, is_blind=bool(self._study.protocol.codes)),
             recorder=self._recorder,
         )
         key = hashlib.sha256(html.encode()).hexdigest()[:16]
         return {"html": html, "key": key, "elapsed_s": state.duration_s, "kind": state.kind}
 
 
-def result_of(outcome: Outcome) -> str:
-    """Say an answer in words, with a sign."""
+def _said(outcome: Outcome, *, is_blind: bool) -> str:
+    """Say an answer with a sign; to whom is blinded without its words, which may name the gate."""
     words = {"success": "✓ success", "failure": "✗ failure", "unknown": "? not known"}
     word = words.get(outcome.result, outcome.result)
-    return f"{word}: {outcome.detail}" if outcome.detail else word
+    return f"{word}: {outcome.detail}" if outcome.detail and not is_blind else word
 
 
 class _LateError(UsageError):

@@ -7,7 +7,7 @@ a plan or a verdict.
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -246,7 +246,10 @@ class ConsoleStudy:
         """
         path = episode_path(self.run, episode_id)
         outcome = outcome_of(self.run, Episode.open(path))
-        told = repr(None if outcome is None else asdict(outcome))
+        shown = outcome
+        if outcome is not None and self.protocol.codes:  # its words may name the gate
+            shown = replace(outcome, detail=None)
+        told = repr(None if shown is None else asdict(shown))
         version = hashlib.sha256(told.encode("utf-8", "surrogatepass")).hexdigest()[:16]
         return Answered(trial_id=episode_id, outcome=outcome, version=version)
 

@@ -13,7 +13,7 @@ from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
 from loopback import free_endpoint
 from serving import serving
 
-from bridge.episode.catalogue import outcome_of
+from bridge.episode.catalogue import label_episode, outcome_of
 from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -204,6 +204,8 @@ def test_neither_arms_nor_verdicts_change_a_byte_of_what_a_blinded_operator_sees
         )
         synthetic.write_trial(run, trial)
         synthetic.write_replay(run, trial, "planned", side == "a")
+        told = "the gate refused it" if side == "b" else None
+        label_episode(run, trial.id, Outcome(result="failure", detail=told))
         app, door = server(run)
         phone = Phone(synthetic, app, door.code)
         parts = [phone.look(), phone.look(correct=trial.id)]
@@ -214,7 +216,7 @@ def test_neither_arms_nor_verdicts_change_a_byte_of_what_a_blinded_operator_sees
         assert start.content.startswith(b"\xff\xd8")
         assert parts[1]["kind"] == "answer"
     assert shown[0] == shown[1]
-    for word in ("secret", "replan", "verdict", "accepted", "refused", "twin fails"):
+    for word in ("secret", "gate", "replan", "verdict", "accepted", "refused", "twin fails"):
         assert word not in str(shown[0][:2])
     assert "arm_01" in shown[0][0] + shown[0][1] or "scripted" in shown[0][0]
 
@@ -296,7 +298,7 @@ def test_a_study_is_recorded_answered_and_read_by_the_evaluator_through_servers_
     assert late["status"] == 409  # another tab that had not seen it
     corrected = phone.look(correct="trial_0001")["html"]
     assert "So far" in corrected
-    assert "✗ failure: dropped it" in corrected
+    assert "✗ failure" in corrected
 
     episode = Episode.open(run.episodes_dir / "trial_0001.mcap")
     outcome = outcome_of(run, episode)

@@ -4,9 +4,9 @@ import base64
 import io
 import json
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from PIL import Image
 from rerun_cell import write_localised
 from serving import dashboard
 
+from bridge.data_files import dataset_file
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import (
     CameraInfo,
@@ -33,7 +34,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ROBOT
-from bridge.task.task_file import SoftMaterial
 from dashboards import scene_file
 from dashboards.scene_file import HEAD, SPLAT
 from twin.robot.posture import posture_track
@@ -198,7 +198,7 @@ def bent_nodes(T: np.ndarray, rest_m: np.ndarray, t_s: float) -> np.ndarray:
     return se3.apply(T, turned)
 
 
-def soften(run: RunFolder, rest_m: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def soften(run: RunFolder, rest_m: np.ndarray) -> None:
     """Make the cube a soft one, and write where the nodes of its lattice go in the replay."""
     (replay,) = run.derived("*.replay.*")
     opened = Episode.open(replay)
@@ -217,20 +217,20 @@ def soften(run: RunFolder, rest_m: np.ndarray, monkeypatch: pytest.MonkeyPatch) 
                 nodes = f"{topic.removesuffix('pose')}nodes"
                 writer.write(nodes, cloud.to_cdr(), type_name=schema.POINT_CLOUD, **about)
     replay.unlink()
-    file = streams.task_file(Episode.open(run.episodes()[0]))
-    material = SoftMaterial(young_pa=1e4, poisson=0.3, damping_s=0.01, cell_m=0.02)
-    task = file.task()
-    soft = {**task.objects, "cube": replace(task.objects["cube"], soft=material)}
-    found = SimpleNamespace(task=lambda: replace(task, objects=soft))
-    monkeypatch.setattr(streams, "task_file", lambda _episode: found)
+    tasks = run.path / "tasks"
+    tasks.mkdir()
+    text = dataset_file("tasks", "cube_into_box").read_text()
+    box = 'shape = "box"\n'
+    soft = "soft = { young_pa = 60000.0, poisson = 0.2, damping_s = 0.01, cell_m = 0.016 }\n"
+    mesh = 'shape = "mesh"\nmesh = "sloth"\n'
+    assert box in text
+    (tasks / "cube_into_box.toml").write_text(text.replace(box, mesh + soft, 1))
 
 
-def test_a_soft_object_is_bent_as_the_twin_bends_it(
-    run: RunFolder, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_soft_object_is_bent_as_the_twin_bends_it(run: RunFolder, synthetic: ModuleType) -> None:
     axis = np.linspace(-0.055, 0.055, 7)
     rest_m = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    soften(run, rest_m, monkeypatch)
+    soften(run, rest_m)
     found = unpack(synthetic.browser_of(run).get(f"/episode/{ID}/scene").content)
     header = found.header
     assert not [note for note in header["notes"] if "bent" in note]
