@@ -366,10 +366,11 @@ class AgreementModel:
                         inside = like.steps[drawn] * (rng.random(len(mass)) - 0.5)
                         side[part, group] = expit(like.grid[drawn] + inside)
         # Draws are few: they are moved to the mean that the quadrature finds.
-        for side, mean in ((recorded, self._rates[:, 0]), (sim, self._rates[:, 1])):
-            side += mean - side.mean(axis=0)
-            np.clip(side, 0.0, 1.0, out=side)
-        return Draws(recorded=recorded, sim=sim)
+        moved = [
+            np.clip(side + (mean - side.mean(axis=0)), 0.0, 1.0)
+            for side, mean in zip((recorded, sim), self._rates.T, strict=True)
+        ]
+        return Draws(recorded=moved[0], sim=moved[1])
 
 
 def _flattened(log_w: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:

@@ -10,6 +10,7 @@ from scipy.special import expit
 
 from evaluator.compare.spreadsheet import compare_csv
 from evaluator.errors import UndefinedStatisticError
+from evaluator.report.front import front
 from evaluator.statistics.differences import mean_of_intervals, newcombe_difference
 from evaluator.statistics.group_likelihood import GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.hierarchical import (
@@ -241,3 +242,5 @@ def test_a_table_of_simpsons_is_said(write_table: Callable[[str], Path]) -> None
     assert within.value is not None
     assert between.value is not None
     assert within.value < 0 < between.value
+    assert front(results).summary.startswith(str(notes[0][1]))  # the report leads with it
+    assert all("Simpson" not in text for _, text in front(results).notes)
