@@ -1,7 +1,9 @@
 """The posterior of the model of agreement, once by its quadrature and once by a sampler.
 
 The sampler shares no code with the evaluator: Metropolis steps for the log-odds of groups and for
-spreads and correlations, exact draws of means, many chains at once. Written down are the posterior
+spreads and correlations, exact draws of means, many chains at once. Spreads also move together with
+what they spread (Yu and Meng 2011), without which few trials leave the chains where they are.
+Written down are the posterior
 means of both, and their difference in posterior standard deviations beside the sampler's own error.
 """
 
@@ -12,16 +14,18 @@ from typing import Any
 
 import numpy as np
 from measure import ROOT, Target, report_targets
-from scipy.special import expit
+from scipy.special import expit, ndtri
 
 from evaluator.statistics.group_likelihood import GroupCounts
 from evaluator.statistics.hierarchical import AgreementModel
 
-FULL_SWEEPS = 12_000
+FULL_SWEEPS = 10_000
 SWEEPS = int(os.environ.get("SAMPLER_SWEEPS", FULL_SWEEPS))
-CHAINS = 200
+CHAINS = 400
 ERROR = "error of the sampler in sd"
-MEAN_SD, SPREAD = 2.5, 2.5
+MEAN_SD, SPREAD, ALIKE = 2.5, 2.5, 0.5
+HEAVY = 5.0
+"""Degrees of freedom of what proposes log-odds anew."""
 if SWEEPS != FULL_SWEEPS:
     os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
 
@@ -50,14 +54,16 @@ class State:
     """Means of tasks (chains, tasks, sides); the overall mean alone without shared tasks."""
     mean: np.ndarray
     within: np.ndarray
-    """Logarithms of both spreads, and atanh of the correlation."""
+    """Logarithms of both spreads, and the arcsine of the correlation."""
     between: np.ndarray
+    shared: bool
+    """Whether groups share tasks: then both correlations are alike beforehand."""
 
 
 def normal_log(off: np.ndarray, spread: np.ndarray, more: float) -> np.ndarray:
     """Log density of pairs (chains, many, 2) summed over the many, up to a constant."""
     s, t = np.exp(2 * spread[:, 0]) + more, np.exp(2 * spread[:, 1]) + more
-    c = np.tanh(spread[:, 2]) * np.exp(spread[:, 0] + spread[:, 1])
+    c = np.sin(spread[:, 2]) * np.exp(spread[:, 0] + spread[:, 1])
     det = s * t - c * c
     xx, yy, xy = (off[..., 0] ** 2).sum(1), (off[..., 1] ** 2).sum(1), off.prod(-1).sum(1)
     return np.asarray(
@@ -66,18 +72,29 @@ def normal_log(off: np.ndarray, spread: np.ndarray, more: float) -> np.ndarray:
 
 
 def spread_log(spread: np.ndarray) -> np.ndarray:
-    """Log prior: half-normal spreads on their logarithm, 1 / cosh of atanh rho."""
+    """Log prior: half-normal spreads on their logarithm, a uniform arcsine of rho."""
     sizes = np.exp(spread[:, :2])
-    found = (spread[:, :2] - 0.5 * sizes**2 / SPREAD**2).sum(1)
-    return np.asarray(found - np.log(np.cosh(spread[:, 2])))
+    return np.asarray((spread[:, :2] - 0.5 * sizes**2 / SPREAD**2).sum(1))
+
+
+def prior_log(state: State, which: str, spread: np.ndarray) -> np.ndarray:
+    """Log prior of one level's spread, given the other's: a normal copula of both angles."""
+    found = spread_log(spread)
+    if not state.shared:
+        return found
+    other = state.between if which == "within" else state.within
+    z, o = (ndtri(each[:, 2] / np.pi + 0.5) for each in (spread, other))
+    return np.asarray(
+        found - 0.5 * (z**2 + o**2 - 2 * ALIKE * z * o) / (1 - ALIKE**2) + 0.5 * (z**2 + o**2)
+    )
 
 
 def matrix(spread: np.ndarray, more: float) -> np.ndarray:
     """Covariance of each chain."""
     size = np.exp(spread[:, :2])
     found = size[:, :, None] * size[:, None, :]
-    found[:, 0, 1] *= np.tanh(spread[:, 2])
-    found[:, 1, 0] *= np.tanh(spread[:, 2])
+    found[:, 0, 1] *= np.sin(spread[:, 2])
+    found[:, 1, 0] *= np.sin(spread[:, 2])
     return np.asarray(found + more * np.eye(2))
 
 
@@ -112,19 +129,24 @@ def sample(study: list[tuple[str, int, int, int, int]], more: float) -> np.ndarr
         mean=np.zeros((CHAINS, 2)),
         within=0.3 * rng.standard_normal((CHAINS, 3)),
         between=0.3 * rng.standard_normal((CHAINS, 3)),
+        shared=shared,
     )
     found = []
     for sweep in range(SWEEPS):
         step_rates(state, k, n, task, more, rng)
+        step_rates_far(state, k, n, task, more, rng)
         step_means(state, member, shared, more, rng)
         for _ in range(2):
             step_spread(state, state.theta - state.centre[:, task], "within", more, rng)
             if shared:
                 step_spread(state, state.centre - state.mean[:, None], "between", 1e-4, rng)
+        step_together(state, k, n, task, "within", more, rng)
+        if shared:
+            step_together(state, k, n, task, "between", 1e-4, rng)
         if sweep >= SWEEPS // 5:
             rates = expit(state.theta)
             gap = (rates[..., 1] - rates[..., 0]).mean(1)
-            rho = np.tanh(state.within[:, 2]), np.tanh(state.between[:, 2])
+            rho = np.sin(state.within[:, 2]), np.sin(state.between[:, 2])
             found.append(np.stack([*state.mean.T, rho[0], rho[1], gap], axis=-1))
     return np.array(found)
 
@@ -152,6 +174,38 @@ def step_rates(
     state.theta = np.where(accept[..., None], moved, state.theta)
 
 
+def step_rates_far(
+    state: State,
+    k: np.ndarray,
+    n: np.ndarray,
+    task: np.ndarray,
+    more: float,
+    rng: np.random.Generator,
+) -> None:
+    """Draw the log-odds of every group anew, about where counts and the others put them."""
+    inverse = np.linalg.inv(matrix(state.within, more))
+    centre = state.centre[:, task]
+    noise = 1 / (k + 0.5) + 1 / (n - k + 0.5)
+    precision = inverse[:, None] + np.eye(2) / noise[:, None, :]
+    pull = np.einsum("cij,cgj->cgi", inverse, centre) + np.log((k + 0.5) / (n - k + 0.5)) / noise
+    cov = np.linalg.inv(precision)
+    middle = np.einsum("cgij,cgj->cgi", cov, pull)
+    chol = np.linalg.cholesky(1.3 * cov)
+    stretch = np.sqrt(HEAVY / rng.chisquare(HEAVY, (*middle.shape[:2], 1)))
+    moved = middle + np.einsum("cgij,cgj->cgi", chol, rng.standard_normal(middle.shape) * stretch)
+
+    def log(theta: np.ndarray) -> np.ndarray:
+        off = theta - centre
+        prior = -0.5 * np.einsum("cgi,cij,cgj->cg", off, inverse, off)
+        away = theta - middle
+        far = np.einsum("cgi,cgij,cgj->cg", away, precision, away) / 1.3
+        here = (k * theta - n * np.logaddexp(0, theta)).sum(-1) + prior
+        return np.asarray(here + (HEAVY + 2) / 2 * np.log1p(far / HEAVY))
+
+    accept = np.log(rng.random(moved.shape[:2])) < log(moved) - log(state.theta)
+    state.theta = np.where(accept[..., None], moved, state.theta)
+
+
 def step_means(
     state: State, member: np.ndarray, shared: bool, more: float, rng: np.random.Generator
 ) -> None:
@@ -173,16 +227,58 @@ def step_means(
     state.mean = gauss(total, np.einsum("cij,cj->ci", outer, state.centre.sum(1)), rng)
 
 
+def moved_from(now: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Propose spreads and correlations; an angle beyond its end comes back from there."""
+    size = rng.choice([0.1, 0.3, 1.0], size=(CHAINS, 1))
+    moved = now + size * rng.standard_normal(now.shape)
+    half = np.pi / 2
+    moved[:, 2] = half - np.abs((moved[:, 2] + half) % (4 * half) - 2 * half)
+    return np.asarray(moved)
+
+
 def step_spread(
     state: State, off: np.ndarray, which: str, more: float, rng: np.random.Generator
 ) -> None:
     """Move spreads and correlation of one level."""
     now = getattr(state, which)
-    moved = now + rng.choice([0.15, 0.5, 1.2], size=(CHAINS, 1)) * rng.standard_normal(now.shape)
-    gain = normal_log(off, moved, more) + spread_log(moved)
-    gain -= normal_log(off, now, more) + spread_log(now)
+    moved = moved_from(now, rng)
+    gain = normal_log(off, moved, more) + prior_log(state, which, moved)
+    gain -= normal_log(off, now, more) + prior_log(state, which, now)
     accept = np.log(rng.random(CHAINS)) < gain
     setattr(state, which, np.where(accept[:, None], moved, now))
+
+
+def step_together(
+    state: State,
+    k: np.ndarray,
+    n: np.ndarray,
+    task: np.ndarray,
+    which: str,
+    more: float,
+    rng: np.random.Generator,
+) -> None:
+    """Move spreads and correlation of one level, and what they spread in the same proportion."""
+    now = getattr(state, which)
+    moved = moved_from(now, rng)
+    turn = np.linalg.cholesky(matrix(moved, more)) @ np.linalg.inv(
+        np.linalg.cholesky(matrix(now, more))
+    )
+    of_tasks = which == "between"
+    middle = state.mean[:, None] if of_tasks else state.centre[:, task]
+    off = (state.centre if of_tasks else state.theta) - middle
+    change = np.einsum("cij,cgj->cgi", turn, off) - off
+    theta = state.theta + (change[:, task] if of_tasks else change)
+
+    def log(rates: np.ndarray) -> np.ndarray:
+        return np.asarray((k * rates - n * np.logaddexp(0, rates)).sum((1, 2)))
+
+    gain = log(theta) - log(state.theta)
+    gain += prior_log(state, which, moved) - prior_log(state, which, now)
+    accept = np.log(rng.random(CHAINS)) < gain
+    setattr(state, which, np.where(accept[:, None], moved, now))
+    state.theta = np.where(accept[:, None, None], theta, state.theta)
+    if of_tasks:
+        state.centre = np.where(accept[:, None, None], state.centre + change, state.centre)
 
 
 def main() -> None:

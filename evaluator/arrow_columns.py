@@ -19,6 +19,8 @@ from evaluator.memory import Packed, packed
 
 TEXT, WHOLE, NUMBER, ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 """Column types in which unknown is null, never "", 0, NaN or False."""
+SHARED_TEXT = pa.dictionary(pa.int32(), TEXT)
+"""Texts as they are read where many rows share few: each place names one of a list."""
 _NUMPY = {pa.int32(): np.int32, WHOLE: np.int64, NUMBER: np.float64}
 _TAKEN: dict[pa.DataType, tuple[type, ...]] = {
     TEXT: (str,),
@@ -108,6 +110,11 @@ def _arrays(piece: pa.Array) -> list[Packed | None]:
 
 
 def _values(piece: pa.Array) -> list[Any]:
+    if piece.type == SHARED_TEXT:
+        texts, places = _values(piece.dictionary), _values(piece.indices)
+        if not piece.null_count:
+            return [texts[place] for place in places]
+        return [None if place is None else texts[place] for place in places]
     first, end = piece.offset, piece.offset + len(piece)
     mask, *buffers = piece.buffers()
     if pa.types.is_list(piece.type):

@@ -400,7 +400,10 @@ def written_index(
 
 def _stored(values: Iterable[Any]) -> list[Any]:
     """Spell out what is not valid Unicode, as in names of files."""
-    return [printable(value) if isinstance(value, str) else value for value in values]
+    return [
+        printable(value) if isinstance(value, str) and not value.isascii() else value
+        for value in values
+    ]
 
 
 def _found_by(trial: IndexedTrial, slugs: Mapping[str, str]) -> list[Any]:

@@ -169,7 +169,7 @@ class RunFolder:
         Raises:
             UsageError: When the folder holds no episode.
         """
-        if not self.episodes():
+        if not any(self.episodes_dir.glob("*.mcap")):
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)
 

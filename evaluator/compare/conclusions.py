@@ -14,7 +14,11 @@ from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import trials_in
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Cell, Interval, Table
-from evaluator.statistics.differences import newcombe_difference, tango_points
+from evaluator.statistics.differences import (
+    mean_of_intervals,
+    newcombe_difference,
+    tango_points,
+)
 from evaluator.statistics.hierarchical import estimate
 from evaluator.statistics.power import detectable_rate, trials_needed
 
@@ -30,8 +34,9 @@ def conclusions_table(
     """Lay out for each task what its numbers mean; none without groups that have both rates.
 
     The bias is the model's where there are counts and three groups, else of the pairs (Tango) or
-    of both sides' own trials (Newcombe). The ranking is settled when the interval of the recorded
-    difference of the best and the next leaves zero out.
+    of both sides' own trials (Newcombe), over two groups their mean (Zou and Donner). The ranking
+    is settled when the interval of the recorded difference of the best and the next leaves zero
+    out.
 
     Args:
         groups: Success rates per task, condition and policy.
@@ -96,10 +101,16 @@ def _bias(
 
 
 def _counted(members: Sequence[RateGroup]) -> Interval | None:
-    """The interval of one group by its own counts; several groups have none without the model."""
-    if len(members) != 1:
+    """The interval of the mean gap from each group's own counts, as if none shared a trial."""
+    gaps = [100 * float((g.sim_rate or 0) - (g.recorded_rate or 0)) for g in members]
+    found = [_of_group(group) for group in members]
+    known = [each for each in found if each is not None]
+    if len(known) < len(members):
         return None
-    (group,) = members
+    return known[0] if len(known) == 1 else mean_of_intervals(gaps, known)
+
+
+def _of_group(group: RateGroup) -> Interval | None:
     if group.trial_table is not None and any(group.trial_table):
         both, only_sim, only_recorded, neither = group.trial_table
         n = both + only_sim + only_recorded + neither

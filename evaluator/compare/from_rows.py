@@ -209,11 +209,15 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
     if not {WITH, WITHOUT} <= conditions:
         there = ", ".join(sorted(name or "unnamed" for name in conditions))
         found.append(f"replanning gain: it needs both conditions, there is only {there}")
-    for side, words in (
+    sides = (
         ("sim_planned", "a decided dynamic replay of the plan sent"),
         ("verdict", "a verdict before motion"),
         ("sim_executed", "a dynamic replay of the executed joints"),
-    ):
+    )
+    paired = any(None not in (row.recorded, row.sim_planned) for row in rows)
+    if not paired and any(row.sim_planned is not None for row in rows):
+        sides = ()  # trials of either side, without pairs: what a row lacks, another one is
+    for side, words in sides:
         without = trials_in(row for row in rows if getattr(row, side) is None)
         if without:
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")

@@ -8,7 +8,7 @@ import gc
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,11 @@ class _Part:
     kind: type[Any]
     scope: str
     make: Callable[[_Files], tuple[Any, ...]]
-    key: Callable[[Trial], str]
+    made_from: tuple[str, ...]
+    """What the key names: replays, localised or both, as ``_hashes`` has them."""
+
+    def key(self, hashes: Mapping[str, str]) -> str:
+        return " ".join([hashes[name] for name in self.made_from])
 
 
 _Job = tuple[_Files, tuple[_Part, ...]]
@@ -121,7 +125,8 @@ def sum_up(
     for trial in trials:
         if trial.row.plan_id is None:
             continue
-        kept = {part.kind: cache.find(part.kind, part.key(trial)) for part in PARTS}
+        hashes = _hashes(trial)
+        kept = {part.kind: cache.find(part.kind, part.key(hashes)) for part in PARTS}
         parts = tuple(part for part in PARTS if kept[part.kind] is None)
         if parts:
             unknown.append((trial, (_files_of(trial, trial.row.plan_id), parts)))
@@ -133,11 +138,12 @@ def sum_up(
         with output.progress("compare motions", len(unknown)) as advance:
             all_made = zip(unknown, pool.map(_make, jobs, each_s=COMPARE_S), strict=True)
             for done, ((trial, (_, parts)), made) in enumerate(all_made, start=1):
+                hashes = _hashes(trial)
                 for part, summaries in zip(parts, made, strict=True):
                     if isinstance(summaries, Exclusion):
                         left_out.append(summaries)
                     else:
-                        cache.keep(part.kind, part.key(trial), summaries)
+                        cache.keep(part.kind, part.key(hashes), summaries)
                         found[part.kind] += summaries
                 advance(done, trial.row.episode)
     return Summaries(
@@ -189,24 +195,33 @@ def _rules(files: _Files) -> tuple[RuleSummary, ...]:
     return () if found is None else (found,)
 
 
-def _replays_key(trial: Trial) -> str:
-    hashes = [trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES]
-    return " ".join([trial.file.sha256, *hashes, str(trial.row.plan_id)])
-
-
-def _localised_key(trial: Trial) -> str:
+def _hashes(trial: Trial) -> dict[str, str]:
+    """Name the bytes that a trial's summaries follow from."""
+    recorded, plan_id = trial.file.sha256, trial.row.plan_id
+    replays = [
+        trial.replays[name].sha256 if name in trial.replays else "-" for name in TRAJECTORIES
+    ]
     localised = "-" if trial.localised is None else trial.localised.sha256
-    task = task_sha256(trial.row.task, RunFolder(trial.file.path.parent.parent).tasks_dir)
-    return f"{trial.file.sha256} {localised} {trial.row.plan_id} {task}"
+    task = task_sha256(trial.row.task, _tasks_dir(trial.file.folder))
+    return {
+        "replays": " ".join([recorded, *replays, str(plan_id)]),
+        "localised": f"{recorded} {localised} {plan_id} {task}",
+    }
 
 
-def _states_key(trial: Trial) -> str:
-    return f"{_replays_key(trial)} {_localised_key(trial)}"
+@cache
+def _tasks_dir(folder: Path) -> Path:
+    return RunFolder(folder).tasks_dir
 
 
 PARTS = (
-    _Part(kind=MotionSummary, scope="motion", make=_motions, key=_replays_key),
-    _Part(kind=StateSummary, scope="final states", make=_states, key=_states_key),
-    _Part(kind=PerceivedOutcome, scope="label", make=_perceived, key=_localised_key),
-    _Part(kind=RuleSummary, scope="baselines", make=_rules, key=_localised_key),
+    _Part(kind=MotionSummary, scope="motion", make=_motions, made_from=("replays",)),
+    _Part(
+        kind=StateSummary,
+        scope="final states",
+        make=_states,
+        made_from=("replays", "localised"),
+    ),
+    _Part(kind=PerceivedOutcome, scope="label", make=_perceived, made_from=("localised",)),
+    _Part(kind=RuleSummary, scope="baselines", make=_rules, made_from=("localised",)),
 )

@@ -176,17 +176,17 @@ def _row(
         clauses=() if planned.verdict is None else planned.verdict.clauses,
         gate_clauses=() if verdict is None else verdict.clauses,
         stages=_stages(outcome),
-        planned_replay=replays["planned"].path.name if "planned" in replays else None,
+        planned_replay=replays["planned"].file.file_name if "planned" in replays else None,
         divergence=replays["executed"].facts.divergence if "executed" in replays else None,
-        executed_replay=replays["executed"].path.name if "executed" in replays else None,
+        executed_replay=replays["executed"].file.file_name if "executed" in replays else None,
         began_ns=facts.began_ns,
         path=file.path,
         start_positions_m=facts.start_positions_m | positions_at_start(places, facts.started_ns),
         read_tcp_errors=partial(
-            read_tcp_errors,
-            file.path,
+            _tcp_errors,
+            file,
             facts.plan_id,
-            {name: replay.path for name, replay in replays.items()},
+            {name: replay.file for name, replay in replays.items()},
         ),
     )
 
@@ -218,6 +218,14 @@ def tcp_track(episode: Episode) -> PoseTrajectory | None:
         return pose_track(episode, topics[0]) if topics else None
     except BridgeError:
         return None
+
+
+def _tcp_errors(
+    recorded: RunFile, plan_id: str | None, replays: Mapping[str, RunFile]
+) -> tuple[TcpErrorSeries, ...]:
+    """Read them; paths are made only now, for most rows are never asked."""
+    paths = {name: file.path for name, file in replays.items()}
+    return read_tcp_errors(recorded.path, plan_id, paths)
 
 
 def read_tcp_errors(

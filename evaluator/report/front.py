@@ -16,6 +16,8 @@ LONGEST = 150
 LONGEST_NOTE = 260
 CLOSE_PP = 10.0
 """A bias smaller than this does not change what one does with a rate [percentage points]."""
+SIMPSON = "Simpson's paradox"
+"""What the report begins with, where a note says it."""
 FIGURES = ("tasks", "scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
@@ -44,8 +46,10 @@ def front(results: Results) -> Front:
     notes = next((t for t in results.tables if t.id == "notes"), None)
     about = [] if notes is None else [(str(a), str(b)) for a, b in notes.rows]
     missing = [text for text in results.missing if not text.startswith("figures without data")]
+    opposed = [text for _, text in about if SIMPSON in text]
+    about = [(name, text) for name, text in about if text not in opposed]
     return Front(
-        summary=_summary(results),
+        summary=" ".join([*(f"{text}." for text in opposed), _summary(results, len(rows))]),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
@@ -151,14 +155,15 @@ def _ranking_words(row: Row) -> str:
     return f"enough to rank: no, {trials}"
 
 
-def _summary(results: Results) -> str:
+def _summary(results: Results, num_tasks: int) -> str:
     by_id = {m.id: m for m in results.measurements}
     parts = []
     rate = by_id.get("agreement.sim_planned.rate")
     if rate is not None and rate.k is not None and rate.n:
         parts.append(f"Sim and outcome agree in {rate.k} of {rate.n} trials.")
     bias = by_id.get("agreement.bias_pp")
-    if bias is not None and bias.value is not None and (bias.n or 0) > 1:
+    one_line = num_tasks == 1 and bias is not None and bias.interval is None  # says it already
+    if bias is not None and bias.value is not None and (bias.n or 0) > 1 and not one_line:
         word = "above" if bias.value > 0 else "below"
         ends = _ends(bias)
         size = f"{_points(bias.value)} {word}" if round(bias.value) else "level with"

@@ -263,8 +263,11 @@ def caption_of(table: Table) -> str:
     for name, many in (("task", "tasks"), ("policy", "policies"), ("condition", "conditions")):
         if name in table.columns:
             values = {row[table.columns.index(name)] for row in table.rows} - NO_NAMES
-            if len(values) > 1:
-                counts.append(f"{len(values)} {many}")
+            count = f"{len(values)} {many}"
+            if len(values) > 1 and not any(
+                said in table.title for said in (count, f"{name} by {name}")
+            ):
+                counts.append(count)
     over = f" over {' and '.join(counts)}" if counts else ""
     methods = [
         str(row[place])

@@ -1,19 +1,18 @@
 """Tables as people read them: numbers of several columns become one text, ``4/5 = 80.0 %``.
 
 Tables hold numbers, one to a column, in ``results.json``, CSV and Parquet. What is printed,
-drawn on the page and set in LaTeX is a view of them, made here as DataFrames.
+drawn on the page and set in LaTeX is a view of them, made here row by row.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from evaluator.result import Cell, Table
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Record = dict[Hashable, Any]
+Record = dict[str, Any]
+"""One row by the names of its columns, in their order."""
+Rows = Sequence[Record]
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,10 @@ def view(table: Table) -> View:
     build = _VIEWS.get("bands" if table.id.startswith("bands_") else table.id)
     if build is None or not table.rows:
         return View(**vars(table))
-    import pandas as pd  # noqa: PLC0415  # a third of a second, and only what is printed needs it
-
-    frame = build(pd.DataFrame(table.rows, columns=table.columns, dtype=object))
-    shown = frame.astype(object).where(frame.notna(), None)
-    rows = tuple(map(tuple, shown.to_numpy()))
-    return View(**(vars(table) | {"columns": tuple(shown.columns), "rows": rows}))
+    records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    shown = build(records)
+    rows = tuple(tuple(row.values()) for row in shown)
+    return View(**(vars(table) | {"columns": tuple(shown[0]), "rows": rows}))
 
 
 def used_columns(table: View) -> list[int]:
@@ -114,27 +111,29 @@ def _rate(row: Record) -> Shown:
     return replace(shown, count=f"{row['k']}/{row['n']}") if isinstance(shown, Figures) else shown
 
 
-def _each(frame: "pd.DataFrame", write: Callable[[Record], Shown]) -> list[Shown]:
-    return [write(row) for row in frame.to_dict("records")]
+def _picked(row: Record, *names: str) -> Record:
+    """Return some columns of a row, in this order."""
+    return {name: row[name] for name in names}
 
 
-def _words(column: "pd.Series[Any]") -> "pd.Series[Any]":
-    return column.str.replace("_", " ")
+def _words(text: str) -> str:
+    return text.replace("_", " ")
 
 
-def _success(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _success(rows: Rows) -> Rows:
     """Put the sides of a group beside each other."""
-    sides = list(dict.fromkeys(frame["side"]))
-    (gap,) = (name for name in frame.columns if name.startswith("sim - "))
-    groups = frame[frame["side"] == sides[0]].reset_index(drop=True)
-    shown = groups[["task", "condition", "policy", "unit"]].copy()
-    shown["condition"] = _words(shown["condition"])
-    if set(shown["unit"]) == {"trial"}:
-        shown["unit"] = None  # as everybody counts
-    for side in sides:
-        shown[side] = _each(frame[frame["side"] == side], _rate)
-    shown[gap] = groups[gap]
-    return shown
+    sides = list(dict.fromkeys(row["side"] for row in rows))
+    of_side = [[row for row in rows if row["side"] == side] for side in sides]
+    (gap,) = (name for name in rows[0] if name.startswith("sim - "))
+    plain = {row["unit"] for row in of_side[0]} == {"trial"}  # as everybody counts
+    found = []
+    for group in zip(*of_side, strict=True):
+        first = group[0]
+        shown = _picked(first, "task", "condition", "policy", "unit")
+        shown |= {"condition": _words(first["condition"])} | ({"unit": None} if plain else {})
+        shown |= {row["side"]: _rate(row) for row in group}
+        found.append(shown | {gap: first[gap]})
+    return found
 
 
 def _points(value: float, row: Record) -> Figures:
@@ -143,130 +142,127 @@ def _points(value: float, row: Record) -> Figures:
     return Figures(f"{value:+.1f} pp", ends)
 
 
-def _gain(row: Record) -> Shown:
-    if not _known(row["gain (pp)"]):
-        return f"undefined: {row['why undefined']}"
-    return _points(row["gain (pp)"], row)
+def _points_of(row: Record, name: str) -> Shown:
+    return _points(row[name], row) if _known(row[name]) else None
 
 
-def _relative(row: Record) -> Shown:
-    if not _known(row["relative gain"]):
-        return f"undefined: {row['why undefined']}"
-    return Figures(f"{100 * row['relative gain']:+.1f} %")
+def _gains(rows: Rows) -> Rows:
+    def shown(row: Record) -> Record:
+        undefined = f"undefined: {row['why undefined']}"
+        relative = row["relative gain"]
+        return {
+            "task": ", ".join(part for part in (row["task"], row["policy"]) if part),
+            "side": row["side"],
+            "percentage points": _points_of(row, "gain (pp)") or undefined,
+            "relative gain": (
+                Figures(f"{100 * relative:+.1f} %") if _known(relative) else undefined
+            ),
+        }
+
+    return [shown(row) for row in rows]
 
 
-def _gains(frame: "pd.DataFrame") -> "pd.DataFrame":
-    tasks = [
-        ", ".join(part for part in (task, policy) if part)
-        for task, policy in zip(frame["task"], frame["policy"], strict=True)
+def _layout(rows: Rows) -> Rows:
+    rates = list(rows[0])[2:]
+    return [row | {name: percent(row[name]) or "undefined" for name in rates} for row in rows]
+
+
+def _curve(rows: Rows) -> Rows:
+    renamed = {"k": "succeeded", "n": "of"}
+    left_out = ("rate", "low", "high", "interval")
+    return [
+        {renamed.get(name, name): cell for name, cell in row.items() if name not in left_out}
+        | {"rate": percent(row["rate"], row["low"], row["high"])}
+        for row in rows
     ]
-    shown = frame[["task", "side"]].assign(task=tasks)
-    shown["percentage points"] = _each(frame, _gain)
-    shown["relative gain"] = _each(frame, _relative)
-    return shown
 
 
-def _layout(frame: "pd.DataFrame") -> "pd.DataFrame":
-    for name in frame.columns[2:]:
-        frame[name] = [percent(value) or "undefined" for value in frame[name]]
-    return frame
+def _varied(rows: Rows) -> Rows:
+    def fresh(row: Record) -> str:
+        return f"{100 * row['rate with fresh seeds']:.1f} % (n = {row['trials with fresh seeds']})"
+
+    return [
+        _picked(row, "task", "condition", "policy")
+        | {
+            "condition": _words(row["condition"]),
+            "sim": f"{row['sim k']}/{row['sim n']}",
+            "sim, fresh seeds": fresh(row),
+            "difference (pp)": row["difference (pp)"],
+        }
+        for row in rows
+    ]
 
 
-def _curve(frame: "pd.DataFrame") -> "pd.DataFrame":
-    rates = _each(frame, lambda row: percent(row["rate"], row["low"], row["high"]))
-    shown = frame.drop(columns=["rate", "low", "high", "interval"])
-    return shown.rename(columns={"k": "succeeded", "n": "of"}).assign(rate=rates)
-
-
-def _varied(frame: "pd.DataFrame") -> "pd.DataFrame":
-    shown = frame[["task", "condition", "policy"]].copy()
-    shown["condition"] = _words(shown["condition"])
-    shown["sim"] = _each(frame, lambda row: f"{row['sim k']}/{row['sim n']}")
-    shown["sim, fresh seeds"] = _each(
-        frame,
-        lambda r: f"{100 * r['rate with fresh seeds']:.1f} % (n = {r['trials with fresh seeds']})",
-    )
-    shown["difference (pp)"] = frame["difference (pp)"]
-    return shown
-
-
-def _clauses(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _clauses(rows: Rows) -> Rows:
     """Write both shares of a clause, and ``any`` for the price of one that refused no good plan."""
 
-    def share(name: str, k: str, n: str) -> list[Shown]:
-        def write(row: Record) -> Shown:
-            shown = percent(row[name], row[f"{name} low"], row[f"{name} high"], digits=0)
-            if isinstance(shown, Figures):
-                return replace(shown, count=f"{row[k]}/{row[n]}")
-            return shown
-
-        return _each(frame, write)
-
     def price(row: Record) -> Shown:
-        price: float | None = row["pays up to a price of"]
-        return "any" if not _known(price) and row["refused and failed"] else price
+        found: float | None = row["pays up to a price of"]
+        return "any" if not _known(found) and row["refused and failed"] else found
 
-    shown = frame[["verdict of", "clause", "trials", "refused", "refused and failed"]].copy()
-    shown["right to refuse"] = share("right", "refused and failed", "refused")
-    shown["good plans refused"] = frame["good plans refused"]
-    shown["failures it found"] = share("found", "refused and failed", "failed")
-    shown["pays up to a price of"] = _each(frame, price)
-    return shown
+    return [
+        _picked(row, "verdict of", "clause", "trials", "refused", "refused and failed")
+        | {
+            "right to refuse": _share(row, "right", "refused and failed", "refused"),
+            "good plans refused": row["good plans refused"],
+            "failures it found": _share(row, "found", "refused and failed", "failed"),
+            "pays up to a price of": price(row),
+        }
+        for row in rows
+    ]
 
 
-def _conclusions(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _share(row: Record, name: str, k: str, n: str) -> Shown:
+    """Write a share with its interval, and with its count: ``4/5 = 80 % [38, 96]``."""
+    shown = percent(row[name], row[f"{name} low"], row[f"{name} high"], digits=0)
+    return replace(shown, count=f"{row[k]}/{row[n]}") if isinstance(shown, Figures) else shown
+
+
+def _conclusions(rows: Rows) -> Rows:
     """Put the bias and its interval into one cell, and a yes beside those that were right."""
 
-    def right(row: Record) -> Shown:
-        if not row["yes"]:
+    def points(value: float | None) -> Shown:
+        return None if value is None or not _known(value) else Figures(f"{value:.0f}")
+
+    def shown(row: Record) -> Record:
+        right = succeeded = None
+        if row["yes"]:
+            right = Figures(f"{row['yes and right']} of {row['yes']}")
+            succeeded = Figures(f"{row['succeeded']} of {row['trials']}")
+        return {
+            **_picked(row, "task", "groups"),
+            "bias": _points_of(row, "bias (pp)"),
+            "interval": row["interval"],
+            "yes and right": right,
+            "succeeded at all": succeeded,
+            **_picked(row, "candidates", "best recorded", "ranked", "more trials"),
+            "trials each": row["recorded trials per candidate"],
+            "smallest difference (pp)": points(row["smallest difference (pp)"]),
+            "smallest bias (pp)": points(row["smallest bias (pp)"]),
+        }
+
+    return [shown(row) for row in rows]
+
+
+def _baselines(rows: Rows) -> Rows:
+    def share(row: Record, k: str, n: str) -> Shown:
+        if not row[n]:
             return None
-        return Figures(f"{row['yes and right']} of {row['yes']}")
+        return Figures(f"{100 * row[k] / row[n]:.0f} %", count=f"{row[k]}/{row[n]}")
 
-    def succeeded(row: Record) -> Shown:
-        return Figures(f"{row['succeeded']} of {row['trials']}") if row["yes"] else None
-
-    def points(name: str) -> list[Shown]:
-        return [Figures(f"{value:.0f}") if _known(value) else None for value in frame[name]]
-
-    shown = frame[["task", "groups"]].copy()
-    shown["bias"] = [
-        _points(value, row) if _known(value) else None
-        for value, row in zip(frame["bias (pp)"], frame.to_dict("records"), strict=True)
+    return [
+        _picked(row, "asked of", "task", "forecast by")
+        | {
+            "right": share(row, "right", "trials"),
+            "PPV": share(row, "yes and succeeded", "said yes"),
+            "NPV": share(row, "no and failed", "said no"),
+            "twin more right": _points_of(row, "twin more right (pp)"),
+        }
+        for row in rows
     ]
-    shown["interval"] = frame["interval"]
-    shown["yes and right"] = _each(frame, right)
-    shown["succeeded at all"] = _each(frame, succeeded)
-    for name in ("candidates", "best recorded", "ranked", "more trials"):
-        shown[name] = frame[name]
-    shown["trials each"] = frame["recorded trials per candidate"]
-    for name in ("smallest difference (pp)", "smallest bias (pp)"):
-        shown[name] = points(name)
-    return shown
 
 
-def _baselines(frame: "pd.DataFrame") -> "pd.DataFrame":
-    def share(k: str, n: str) -> list[Shown]:
-        def write(row: Record) -> Shown:
-            if not row[n]:
-                return None
-            return Figures(f"{100 * row[k] / row[n]:.0f} %", count=f"{row[k]}/{row[n]}")
-
-        return _each(frame, write)
-
-    def difference(row: Record) -> Shown:
-        if not _known(row["twin more right (pp)"]):
-            return None
-        return _points(row["twin more right (pp)"], row)
-
-    shown = frame[["asked of", "task", "forecast by"]].copy()
-    shown["right"] = share("right", "trials")
-    shown["PPV"] = share("yes and succeeded", "said yes")
-    shown["NPV"] = share("no and failed", "said no")
-    shown["twin more right"] = _each(frame, difference)
-    return shown
-
-
-def _stopping(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _stopping(rows: Rows) -> Rows:
     def interval(row: Record) -> Shown:
         if not _known(row["low"]):
             return None
@@ -277,78 +273,91 @@ def _stopping(frame: "pd.DataFrame") -> "pd.DataFrame":
             return str(row["why undefined"])
         return f"stop: {row['answer']} {100 * row['goal']:g} %" if row["stop"] else "continue"
 
-    shown = frame[["task", "condition", "policy", "trials"]].copy()
-    shown["condition"] = _words(shown["condition"])
-    shown["interval at any time"] = _each(frame, interval)
-    shown["advice"] = _each(frame, advice)
-    shown["more trials at this rate"] = frame["more trials at this rate"]
-    return shown
+    return [
+        _picked(row, "task", "condition", "policy", "trials")
+        | {
+            "condition": _words(row["condition"]),
+            "interval at any time": interval(row),
+            "advice": advice(row),
+            "more trials at this rate": row["more trials at this rate"],
+        }
+        for row in rows
+    ]
 
 
-def _bands(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _bands(rows: Rows) -> Rows:
     name = "inside the recorded band"
-    if name in frame:  # the other tables of bands hold lengths alone
-        frame[name] = [percent(value, digits=0) for value in frame[name]]
-    return frame
+    if name not in rows[0]:  # the other tables of bands hold lengths alone
+        return rows
+    return [row | {name: percent(row[name], digits=0)} for row in rows]
 
 
-def _without_task(frame: "pd.DataFrame") -> "pd.DataFrame":
-    frame["Pearson r"] = _each(
-        frame,
-        lambda row: (
-            row["Pearson r"] if _known(row["Pearson r"]) else f"undefined: {row['why undefined']}"
-        ),
-    )
-    return frame.drop(columns="why undefined")
+def _without_task(rows: Rows) -> Rows:
+    def r(row: Record) -> Shown:
+        known = _known(row["Pearson r"])
+        return row["Pearson r"] if known else f"undefined: {row['why undefined']}"
+
+    return [
+        {name: cell for name, cell in row.items() if name != "why undefined"}
+        | {"Pearson r": r(row)}
+        for row in rows
+    ]
 
 
-def _states(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _states(rows: Rows) -> Rows:
+    """Put both ends of the interval into one cell, where the lower one stood."""
+
     def interval(row: Record) -> Shown:
         known = _known(row["low (mm)"])
         return f"[{row['low (mm)']:.1f}, {row['high (mm)']:.1f}]" if known else None
 
-    at = frame.columns.get_loc("low (mm)")
-    ends = _each(frame, interval)
-    frame = frame.drop(columns=["low (mm)", "high (mm)"])
-    frame.insert(at, "interval (mm)", ends)
-    return frame
+    return [
+        {
+            ("interval (mm)" if name == "low (mm)" else name): (
+                interval(row) if name == "low (mm)" else cell
+            )
+            for name, cell in row.items()
+            if name != "high (mm)"
+        }
+        for row in rows
+    ]
 
 
-def _published(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _published(rows: Rows) -> Rows:
     def recomputed(row: Record) -> Shown:
         value = row["recomputed"]
         if not _known(value):
             return str(row["instead"])
         return f"{value:.4g}" if abs(value) < 1 else f"{value:.2f}"
 
-    frame["recomputed"] = _each(frame, recomputed)
-    return frame.drop(columns="instead")
+    return [
+        {name: cell for name, cell in row.items() if name != "instead"}
+        | {"recomputed": recomputed(row)}
+        for row in rows
+    ]
 
 
-def _axes(frame: "pd.DataFrame") -> "pd.DataFrame":
+def _axes(rows: Rows) -> Rows:
     """Put the agreement and the gap of each value of an axis into one cell each."""
-    word = next(name for name in frame.columns if name.endswith(" rate") and name[:3] != "sim")
-    gap = next(name for name in frame.columns if name.startswith("sim - "))
-
-    def agree(row: Record) -> Shown:
-        shown = percent(row["agree rate"], row["agree low"], row["agree high"], digits=0)
-        if isinstance(shown, Figures):
-            return replace(shown, count=f"{row['agree k']}/{row['agree n']}")
-        return shown
+    word = next(name for name in rows[0] if name.endswith(" rate") and name[:3] != "sim")
+    gap = next(name for name in rows[0] if name.startswith("sim - "))
 
     def points(row: Record) -> Shown:
         if not _known(row[gap]):
             return None
         return _points(row[gap], {"low": row["gap low"], "high": row["gap high"]})
 
-    shown = frame[["axis", "value", "trials"]].assign(agree=_each(frame, agree))
-    for name in (word, "sim rate"):
-        shown[name] = [percent(value, digits=0) for value in frame[name]]
-    return shown.assign(**{gap: _each(frame, points)})
+    return [
+        _picked(row, "axis", "value", "trials")
+        | {"agree": _share(row | {"agree": row["agree rate"]}, "agree", "agree k", "agree n")}
+        | {name: percent(row[name], digits=0) for name in (word, "sim rate")}
+        | {gap: points(row)}
+        for row in rows
+    ]
 
 
-def _progress(frame: "pd.DataFrame") -> "pd.DataFrame":
-    gap = next(name for name in frame.columns if name.startswith("sim - "))
+def _progress(rows: Rows) -> Rows:
+    gap = next(name for name in rows[0] if name.startswith("sim - "))
 
     def difference(row: Record) -> Shown:
         if not _known(row[gap]):
@@ -356,15 +365,19 @@ def _progress(frame: "pd.DataFrame") -> "pd.DataFrame":
         ends = f"{row['low']:+.2f}, {row['high']:+.2f}" if _known(row["low"]) else ""
         return Figures(f"{row[gap]:+.3f}", ends)
 
-    shown = frame.drop(columns=["low", "high"])
-    shown[gap] = _each(frame, difference)
-    for name in shown.columns:
+    def cell(row: Record, name: str) -> Shown:
+        if name == gap:
+            return difference(row)
         if name.endswith((" mean", " of pairs")):
-            shown[name] = [round(x, 3) if _known(x) else None for x in shown[name]]
-    return shown
+            return round(row[name], 3) if _known(row[name]) else None
+        shown: Shown = row[name]
+        return shown
+
+    kept = [name for name in rows[0] if name not in ("low", "high")]
+    return [{name: cell(row, name) for name in kept} for row in rows]
 
 
-_VIEWS: dict[str, Callable[["pd.DataFrame"], "pd.DataFrame"]] = {
+_VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "success": _success,
     "axes": _axes,

@@ -6,7 +6,7 @@ arm moved is left to ``motion``.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -463,7 +463,7 @@ def read_derived(path: Path) -> DerivedFacts:
     derived = episode.derived
     if derived is None:
         raise EvaluatorError("no 'derived' metadata: it does not say what it was made from")
-    info = episode.info
+    info, derived = episode.info, _without_seed(derived)
     try:
         if _is_dynamic(derived):
             mine = [
@@ -479,6 +479,15 @@ def read_derived(path: Path) -> DerivedFacts:
     except GstError as error:
         return DerivedFacts(info=info, derived=derived, broken=str(error))
     return DerivedFacts(info=info, derived=derived)
+
+
+def _without_seed(derived: Derived) -> Derived:
+    """Leave the seed out of the settings: it stands beside them, and they are alike without it."""
+    config = derived.settings.get("config")
+    if not isinstance(config, dict) or "seed" not in config:
+        return derived
+    kept = {name: value for name, value in config.items() if name != "seed"}
+    return replace(derived, settings={**derived.settings, "config": kept})
 
 
 def _is_dynamic(derived: Derived) -> bool:

@@ -43,9 +43,14 @@ class RunFile:
         return self.folder / self.name
 
     @property
+    def file_name(self) -> str:
+        """The name of the file without folder."""
+        return self.name.rpartition("/")[2]
+
+    @property
     def stem(self) -> str:
         """The name of the file without folder and ending."""
-        return self.name.rpartition("/")[2].rpartition(".")[0]
+        return self.file_name.rpartition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)

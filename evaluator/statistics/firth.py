@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import brentq
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, chdtri, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
 
@@ -62,7 +61,7 @@ def firth(design: Design, outcomes: Outcomes, *, level: float = 0.95) -> list[Ef
     best, most = _fit(design, outcomes, np.zeros(terms), None)
     if n > PROFILED_TRIALS:
         return _wald(design, outcomes, best, level)
-    limit = most - float(chi2.ppf(level, 1)) / 2
+    limit = most - float(chdtri(1, 1 - level)) / 2
     return [_effect(design, outcomes, best, most, limit, place) for place in range(terms)]
 
 
@@ -70,13 +69,13 @@ def _wald(design: Design, outcomes: Outcomes, best: Coefficients, level: float) 
     """With many trials the likelihood is a parabola, and its curvature says as much."""
     _, information = _score(design, outcomes, best)
     errors = np.sqrt(np.diag(np.linalg.inv(information)))
-    reach = float(norm.ppf(0.5 + level / 2))
+    reach = float(ndtri(0.5 + level / 2))
     return [
         Effect(
             value=float(value),
             low=float(value - reach * error),
             high=float(value + reach * error),
-            p=float(2 * norm.sf(abs(value) / error)),
+            p=float(2 * ndtr(-abs(value) / error)),
         )
         for value, error in zip(best, errors, strict=True)
     ]
@@ -138,6 +137,7 @@ def _effect(
     place: int,
 ) -> Effect:
     """Profile one coefficient: its interval, and the test that it is zero."""
+    from scipy.optimize import brentq  # noqa: PLC0415  # a third of a second; many trials have none
 
     def above(value: float) -> float:
         start = best.copy()
@@ -156,5 +156,5 @@ def _effect(
         ends.append(float(brentq(above, best[place], far, xtol=1e-4)))
     ratio = 2 * (most - (above(0.0) + limit))
     return Effect(
-        value=float(best[place]), low=ends[0], high=ends[1], p=float(chi2.sf(max(ratio, 0.0), 1))
+        value=float(best[place]), low=ends[0], high=ends[1], p=float(chdtrc(1, max(ratio, 0.0)))
     )

@@ -13,10 +13,15 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy.special import expit
 
-EDGE = 9.0
-"""Log-odds beyond which a rate is as good as 0 or 1."""
-STEP_ALONE, STEP_IN_TASKS = 0.2, 0.3
-"""Grid of the log-odds; the pairs of numbers vary by half a step more than sigma says."""
+EDGE = 18.0
+"""Log-odds where the grid ends. A rate is as good as 0 or 1 long before, but how probable rates
+are that cannot be told from 0 or 1 is a matter of the tails: cut at 9 they move the mean."""
+STEP_ALONE, STEP_IN_TASKS = 0.2, 0.25
+"""Step of the grid of log-odds at 0; the pairs of numbers vary by half of it more than sigma
+says."""
+BEND = 2.0
+"""Log-odds about which steps become longer, where counts say less of them: x = bend sinh(t / bend)
+with equal steps of t."""
 MOST = 200
 """A larger side is taken as one of so many trials: its rate is as good as known then."""
 TASK_NODES = 3
@@ -112,6 +117,17 @@ def common_log_odds(groups: Sequence[GroupCounts]) -> float:
     return float(np.clip(np.log(agree / differ), -5.0, 5.0))
 
 
+@dataclass(frozen=True, kw_only=True)
+class OfTask:
+    """A task's probability, split over where its mean may lie."""
+
+    logs: Float64[np.ndarray, "nodes centres"]
+    """Of each centre's share."""
+    centres: Float64[np.ndarray, "nodes centres 2"]
+    rates: Float64[np.ndarray, "nodes centres groups sides"]
+    """Mean recorded and twin rate given parameters and centre; no sides where not asked for."""
+
+
 class Likelihood:
     """Probability of the counts of every group on a grid of both log-odds."""
 
@@ -129,7 +145,11 @@ class Likelihood:
         if not self.in_tasks:
             self.members = [np.arange(len(groups))]
         self.step = STEP_IN_TASKS if self.in_tasks else STEP_ALONE
-        self.grid = np.arange(-EDGE, EDGE + self.step / 2, self.step)
+        most = np.ceil(BEND * np.arcsinh(EDGE / BEND) / self.step)
+        even = self.step * np.arange(-most, most + 1)
+        self.grid = BEND * np.sinh(even / BEND)
+        self.steps = self.step * np.cosh(even / BEND)
+        """Length of grid that each place stands for."""
         self.rate = expit(self.grid)
         self.shape = (len(self.grid), len(self.grid))
         odds = common_log_odds(groups)
@@ -167,8 +187,9 @@ class Likelihood:
         first, second, shared = spread.entries((self.step / 2) ** 2)
         det = first * second - shared**2
         x, y = (self.grid[None, :] - mean[:, [side]] for side in (0, 1))
-        one = -0.5 * (second / det)[:, None] * x**2
-        two = -0.5 * (first / det)[:, None] * y**2
+        size = np.log(self.steps)
+        one = size - 0.5 * (second / det)[:, None] * x**2
+        two = size - 0.5 * (first / det)[:, None] * y**2
         ones, skew = np.ones_like(x), (shared / det)[:, None] * x
         rows = np.stack([one, skew, ones], axis=2).astype(np.float32)
         columns = np.stack([ones, y, two], axis=1).astype(np.float32)
@@ -181,17 +202,32 @@ class Likelihood:
         nodes = Nodes.of(phi)
         found = np.zeros(len(phi))
         for members in self.members:
-            found += _log_sum(self.of_task(nodes, members)[0])
+            found += _log_sum(self.of_task(nodes, members).logs)
         return np.asarray(found)
 
+    def log_and_rates(
+        self, phi: Float64[np.ndarray, "nodes parameters"]
+    ) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, "nodes groups 2"]]:
+        """Return ``log``, and the mean recorded and twin rate of every group given parameters."""
+        nodes = Nodes.of(phi)
+        found, rates = np.zeros(len(phi)), np.empty((len(phi), len(self.table), 2))
+        for members in self.members:
+            task = self.of_task(nodes, members, with_rates=True)
+            total = _log_sum(task.logs)
+            found += total
+            share = np.exp(task.logs - total[:, None])
+            rates[:, members] = np.einsum("nq,nqgs->ngs", share, task.rates)
+        return np.asarray(found), rates
+
     def of_task(
-        self, nodes: Nodes, members: Int64[np.ndarray, " groups"]
-    ) -> tuple[Float64[np.ndarray, "nodes centres"], Float64[np.ndarray, "nodes centres 2"]]:
-        """Return the log of each centre's share in a task's probability, and the centres.
+        self, nodes: Nodes, members: Int64[np.ndarray, " groups"], *, with_rates: bool = False
+    ) -> "OfTask":
+        """Return each centre's share in a task's probability.
 
         Args:
             nodes: Parameters.
             members: Places of the task's groups.
+            with_rates: Whether mean rates are asked for.
         """
         count = len(nodes.mean)
         centres, log_shares = self.centres(nodes, members)
@@ -200,17 +236,32 @@ class Likelihood:
         spread = Spread(
             **{name: np.repeat(values, each) for name, values in vars(nodes.within).items()}
         )
-        ones = np.ones((1, self.table.shape[1]), dtype=np.float32)
-        columns = np.concatenate([self.table[members], ones]).T
-        found = np.empty((len(flat), len(members)))
+        table, ones = self.table[members], np.ones((1, self.table.shape[1]), dtype=np.float32)
+        sides = [side.astype(np.float32) for side in self.rate_of_cells] if with_rates else []
+        columns = np.concatenate([table, *(table * side for side in sides), ones]).T
+        found = np.empty((len(flat), columns.shape[1] - 1))
         size = max(1, BATCH // self.table.shape[1])
         for at in range(0, len(flat), size):
             part = slice(at, at + size)
             some = Spread(**{name: values[part] for name, values in vars(spread).items()})
             shares = self.weights(flat[part], some) @ columns
             found[part] = shares[:, :-1] / np.maximum(shares[:, -1:], 1e-30)
-        logs = np.log(np.maximum(found, 1e-35)).sum(axis=1).reshape(count, each)
-        return logs + log_shares, centres
+        chance = np.maximum(found[:, : len(members)], 1e-35)
+        logs = np.log(chance).sum(axis=1).reshape(count, each)
+        rates = found[:, len(members) :].reshape(len(flat), len(sides), len(members))
+        return OfTask(
+            logs=logs + log_shares,
+            centres=centres,
+            rates=(rates / chance[:, None]).swapaxes(1, 2).reshape(count, each, len(members), -1)
+            if with_rates
+            else np.empty((count, each, len(members), 0)),
+        )
+
+    @property
+    def rate_of_cells(self) -> tuple[np.ndarray, np.ndarray]:
+        """Recorded and twin rate of every cell of the grid."""
+        ones = np.ones_like(self.rate)
+        return np.outer(self.rate, ones).ravel(), np.outer(ones, self.rate).ravel()
 
     def centres(
         self, nodes: Nodes, members: Int64[np.ndarray, " groups"]

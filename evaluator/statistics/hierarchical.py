@@ -7,7 +7,8 @@ trials is taken out of correlations, and rates of small groups are drawn towards
 
 Everything is quadrature: ``group_likelihood.py`` has the groups; over the parameters go importance
 weights on Sobol nodes. Equal counts give equal numbers. Parameters are the means mu (normal, sd
-2.5), the spreads sigma (half-normal, 2.5) and correlations rho, whose arcsine is uniform. Nodes are
+2.5), the spreads sigma (half-normal, 2.5) and correlations rho, whose arcsine is uniform; those
+within and between tasks are alike rather than not (a normal copula of 0.5). Nodes are
 placed in coordinates in which each has a standard normal prior: there no edge cuts the posterior
 off, as 0 does for a spread and 1 for a correlation.
 """
@@ -18,23 +19,29 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-from scipy.special import expit, ndtr, ndtri
-from scipy.stats import chi2, qmc
+from scipy.special import chdtri, expit, ndtr, ndtri
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.group_likelihood import BATCH, GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.intervals import LEVEL
+from evaluator.statistics.sobol import sobol
 
 WHAT = "model of agreement"
 METHOD = "hierarchical"
 MIN_GROUPS = 3
 PRIOR_MEAN_SD = 2.5
 PRIOR_SPREAD = 2.5
+LEAST_SPREAD = 1e-9
+"""Below it, a spread is none; but its square is still a number."""
+PRIOR_ALIKE = 0.5
+"""Correlation, before any data, of the normal numbers that the correlations within and between
+tasks stand for: a twin that is right about tasks is more often right inside them, too."""
 ROUNDS = 4
 """Times that the nodes are moved to where the posterior lies."""
-FREEDOM = 10
-"""Of Student's t, as which the nodes lie."""
+FREEDOM, WIDER = 7, 1.25
+"""Of Student's t, as which the nodes lie, and how much wider than the posterior: with lighter tails
+than the posterior has, few far nodes would carry much of it."""
 FEW = 80.0
 """Nodes that have to count while they are being moved."""
 NUM_DRAWS = 4_000
@@ -77,6 +84,10 @@ def estimate(
     return Estimate(mean=mean, sd=sd, low=float(low), high=float(high))
 
 
+WITHIN_RHO, BETWEEN_RHO = 4, 7
+"""Places of both correlations among the parameters."""
+
+
 def from_normal(
     z: Float64[np.ndarray, "nodes parameters"],
 ) -> Float64[np.ndarray, "nodes parameters"]:
@@ -84,10 +95,15 @@ def from_normal(
 
     A standard normal number has the prior of its parameter: it is carried by equal probability.
     """
+    z = z.copy()
+    if z.shape[1] > BETWEEN_RHO:
+        z[:, BETWEEN_RHO] *= np.sqrt(1 - PRIOR_ALIKE**2)
+        z[:, BETWEEN_RHO] += PRIOR_ALIKE * z[:, WITHIN_RHO]
     phi = PRIOR_MEAN_SD * z
     for at in range(2, z.shape[1], 3):
         # From the upper tail, which stays exact: P(sigma > s) = P(number > z).
-        phi[:, at : at + 2] = -PRIOR_SPREAD * ndtri(ndtr(-z[:, at : at + 2]) / 2)
+        size = -PRIOR_SPREAD * ndtri(ndtr(-z[:, at : at + 2]) / 2)
+        phi[:, at : at + 2] = np.maximum(size, LEAST_SPREAD)
         phi[:, at + 2] = np.pi * (ndtr(z[:, at + 2]) - 0.5)
     return np.asarray(phi)
 
@@ -98,6 +114,9 @@ def to_normal(phi: Float64[np.ndarray, " parameters"]) -> Float64[np.ndarray, " 
     for at in range(2, len(phi), 3):
         z[at : at + 2] = -ndtri(2 * ndtr(-phi[at : at + 2] / PRIOR_SPREAD))
         z[at + 2] = ndtri(phi[at + 2] / np.pi + 0.5)
+    if len(z) > BETWEEN_RHO:
+        z[BETWEEN_RHO] -= PRIOR_ALIKE * z[WITHIN_RHO]
+        z[BETWEEN_RHO] /= np.sqrt(1 - PRIOR_ALIKE**2)
     return np.asarray(z)
 
 
@@ -147,7 +166,7 @@ class AgreementModel:
         self.likelihood = Likelihood(groups)
         self._seed = seed
         wanted = num_nodes or self._enough()
-        self.phi, self.weights = self._integrate(wanted)
+        self.phi, self.weights, self._rates = self._integrate(wanted)
         self.nodes = Nodes.of(self.phi)
 
     @property
@@ -164,23 +183,29 @@ class AgreementModel:
         """As many as take some seconds."""
         count = len(self.groups)
         if not self.in_tasks:
-            return 16_384 if count <= 40 else 8192
+            return 8192
         return 8192 if count <= 16 else 2048 if count <= 40 else 1024
 
-    def _integrate(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Move nodes to the posterior in some rounds, then weigh as many as were asked for."""
+    def _integrate(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Move nodes to the posterior in some rounds, then weigh as many as were asked for.
+
+        Returns:
+            Nodes, weights, and the mean rates of every group on both sides.
+        """
         centre, scale = self._start()
         chol = np.diag(scale)
         for turn in range(ROUNDS):
-            z, log_w = self._weigh(centre, chol, max(num_nodes // 8, 512), turn)
+            u, log_w, _ = self._weigh(centre, chol, max(num_nodes // 8, 512), turn)
             weights = _flattened(log_w)
-            centre = weights @ z
-            off = z - centre
+            centre = weights @ u
+            off = u - centre
             cov = (weights[:, None] * off).T @ off + 1e-4 * np.eye(len(centre))
             chol = np.linalg.cholesky(cov)
-        z, log_w = self._weigh(centre, chol, num_nodes, ROUNDS)
+        u, log_w, rates = self._weigh(centre, WIDER * chol, num_nodes, ROUNDS, with_rates=True)
         weights = np.exp(log_w - log_w.max())
-        return from_normal(z), weights / weights.sum()
+        weights /= weights.sum()
+        phi = from_normal(self._spread_out(u)[0])
+        return phi, weights, np.einsum("n,ngs->gs", weights, rates)
 
     def _start(self) -> tuple[np.ndarray, np.ndarray]:
         """Guess the normal numbers and how far off the guess may be."""
@@ -206,25 +231,66 @@ class AgreementModel:
         guess, reach = np.array(start), np.array(scale) / 2
         low, high = guess - reach, guess + reach
         low[2:] = np.maximum(low[2:], 0.02)
-        return to_normal(guess), np.clip(to_normal(high) - to_normal(low), 0.1, 0.8)
+        centre, size = to_normal(guess), np.clip(to_normal(high) - to_normal(low), 0.1, 0.8)
+        centre[:2], size[:2] = 0.0, 1.0  # as they are spread out
+        return centre, size
+
+    def _spread_out(
+        self, u: Float64[np.ndarray, "nodes parameters"]
+    ) -> tuple[Float64[np.ndarray, "nodes parameters"], Float64[np.ndarray, " nodes"]]:
+        """Return the normal numbers of some nodes, and the log of the volume that each stands for.
+
+        How far off a mean may be depends on the spreads: with wide ones, and few groups, very far.
+        So the first two coordinates are about where the counts put the means, in units of that.
+        """
+        like, z = self.likelihood, u.copy()
+        z[:, :2] = 0.0
+        phi = from_normal(z)
+        count = len(self.groups)
+        variance = (phi[:, 2:4] ** 2 + like.noise.mean(axis=0)) / count
+        if self.in_tasks:
+            variance += phi[:, 5:7] ** 2 / len(like.members)
+        size = 1 / np.sqrt(1 + PRIOR_MEAN_SD**2 / variance)
+        middle = (1 - size**2) * like.logits.mean(axis=0) / PRIOR_MEAN_SD
+        z[:, :2] = middle + size * u[:, :2]
+        return z, np.log(size).sum(axis=1)
 
     def _weigh(
-        self, centre: np.ndarray, chol: np.ndarray, num_nodes: int, turn: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Place Sobol nodes as Student's t, and return them with the log of their weights."""
+        self,
+        centre: np.ndarray,
+        chol: np.ndarray,
+        num_nodes: int,
+        turn: int,
+        *,
+        with_rates: bool = False,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Place Sobol nodes as Student's t, and return them with the log of their weights.
+
+        Args:
+            centre: Of the distribution.
+            chol: Root of its covariance.
+            num_nodes: Nodes to place.
+            turn: Scrambles them otherwise in every round.
+            with_rates: Whether mean rates of the groups are returned too, for each node.
+        """
         dim = len(centre)
         rng = np.random.default_rng([self._seed, turn])
-        cube = qmc.Sobol(dim + 1, scramble=True, rng=rng).random(num_nodes)
-        cube = np.clip(cube, 1e-9, 1 - 1e-9)
-        stretch = np.sqrt(FREEDOM / chi2.ppf(cube[:, -1], FREEDOM))
+        cube = np.clip(sobol(num_nodes, dim + 1, rng), 1e-9, 1 - 1e-9)
+        stretch = np.sqrt(FREEDOM / chdtri(FREEDOM, 1 - cube[:, -1]))
         t = ndtri(cube[:, :-1]) * stretch[:, None]
-        z = centre + t @ chol.T
+        u = centre + t @ chol.T
+        z, log_size = self._spread_out(u)
         log_t = -0.5 * (FREEDOM + dim) * np.log1p((t**2).sum(axis=1) / FREEDOM)
         prior = -0.5 * (z**2).sum(axis=1)
         found = np.full(num_nodes, -np.inf)
         near = prior > prior.max() - 60
-        found[near] = self.likelihood.log(from_normal(z[near])) + prior[near] - log_t[near]
-        return z, found
+        rates = np.zeros((num_nodes, len(self.groups) if with_rates else 0, 2))
+        if with_rates:
+            found[near], rates[near] = self.likelihood.log_and_rates(from_normal(z[near]))
+        else:
+            found[near] = self.likelihood.log(from_normal(z[near]))
+        found += prior + log_size - log_t
+        return u, found, rates
 
     def of_nodes(self, values: Float64[np.ndarray, " nodes"]) -> Estimate:
         """Sum up a function of the parameters, given at every node."""
@@ -279,7 +345,8 @@ class AgreementModel:
         nodes = Nodes.of(self.phi[order[np.minimum(places, len(order) - 1)]])
         recorded, sim = (np.empty((count, len(self.groups))) for _ in range(2))
         for members in like.members:
-            shares, centres = like.of_task(nodes, members)
+            task = like.of_task(nodes, members)
+            shares, centres = task.logs, task.centres
             mass = np.cumsum(np.exp(shares - shares.max(axis=1, keepdims=True)), axis=1)
             picked = (mass < _strata(count, rng)[:, None] * mass[:, -1:]).sum(axis=1)
             at = centres[np.arange(count), picked]
@@ -296,9 +363,14 @@ class AgreementModel:
                         mass[np.arange(len(mass)), row], shares_of[group][1][part]
                     )
                     for side, drawn in ((recorded, row), (sim, column)):
-                        inside = like.step * (rng.random(len(mass)) - 0.5)
+                        inside = like.steps[drawn] * (rng.random(len(mass)) - 0.5)
                         side[part, group] = expit(like.grid[drawn] + inside)
-        return Draws(recorded=recorded, sim=sim)
+        # Draws are few: they are moved to the mean that the quadrature finds.
+        moved = [
+            np.clip(side + (mean - side.mean(axis=0)), 0.0, 1.0)
+            for side, mean in zip((recorded, sim), self._rates.T, strict=True)
+        ]
+        return Draws(recorded=moved[0], sim=moved[1])
 
 
 def _flattened(log_w: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:

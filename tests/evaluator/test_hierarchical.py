@@ -10,6 +10,7 @@ from scipy.special import expit
 
 from evaluator.compare.spreadsheet import compare_csv
 from evaluator.errors import UndefinedStatisticError
+from evaluator.report.front import front
 from evaluator.statistics.differences import mean_of_intervals, newcombe_difference
 from evaluator.statistics.group_likelihood import GroupCounts, Likelihood, Nodes, Spread
 from evaluator.statistics.hierarchical import (
@@ -139,9 +140,43 @@ def test_normal_numbers_stand_for_parameters_with_their_prior() -> None:
         sizes = phi[:, at : at + 2]
         assert (sizes >= 0).all()
         assert stats.halfnorm(scale=2.5).sf(sizes) == pytest.approx(1 - share[:, :2], rel=1e-6)
-        assert phi[:, at + 2] / np.pi + 0.5 == pytest.approx(share[:, 0])
+        angle = stats.norm.cdf((1.0 if at == 2 else 0.5 + np.sqrt(0.75)) * z[:, 0])
+        assert phi[:, at + 2] / np.pi + 0.5 == pytest.approx(angle, abs=1e-12)
     assert to_normal(phi[1]) == pytest.approx(z[1])
     assert to_normal(phi[3]) == pytest.approx(z[3])
+    drawn = from_normal(np.random.default_rng(3).standard_normal((20_000, 8)))
+    for at in (4, 7):  # each correlation alone has a uniform arcsine
+        assert stats.kstest(drawn[:, at] / np.pi + 0.5, "uniform").pvalue > 1e-3
+    alike = stats.norm.ppf(drawn[:, [4, 7]] / np.pi + 0.5)
+    assert np.corrcoef(alike.T)[0, 1] == pytest.approx(0.5, abs=0.03)
+
+
+def test_mean_rates_are_those_of_all_nodes_and_draws_are_moved_there(eight: AgreementModel) -> None:
+    like = eight.likelihood
+    logs, rates = like.log_and_rates(eight.phi[:300])
+    assert logs == pytest.approx(like.log(eight.phi[:300]), abs=1e-4)
+    part = like.weights(eight.nodes.mean[:300], Spread(**first(eight.nodes.within, 300)))
+    for group in range(len(EIGHT)):
+        mass = part * like.table[group]
+        for side, rate in enumerate(like.rate_of_cells):
+            wanted = mass @ rate / mass.sum(axis=1)
+            assert rates[:, group, side] == pytest.approx(wanted, abs=1e-4)
+    means = np.stack([eight.draws.recorded.mean(axis=0), eight.draws.sim.mean(axis=0)], axis=1)
+    whole = np.einsum("n,ngs->gs", eight.weights, like.log_and_rates(eight.phi)[1])
+    assert means == pytest.approx(whole, abs=1e-3)
+
+
+def first(spread: Spread, count: int) -> dict[str, np.ndarray]:
+    return {name: values[:count] for name, values in vars(spread).items()}
+
+
+def test_rates_that_cannot_be_told_from_one_have_their_place_on_the_grid() -> None:
+    at = stats.norm(4, 5)
+    chance = integrate.quad(lambda x: expit(x) ** 5 * at.pdf(x), -40, 60, points=(0,))[0]
+    rate = integrate.quad(lambda x: expit(x) ** 6 * at.pdf(x), -40, 60, points=(0,))[0] / chance
+    like = Likelihood(groups_of([(name, 5, 5, 5, 5) for name in "abc"]))
+    _, rates = like.log_and_rates(np.array([[4.0, 4.0, 5.0, 5.0, 0.0]]))
+    assert rates[0, :, 0] == pytest.approx([rate] * 3, abs=1e-3)
 
 
 def test_the_population_has_the_correlation_that_draws_have() -> None:
@@ -207,3 +242,5 @@ def test_a_table_of_simpsons_is_said(write_table: Callable[[str], Path]) -> None
     assert within.value is not None
     assert between.value is not None
     assert within.value < 0 < between.value
+    assert front(results).summary.startswith(str(notes[0][1]))  # the report leads with it
+    assert all("Simpson" not in text for _, text in front(results).notes)

@@ -1,6 +1,8 @@
 """Laws and known answers of paired and unpaired comparisons, and of power."""
 
 import itertools
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from bridge.exchange.table_text import TableOptions
+from evaluator.compare.spreadsheet import compare_csv
 from evaluator.errors import UndefinedStatisticError
+from evaluator.report.front import front
 from evaluator.statistics.differences import (
     boschloo,
     guaranteed_difference,
+    mean_of_intervals,
     newcombe_difference,
     sign_test,
     tango_difference,
@@ -174,3 +180,29 @@ def test_paired_power_by_hand_and_in_the_limit() -> None:
     assert power_paired(0.2, 0.2, 60) < 0.05
     with pytest.raises(UndefinedStatisticError, match="no probabilities"):
         power_paired(0.0, 0.0, 10)
+
+
+def test_trials_of_either_side_of_two_policies_have_a_bias_with_its_interval(
+    write_table: Callable[[str], Path],
+) -> None:
+    counts = {"a": ((14, 20), (150, 200)), "b": ((9, 20), (109, 200))}
+    rows = [
+        f"place,{policy},{side},{'success' if number < k else 'failure'}"
+        for policy, sides in counts.items()
+        for side, (k, n) in zip(("real", "sim"), sides, strict=True)
+        for number in range(n)
+    ]
+    path = write_table("\n".join(["task,policy,side,result", *rows]))
+    found = compare_csv(path, options=TableOptions(map="outcome=result"))
+    table = next(table for table in found.tables if table.id == "conclusions")
+    line = dict(zip(table.columns, table.rows[0], strict=True))
+    each = [newcombe_difference(*real, *sim) for real, sim in counts.values()]
+    wanted = mean_of_intervals([0.05, 0.095], each)
+    assert line["bias (pp)"] == pytest.approx(7.25)
+    assert (line["low"], line["high"]) == pytest.approx(
+        (100 * wanted.low, 100 * wanted.high), abs=0.05
+    )
+    sides = ("sim_planned", "verdict", "sim_executed")
+    assert not any(text.startswith(sides) for text in found.missing)
+    said = front(found.results())
+    assert "without an interval" not in said.summary + said.tasks[0][1]

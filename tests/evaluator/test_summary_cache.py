@@ -30,6 +30,16 @@ class Inner:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Owner:
+    """A record that is always there, with another one inside."""
+
+    text: str
+    inner: Inner
+    maybe: Inner | None = None
+    count: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Everything:
     """One field of each sort that a summary may have."""
 
@@ -46,6 +56,7 @@ class Everything:
     places: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     cells: tuple[str | int | float | None, ...] = ()
+    owner: Owner = Owner(text="", inner=Inner(name=""))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +78,7 @@ FULL = Everything(
     places={"cube": (0.1, 0.2, 0.3)},
     settings={"a": [1, {"b": None}]},
     cells=("x", 1, 1.0, None),
+    owner=Owner(text="o", inner=Inner(name="p"), maybe=Inner(name="q"), count=3),
 )
 
 names = st.text(max_size=5).filter(lambda text: text.isprintable())
@@ -84,6 +96,13 @@ everything = st.builds(
     names=st.none() | st.lists(names, max_size=3).map(tuple),
     inner=st.none() | st.builds(Inner, name=names),
     places=st.dictionaries(names, st.tuples(numbers, numbers, numbers), max_size=2),
+    owner=st.builds(
+        Owner,
+        text=names,
+        inner=st.builds(Inner, name=names),
+        maybe=st.none() | st.builds(Inner, name=names),
+        count=st.none() | st.integers(-9, 9),
+    ),
 )
 
 

@@ -188,3 +188,15 @@ def test_a_sentence_is_broken_over_lines_and_a_long_wide_table_is_set_smaller() 
     long = as_latex(table([("a" * 60, "b" * 60)] * (LONG_ROWS + 1)))
     check(long, columns=2, rows=LONG_ROWS + 1)
     assert r"{\tiny\setlength{\tabcolsep}{2pt}" in long
+
+
+@pytest.mark.parametrize(
+    ("title", "caption"),
+    [
+        ("Ranking of 2 policies", "Ranking of 2 policies."),
+        ("Success", "Success over 2 policies."),
+    ],
+)
+def test_a_caption_counts_nothing_twice(title: str, caption: str) -> None:
+    table = Table.of([{"policy": "a"}, {"policy": "b"}], id="t", title=title)
+    assert caption_of(table) == caption
