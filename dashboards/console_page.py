@@ -359,14 +359,14 @@ class ConsolePages:
             causes=CAUSES,
             none_done=NONE_DONE,
             not_executed=NOT_EXECUTED,
-            result_of=partial(_said, is_blind=bool(self._study.protocol.codes)),
+            result_of=partial(_answer_words, is_blind=bool(self._study.protocol.codes)),
             recorder=self._recorder,
         )
         key = hashlib.sha256(html.encode()).hexdigest()[:16]
         return {"html": html, "key": key, "elapsed_s": state.duration_s, "kind": state.kind}
 
 
-def _said(outcome: Outcome, *, is_blind: bool) -> str:
+def _answer_words(outcome: Outcome, *, is_blind: bool) -> str:
     """Say an answer with a sign; to whom is blinded without its words, which may name the gate."""
     words = {"success": "✓ success", "failure": "✗ failure", "unknown": "? not known"}
     word = words.get(outcome.result, outcome.result)
