@@ -283,7 +283,7 @@ class ConsolePages:
         """
         status: dict[str, Any] = self._link.ask(lambda recorder: recorder.status(), STATUS_S)
         where = Path(str(status.get("run", "")))
-        if where.resolve() != self._study.run.path.resolve():
+        if not may_write_into(where, self._study.run.path):
             message = f"The recorder writes into {where}, and this console is of another run."
             raise UsageError(message)
         if status.get("error"):
@@ -359,18 +359,32 @@ class ConsolePages:
             causes=CAUSES,
             none_done=NONE_DONE,
             not_executed=NOT_EXECUTED,
-            result_of=partial(_said, is_blind=bool(self._study.protocol.codes)),
+            result_of=partial(_answer_words, is_blind=bool(self._study.protocol.codes)),
             recorder=self._recorder,
         )
         key = hashlib.sha256(html.encode()).hexdigest()[:16]
         return {"html": html, "key": key, "elapsed_s": state.duration_s, "kind": state.kind}
 
 
-def _said(outcome: Outcome, *, is_blind: bool) -> str:
+def _answer_words(outcome: Outcome, *, is_blind: bool) -> str:
     """Say an answer with a sign; to whom is blinded without its words, which may name the gate."""
     words = {"success": "✓ success", "failure": "✗ failure", "unknown": "? not known"}
     word = words.get(outcome.result, outcome.result)
     return f"{word}: {outcome.detail}" if outcome.detail and not is_blind else word
+
+
+def may_write_into(told: Path, run_path: Path) -> bool:
+    """Whether a recorder writes into a run; it may have been given a path from its own folder.
+
+    Args:
+        told: Where it says that it writes.
+        run_path: The run folder.
+    """
+    here = run_path.resolve()
+    if told.is_absolute():
+        return told.resolve() == here
+    ending = [part for part in told.parts if part != ".."]
+    return not ending or list(here.parts[-len(ending) :]) == ending
 
 
 class _LateError(UsageError):

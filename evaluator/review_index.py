@@ -448,7 +448,9 @@ class ReviewIndex:
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        name = ":memory:" if isinstance(self.source, bytes) else f"{self.source.as_uri()}?mode=ro"
+        name = ":memory:"
+        if not isinstance(self.source, bytes):
+            name = f"{self.source.absolute().as_uri()}?mode=ro"
         try:
             with closing(sqlite3.connect(name, uri=True)) as db:
                 if isinstance(self.source, bytes):

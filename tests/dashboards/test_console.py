@@ -25,6 +25,7 @@ from bridge.wire.config import WireConfig
 from dashboards.app import create_app
 from dashboards.config import DashboardConfig
 from dashboards.console_door import CLOSED_S, MOST_WRONG, ConsoleDoor, claim_console
+from dashboards.console_page import may_write_into
 from dashboards.console_study import ConsoleStudy, drawn_start, outcome_from
 from dashboards.guard import Admission
 from dashboards.label_page import CAUSES
@@ -313,6 +314,23 @@ def test_a_study_is_recorded_answered_and_read_by_the_evaluator_through_servers_
     (row,) = compare_run(run).rows
     assert (row.policy, row.study_arm, row.recorded) == ("secret_policy", first.arm, False)
     assert row.stages == (("grasp", True), ("place", False))
+
+
+def test_a_recorder_may_name_its_run_from_its_own_folder(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "study"
+    run.mkdir(parents=True)
+    (tmp_path / "link").symlink_to(run)
+    for told in (
+        run,
+        tmp_path / "link",
+        Path("study"),
+        Path("runs/study"),
+        Path("../study"),
+        Path(),
+    ):
+        assert may_write_into(told, run), told
+    for told in (tmp_path / "other", Path("other"), Path("others/study"), Path("study/other")):
+        assert not may_write_into(told, run), told
 
 
 def test_a_recorder_of_another_run_or_none_is_told_and_never_started(

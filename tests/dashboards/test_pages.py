@@ -362,3 +362,12 @@ def test_the_views_follow_the_few_numbers_to_read_first(browser: Any) -> None:
     assert page[first:views].count("<article") <= 4
     assert "held out: " not in words(page[first:views])
     assert "MS-SSIM" in words(page[all_numbers:])
+
+
+def test_a_run_that_is_named_by_a_relative_path_is_shown(
+    shared_run: RunFolder, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(shared_run.path.parent)
+    pages = synthetic.browser_of(RunFolder(Path(shared_run.path.name)))
+    for address in ("/", "/queue", "/failures", "/numbers", "/episode/trial_0001"):
+        assert pages.get(address).status_code == 200, address
