@@ -35,8 +35,8 @@ class DepthScore:
     def __str__(self) -> str:
         """One line."""
         return (
-            f"{1e3 * self.median_abs_m:.2f} mm, bias {1e3 * self.bias_m:+.2f} mm, "
-            f"{100 * self.within_5mm:.1f} % within 5 mm, {100 * self.within_20mm:.1f} % within 20 mm"
+            f"{1e3 * self.median_abs_m:.2f} mm, bias {1e3 * self.bias_m:+.2f} mm, within 5 mm "
+            f"{100 * self.within_5mm:.1f} %, within 20 mm {100 * self.within_20mm:.1f} %"
         )
 
 
