@@ -46,7 +46,7 @@ def work() -> None:
         views.append(training_view(surface))
     start = time.process_time()
     config = InitialiseConfig(max_splats=NUM_SPLATS, growth=0.0, footprint_factor=1.2)
-    cloud = fuse(points, config)
+    cloud = fuse(points, config, views)
     seconds = time.process_time() - start
     points.clear()
     steps = FitConfig(iterations=11, coarse_fraction=0.3, appearance_steps=1, gain=False)

@@ -57,8 +57,8 @@ def rebuild(
     surfaces = [FrameSurface(frame, limits) for frame in frames]
     pixels = len(frames) * frames[0].depth_m.size
     stride = max(1, round(float(np.sqrt(pixels / MAX_POINTS))))
-    first = fuse([surface.points(stride) for surface in surfaces], initialise)
     views = [training_view(surface) for surface in surfaces]
+    first = fuse([surface.points(stride) for surface in surfaces], initialise, views)
     left = budget_s - (seconds() - start)
     result = fit(
         first,

@@ -39,7 +39,7 @@ def rasterization(
     rasterize_mode: str,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Colours (1, h, w, channels), alphas (1, h, w, 1), and the radii of one view."""
-    if packed or rasterize_mode != "antialiased" or render_mode not in ("RGB", "RGB+D"):
+    if packed or rasterize_mode != "antialiased" or render_mode != "RGB":
         raise NotImplementedError(render_mode)
     T, K = viewmats[0], Ks[0]
     p = means @ T[:3, :3].T + T[:3, 3]
@@ -73,8 +73,7 @@ def rasterization(
     alpha = alpha[order]
     light = torch.cumprod(1 - alpha, dim=0)
     weight = alpha * torch.cat([torch.ones_like(light[:1]), light[:-1]])
-    channels = torch.cat([colors, z[:, None]], 1) if render_mode == "RGB+D" else colors
-    image = torch.einsum("nhw,nc->hwc", weight, channels[order])
+    image = torch.einsum("nhw,nc->hwc", weight, colors[order])
     radius = 3.0 * blurred.diagonal(dim1=1, dim2=2).sqrt() * front[:, None]
     touches = (u + radius[:, 0] > 0) & (u - radius[:, 0] < width)
     touches &= (v + radius[:, 1] > 0) & (v - radius[:, 1] < height) & (opacity > ALPHA_CUT)

@@ -51,12 +51,16 @@ def weights(
     T_camera_base: torch.Tensor,
     alpha_cut: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what each Gaussian adds to each pixel (num, height, width), and its depth."""
+    """Return what each Gaussian adds to each pixel (num, height, width), and its depth there.
+
+    The depth is the mean of z given the pixel under the joint normal distribution of both.
+    """
     T = T_camera_base
     p = means @ T[:3, :3].T + T[:3, 3]
     front = p[:, 2] > NEAR_M
     p = torch.where(front[:, None], p, torch.tensor([0.0, 0.0, 1.0], dtype=p.dtype))
     A = _jacobian(camera, p) @ T[:3, :3] @ rotation(quats) @ torch.diag_embed(scales_log.exp())
+    axis = T[2:3, :3] @ rotation(quats) @ torch.diag_embed(scales_log.exp())
     cov = A @ A.transpose(1, 2)
     mip = cov + MIP_VARIANCE_PX2 * torch.eye(2, dtype=cov.dtype)
     ratio = torch.linalg.det(cov) / torch.linalg.det(mip)
@@ -79,7 +83,9 @@ def weights(
     alpha = alpha[order]
     light = torch.cumprod(1 - alpha, dim=0)
     light = torch.cat([torch.ones_like(light[:1]), light[:-1]])
-    return (alpha * light)[torch.argsort(order)], p[:, 2]
+    slope = (conic @ A @ axis.transpose(1, 2))[:, :, :, None]
+    depth = p[:, 2, None, None] + slope[:, 0] * dx + slope[:, 1] * dy
+    return (alpha * light)[torch.argsort(order)], depth
 
 
 def seen_colors(
@@ -109,5 +115,19 @@ def draw(
     weight, depth = weights(means, quats, scales_log, opacities_logit, camera, T, alpha_cut)
     if harmonics is not None:
         colors = seen_colors(means, colors, harmonics, T)
-    channels = torch.cat([colors, depth[:, None], torch.ones_like(depth)[:, None]], dim=1)
-    return torch.einsum("nhw,nc->chw", weight, channels)
+    image = torch.einsum("nhw,nc->chw", weight, colors)
+    rest = torch.stack([(weight * depth).sum(dim=0), weight.sum(dim=0)])
+    return torch.cat([image, rest])
+
+
+def surface_depth(
+    weight: torch.Tensor, depth: torch.Tensor, means: torch.Tensor, T_camera_base: torch.Tensor
+) -> torch.Tensor:
+    """Mean depth (height, width) of what lies within 2 % of where half of the light is gone."""
+    order = torch.argsort(means @ T_camera_base[2, :3] + T_camera_base[2, 3], stable=True)
+    weight, depth = weight[order], depth[order]
+    gone = weight.cumsum(dim=0) >= 0.5
+    median = depth.gather(0, gone.int().argmax(dim=0)[None])
+    near = weight * ((depth - median).abs() <= 0.02 * median)
+    mean = (near * depth).sum(dim=0) / near.sum(dim=0).clamp(min=1e-12)
+    return torch.where(gone[-1], mean, torch.zeros_like(mean))

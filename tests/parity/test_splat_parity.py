@@ -184,6 +184,24 @@ def test_features_lift_and_labels_agree_with_the_reference(isa: str) -> None:
 
 
 @pytest.mark.parametrize("isa", ISAS)
+def test_the_depth_of_the_surface_agrees_with_the_reference(isa: str) -> None:
+    cloud = random_cloud(np.random.default_rng(9), 120, shiny=False)
+    config = RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1, isa=isa)
+    rasteriser = Rasteriser(config)
+    alpha = rasteriser.draw_planes(cloud, CAMERA, tilted_pose())[4]
+    tensors = [torch.tensor(rows, dtype=torch.float64) for _, rows in arrays(cloud)][:4]
+    T = torch.tensor(as_float32(se3.invert(tilted_pose())), dtype=torch.float64)
+    weight, depth = splat_reference.weights(*tensors, CAMERA, T, 2.0**-24)
+    expected = splat_reference.surface_depth(weight, depth, tensors[0], T).numpy()
+    found = rasteriser.surface_depth()
+    clear = np.abs(alpha - 0.5) > 1e-4  # float32 may see half of the light gone one Gaussian later
+    np.testing.assert_array_equal((found > 0)[clear], (expected > 0)[clear])
+    off = np.abs(found - expected)[clear]
+    assert np.quantile(off, 0.99) < 2e-5
+    assert (expected > 0).mean() > 0.3
+
+
+@pytest.mark.parametrize("isa", ISAS)
 def test_all_instruction_sets_agree(isa: str) -> None:
     cloud = random_cloud(np.random.default_rng(4), 200)
     pose = tilted_pose()

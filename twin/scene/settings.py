@@ -111,7 +111,7 @@ class InitialiseConfig:
 
     max_splats: int = 60_000
     """Budget of the whole fit."""
-    growth: float = 0.25
+    growth: float = 0.4
     """Share of the budget left to the fit, which splits Gaussians where the error is large;
     voxels grow until the first Gaussians fit in the others."""
     footprint_factor: float = 1.6
@@ -160,9 +160,9 @@ class FitConfig:
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
     loss: Literal["3dgs", "paper"] = "3dgs"
     """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
-    depth_weight: float = 0.1
+    depth_weight: float = 0.5
     """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
-    slab: float = 0.0
+    slab: float = 0.5
     """How far a Gaussian may leave the surface that depth fused, along its normal and in units of
     its own size; 0: as far as it likes."""
     coarse_fraction: float = 0.6

@@ -74,7 +74,9 @@ def refine_poses(
     with output.progress("align poses", ROUNDS * len(views)) as advance:
         for number in range(ROUNDS):
             moved = [_moved_points(p, T) for p, T in zip(points, corrections, strict=True)]
-            model = model_surface(fuse(moved, InitialiseConfig(max_splats=MODEL_SPLATS)))
+            model = model_surface(
+                fuse(moved, InitialiseConfig(max_splats=MODEL_SPLATS, growth=0.25))
+            )
             for index, view in enumerate(views):
                 corrections[index] = refine_view_pose(
                     points[index], view, model, corrections[index], number

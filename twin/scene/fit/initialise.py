@@ -1,10 +1,20 @@
-"""The first Gaussians: depth points fused in voxels as large as the pixels that saw them."""
+"""The first Gaussians: depth points fused in voxels as large as the pixels that saw them.
+
+Measurements of one surface by many views scatter by more than a voxel: noise, and poses that are
+off. Voxels then lie in several layers one behind the other, each view meets the front one first,
+and depth comes out too near. So each voxel is moved along its normal to where the views measured
+the surface on average, and layers that coincide then become one.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8
 
+from bridge.geometry import se3
 from twin.errors import TwinError
-from twin.scene.frames.rgbd import PointSet
+from twin.scene.frames.rgbd import NEAR_M, PointSet, TrainingView
 from twin.scene.gaussians import GaussianCloud, as_float32, morton_order
 from twin.scene.settings import InitialiseConfig
 
@@ -16,11 +26,22 @@ MIN_POINTS = 2
 """A voxel seen by fewer points is noise."""
 
 
+SETTLE_ROUNDS = 3
+SETTLE_SIGMA = 4.0
+"""Measurements within this many times their scatter are of the same surface."""
+OTHER_SURFACE = 0.05
+"""Those whose depth differs by more than this share never are."""
+LEAST_COSINE = 0.2
+"""Of the angle between a ray and the normal; flatter looks measure nothing along the normal."""
+
+
 class NoSurfaceError(TwinError):
     """The depth images hold no usable surface."""
 
 
-def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
+def fuse(
+    points: list[PointSet], config: InitialiseConfig, views: Sequence[TrainingView] = ()
+) -> GaussianCloud:
     """Average points in voxels of 1.6 pixel footprints, and flatten them along their normal.
 
     Voxel sizes are powers of two times a base size, so that near surfaces keep detail and far
@@ -30,6 +51,7 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
     Args:
         points: What each frame measured, all in one frame.
         config: Voxel size, budget and the shape of new Gaussians.
+        views: Whose depth says where the surface is on average; none: voxels stay where they are.
 
     Raises:
         NoSurfaceError: When no voxel has two points.
@@ -37,7 +59,8 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
     p = np.concatenate([item.p_m for item in points])
     if len(p) < MIN_POINTS:
         raise NoSurfaceError(_no_surface(len(p)))
-    p -= p.min(axis=0)
+    origin = p.min(axis=0)
+    p -= origin
     wanted = np.float32(config.footprint_factor) * np.concatenate(
         [item.footprint_m for item in points]
     )
@@ -56,8 +79,111 @@ def fuse(points: list[PointSet], config: InitialiseConfig) -> GaussianCloud:
         _average([getattr(item, name) for item in points], inverse, kept, count)
         for name in ("p_m", "normals", "colors")
     )
-    cloud = flat_gaussians(means, normals, colors, sizes[kept], config)
+    voxels = _Voxels(means=means, normals=normals, colors=colors, count=count, sizes=sizes[kept])
+    if len(views) > 0:
+        voxels = voxels.settled(views).merged(origin)
+    cloud = flat_gaussians(voxels.means, voxels.normals, voxels.colors, voxels.sizes, config)
     return cloud.take(morton_order(cloud.means_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Voxels:
+    """What was averaged in each voxel."""
+
+    means: Float[np.ndarray, "num_voxels 3"]
+    normals: Float[np.ndarray, "num_voxels 3"]
+    """Of any length."""
+    colors: Float[np.ndarray, "num_voxels 3"]
+    count: np.ndarray
+    sizes: Float[np.ndarray, " num_voxels"]
+
+    def settled(self, views: Sequence[TrainingView]) -> "_Voxels":
+        """Moved along their normals to the mean of what the views measured there.
+
+        Near measurements and those seen straight on count more, as the noise of depth cameras
+        grows with the square of the distance.
+        """
+        unit = self.normals / np.maximum(np.linalg.norm(self.normals, axis=1, keepdims=True), 1e-9)
+        means, normals = as_float32(self.means), as_float32(unit)
+        for _ in range(SETTLE_ROUNDS):
+            seen = list(_measured_offsets(means, normals, views))
+            apart = np.concatenate([np.abs(item.offset_m) / item.depth_m for item in seen])
+            if len(apart) == 0:
+                break
+            limit = SETTLE_SIGMA * 1.4826 * np.median(apart)
+            total, weights = (np.zeros(len(means), np.float32) for _ in range(2))
+            for item in seen:
+                weight = item.cosine / np.square(item.depth_m)
+                weight *= np.abs(item.offset_m) <= limit * item.depth_m
+                total[item.voxel] += weight * item.offset_m
+                weights[item.voxel] += weight
+            means += (total / np.where(weights > 0, weights, 1.0))[:, None] * normals
+        return replace(self, means=means.astype(np.float64))
+
+    def merged(self, origin: Float[np.ndarray, "3"]) -> "_Voxels":
+        """One for all that now lie in the same voxel of their size.
+
+        Args:
+            origin: Corner of the voxels.
+        """
+        level = np.rint(np.log2(self.sizes / self.sizes.min())).astype(np.int64)
+        cell = np.floor((self.means - origin) / self.sizes[:, None]).astype(np.int64)
+        _, first, inverse = np.unique(
+            _pack(np.maximum(cell, 0), level), return_index=True, return_inverse=True
+        )
+        weight = np.bincount(inverse, weights=self.count)
+
+        def mean(rows: np.ndarray) -> np.ndarray:
+            columns = [np.bincount(inverse, weights=self.count * rows[:, k]) for k in range(3)]
+            return np.stack(columns, axis=1) / weight[:, None]
+
+        return _Voxels(
+            means=mean(self.means),
+            normals=mean(self.normals),
+            colors=mean(self.colors),
+            count=weight,
+            sizes=self.sizes[first],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Offsets:
+    """How far from some voxels one view measured their surface."""
+
+    voxel: np.ndarray
+    offset_m: Float32[np.ndarray, " num_pairs"]
+    """Along the normal, to the plane through the measured point."""
+    depth_m: Float32[np.ndarray, " num_pairs"]
+    cosine: Float32[np.ndarray, " num_pairs"]
+    """Between the ray and the normal."""
+
+
+def _measured_offsets(
+    means: Float32[np.ndarray, "num_voxels 3"],
+    normals: Float32[np.ndarray, "num_voxels 3"],
+    views: Sequence[TrainingView],
+) -> Iterator[_Offsets]:
+    """Look each voxel up in each depth image; what another surface hides is left out."""
+    for view in views:
+        camera, T = view.full.camera, as_float32(se3.invert(view.T_base_color))
+        p = means @ T[:3, :3].T + T[:3, 3]
+        voxel = np.flatnonzero(p[:, 2] > NEAR_M)
+        column, row = np.floor(camera.project(p[voxel])[0].T)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        voxel, x, y = voxel[inside], column[inside].astype(np.int32), row[inside].astype(np.int32)
+        depth = view.full.depth_m[y, x]
+        ray = np.stack(
+            [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))],
+            axis=1,
+        ).astype(np.float32)
+        p, n = p[voxel], normals[voxel] @ T[:3, :3].T
+        cosine = -np.einsum("ni,ni->n", n, ray) / np.linalg.norm(ray, axis=1)
+        offset = np.einsum("ni,ni->n", n, depth[:, None] * ray - p)
+        same = (depth > 0) & (cosine > LEAST_COSINE)
+        same &= np.abs(depth - p[:, 2]) < OTHER_SURFACE * p[:, 2]
+        yield _Offsets(
+            voxel=voxel[same], offset_m=offset[same], depth_m=depth[same], cosine=cosine[same]
+        )
 
 
 def _no_surface(num_points: int) -> str:

@@ -6,8 +6,9 @@ at many images at once, so none may take more than its share of the budget.
 
 Images alone let a Gaussian slide along its rays as long as the training views agree; the depth term
 sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in it. From
-other viewpoints they come apart as a haze of millimetres. With ``slab`` each Gaussian is held
-within a slab around the piece of the fused surface that it began on.
+other viewpoints they come apart as a haze of millimetres, and the nearest of them hide the others:
+depth comes out too near. So each Gaussian is held within a ``slab`` around the piece of the fused
+surface that it began on.
 """
 
 import io
@@ -361,6 +362,9 @@ SPENT_AT_MOST = 0.5
 """Initialisation uses up this share of the budget at most, so that there always is a fit."""
 POSES_FROM = 0.15
 """Cameras are moved only once the scene is good enough to say where to."""
+POSES_DEPTH = 0.05
+"""Where cameras are moved, depth weighs only this much of what it does otherwise, and nothing is
+held near the fused surface: the depth of a view that stands wrong is wrong with it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -436,8 +440,7 @@ def fit(
         if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
             state.seconds = last_saved = at.seconds
             save_state(checkpoint, state)
-    if config.slab:
-        state.surface.hold(state.session.cloud, config.slab)
+    learner.hold(state)
     return FitResult(
         cloud=state.session.cloud,
         iterations=state.session.steps,
@@ -490,12 +493,18 @@ class _Learner:
 
     def session(self, cloud: GaussianCloud) -> FitSession:
         """What draws, compares and learns, from a cloud on."""
+        config = self._config
         return FitSession(
             cloud,
             self.rasteriser.config,
-            loss=self._config.loss,
-            depth_weight=self._config.depth_weight,
+            loss=config.loss,
+            depth_weight=config.depth_weight * (POSES_DEPTH if config.refine_poses else 1.0),
         )
+
+    def hold(self, state: FitState) -> None:
+        """Keep Gaussians near the surface they began on, where that is to be trusted."""
+        if self._config.slab and not self._config.refine_poses:
+            state.surface.hold(state.session.cloud, self._config.slab)
 
     def pose(self, state: FitState, index: int) -> np.ndarray:
         """Where a view is now thought to be."""
@@ -514,8 +523,8 @@ class _Learner:
         report = state.session.step(
             view.half if coarse else view.full, pose, rates, state.gains[index]
         )
-        if self._config.slab and state.session.steps % HOLD_EVERY == 0:
-            state.surface.hold(state.session.cloud, self._config.slab)
+        if state.session.steps % HOLD_EVERY == 0:
+            self.hold(state)
         if self._config.refine_poses and at.fraction >= POSES_FROM:
             pulled = correction_gradient(report.T_camera_base, pose)
             state.cameras.update(index, pulled, decay)

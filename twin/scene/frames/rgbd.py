@@ -15,6 +15,9 @@ NORMAL_REACH_PX = 2
 """Normals come from the pixels this far to each side."""
 SEAMED = 0.3
 """With a smaller share of measured pixels among measured neighbours, gaps are the rule."""
+SAME_SURFACE = 1.03
+"""Measurements in one pixel up to this many times the nearest are of its surface. They are
+averaged: the nearest of several noisy ones is too near."""
 OCCLUSION_CELL_PX = 4
 """Size of the cells in which the nearest point hides those behind it."""
 
@@ -140,17 +143,21 @@ class FrameSurface:
     def depth_in_color_camera(self) -> Float32[np.ndarray, "height width"]:
         """Depth along the colour camera's axis at its size; 0 where unknown.
 
-        Of several measurements in one pixel the nearest counts.
+        Of several measurements in one pixel those of the nearest surface are averaged.
         """
         camera = self.frame.color_camera
         p = _carry(self._T_color_depth(), self._p_depth[:, self.trusted])
         u, v = _pixels(camera, p)
         inside = (p[2] > NEAR_M) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         index = v[inside].astype(np.int32) * camera.width + u[inside].astype(np.int32)
+        z = p[2, inside]
         nearest = np.full(camera.width * camera.height, np.inf, dtype=np.float32)
-        np.minimum.at(nearest, index, p[2, inside])
-        nearest[~np.isfinite(nearest)] = 0.0
-        return np.asarray(nearest.reshape(camera.height, camera.width))
+        np.minimum.at(nearest, index, z)
+        same = z <= SAME_SURFACE * nearest[index]
+        count = np.bincount(index[same], minlength=len(nearest))
+        total = np.bincount(index[same], weights=z[same], minlength=len(nearest))
+        depth = total / np.maximum(count, 1)
+        return as_float32(depth.reshape(camera.height, camera.width))
 
     def _T_color_depth(self) -> Float[np.ndarray, "4 4"]:
         return np.asarray(se3.invert(self.frame.T_base_color) @ self.frame.T_base_depth)
@@ -308,7 +315,9 @@ def _halved_image(image_u8: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _halved_depth(depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-    """Nearest measurement of each block; blocks without one stay 0."""
-    known = np.where(depth_m > 0, depth_m, np.float32(np.inf))
-    nearest = _blocks(known, camera).min(axis=(1, 3))
-    return np.where(np.isfinite(nearest), nearest, np.float32(0.0))
+    """Mean of each block's measurements of its nearest surface; blocks without one stay 0."""
+    known = _blocks(np.where(depth_m > 0, depth_m, np.float32(np.inf)), camera)
+    nearest = known.min(axis=(1, 3), keepdims=True)
+    same = (known <= np.float32(SAME_SURFACE) * nearest) & np.isfinite(known)
+    total = np.where(same, known, np.float32(0.0)).sum(axis=(1, 3))
+    return as_float32(total / np.maximum(same.sum(axis=(1, 3)), 1))

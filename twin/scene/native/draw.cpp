@@ -1,7 +1,8 @@
 // Drawing one tile and the gradients of one tile, front to back; a block of pixels is a vector.
 //
 // Paper Eq. 2 with the product transmittance of the errata: w_i = alpha_i prod_{j<i}(1 - alpha_j).
-// Planes: sum w rgb, sum w depth, sum w.
+// Planes: sum w rgb, sum w depth, sum w. Depth is that of the Gaussian's own surface at the pixel,
+// depth + depth_x dx + depth_y dy: the densest point of the ray in it (Zhang et al. 2024, RaDe-GS).
 #include "tile.hpp"
 
 namespace splat::SPLAT_ISA {
@@ -28,6 +29,7 @@ void draw_gaussian(const Projected& g, const TileJob& job, float log2_cut, Tile*
     const Grid grid = block_grid();
     for (int y = reach.y0; y < reach.y1; ++y) {
         const RowShape shape = row_shape(g, job, y, grid);
+        const Floats row_depth = g.depth + g.depth_y * shape.dy;
         for (int x = reach.x0; x < reach.x1; ++x) {
             const int at = block_at(y, x);
             const Floats dx = offsets(g, job, x, grid);
@@ -37,7 +39,8 @@ void draw_gaussian(const Projected& g, const TileJob& job, float log2_cut, Tile*
             store(tile->light + at, light - weight);
             for (int k = 0; k < 3; ++k)
                 store(tile->planes[k] + at, load(tile->planes[k] + at) + weight * g.rgb[k]);
-            store(tile->planes[3] + at, load(tile->planes[3] + at) + weight * g.depth);
+            const Floats depth = row_depth + g.depth_x * dx;
+            store(tile->planes[3] + at, load(tile->planes[3] + at) + weight * depth);
             store(tile->planes[4] + at, load(tile->planes[4] + at) + weight);
         }
     }
@@ -57,10 +60,12 @@ void pull_gaussian(const Projected& g, const TileJob& job, Limits limits, Gradie
                    float* out) {
     const Reach reach = reach_of(g, job);
     const Grid grid = block_grid();
-    Floats e0{}, ex{}, ey{}, exx{}, exy{}, eyy{}, red{}, green{}, blue{}, depth{};
+    Floats e0{}, ex{}, ey{}, exx{}, exy{}, eyy{}, red{}, green{}, blue{};
+    Floats depth{}, depth_x{}, depth_y{};
     for (int y = reach.y0; y < reach.y1; ++y) {
         const RowShape shape = row_shape(g, job, y, grid);
-        Floats row_e{}, row_ex{};
+        const Floats row_depth = g.depth + g.depth_y * shape.dy;
+        Floats row_e{}, row_ex{}, row_on_depth{};
         for (int x = reach.x0; x < reach.x1; ++x) {
             const int at = block_at(y, x);
             const Floats dx = offsets(g, job, x, grid);
@@ -71,7 +76,8 @@ void pull_gaussian(const Projected& g, const TileJob& job, Limits limits, Gradie
             const Floats g_red = load(tile->planes[0] + at), g_green = load(tile->planes[1] + at);
             const Floats g_blue = load(tile->planes[2] + at), g_depth = load(tile->planes[3] + at);
             const Floats value = g_red * g.rgb[0] + g_green * g.rgb[1] + g_blue * g.rgb[2] +
-                                 g_depth * g.depth + load(tile->planes[4] + at);
+                                 g_depth * (row_depth + g.depth_x * dx) +
+                                 load(tile->planes[4] + at);
             const Floats behind = load(tile->behind + at) - weight * value;
             store(tile->behind + at, behind);
             store(tile->light + at, light - weight);
@@ -84,19 +90,23 @@ void pull_gaussian(const Projected& g, const TileJob& job, Limits limits, Gradie
             red += weight * g_red;
             green += weight * g_green;
             blue += weight * g_blue;
-            depth += weight * g_depth;
+            const Floats on_depth = weight * g_depth;
+            row_on_depth += on_depth;
+            depth_x += on_depth * dx;
         }
         e0 += row_e;
         ex += row_ex;
         ey += row_e * shape.dy;
         exy += row_ex * shape.dy;
         eyy += row_e * (shape.dy * shape.dy);
+        depth += row_on_depth;
+        depth_y += row_on_depth * shape.dy;
     }
     const Floats4 first = four_sums(e0, ex, ey, exx), second = four_sums(exy, eyy, red, green);
+    const Floats4 third = four_sums(blue, depth, depth_x, depth_y);
     __builtin_memcpy(out, &first, sizeof first);
     __builtin_memcpy(out + 4, &second, sizeof second);
-    out[kBlue] = sum(blue);
-    out[kDepth] = sum(depth);
+    __builtin_memcpy(out + 8, &third, sizeof third);
 }
 
 }  // namespace

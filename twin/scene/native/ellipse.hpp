@@ -81,6 +81,7 @@ struct Local {
     Floats s[3];            // scales [m]
     Floats T[6];            // J W, 2 x 3
     Floats A[6];            // J W R S, 2 x 3
+    Floats B[3];            // last row of W R S: depth [m]
     Floats xx, xy, yy;      // image covariance without the low-pass [px^2]
 };
 
@@ -138,6 +139,10 @@ static inline void fill_local(const Splats& in, const Camera& camera, int begin,
                 (out->T[3 * row] * out->R[k] + out->T[3 * row + 1] * out->R[3 + k] +
                  out->T[3 * row + 2] * out->R[6 + k]) *
                 out->s[k];
+    for (int k = 0; k < 3; ++k)
+        out->B[k] = (camera.R[6] * out->R[k] + camera.R[7] * out->R[3 + k] +
+                     camera.R[8] * out->R[6 + k]) *
+                    out->s[k];
     const Floats* A = out->A;
     out->xx = A[0] * A[0] + A[1] * A[1] + A[2] * A[2];
     out->xy = A[0] * A[3] + A[1] * A[4] + A[2] * A[5];
@@ -154,6 +159,17 @@ static inline Floats image_determinant(const Floats* A) {
 
 static inline Floats low_pass_determinant(const Local& local, Floats det_raw) {
     return det_raw + kMipVariance * (local.xx + local.yy) + kMipVariance * kMipVariance;
+}
+
+// How depth changes over the image on the surface that a ray meets where the Gaussian is densest
+// along it: the regression of depth on the pixel, cov(z, uv) cov(uv)^-1. Both covariances are those
+// of the Gaussian seen through the low-pass, so that a grazing one has no infinite slope.
+static inline void depth_slope(const Local& local, Floats inverse_det, Floats* slope) {
+    const Floats *A = local.A, *B = local.B;
+    const Floats xz = A[0] * B[0] + A[1] * B[1] + A[2] * B[2];
+    const Floats yz = A[3] * B[0] + A[4] * B[1] + A[5] * B[2];
+    slope[0] = ((local.yy + kMipVariance) * xz - local.xy * yz) * inverse_det;
+    slope[1] = ((local.xx + kMipVariance) * yz - local.xy * xz) * inverse_det;
 }
 
 // Unit vector from the camera centre to each mean; returns one over the distance.

@@ -69,6 +69,10 @@ struct Kernels {
     // ``slots`` names for each Gaussian of the job the tile of ``label_weights`` it adds to.
     void (*label_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
                        const int* slots, float* label_weights);
+    // ``plane`` (height x width): depth of the surface behind which less than half of the light
+    // is left, averaged with all that lies within kSurfaceBand of it; 0 where more light passes.
+    void (*surface_tile)(const Projected*, const TileJob&, const Camera&, const Settings&,
+                         float* plane);
     // Structural similarity of the columns from x0 on (at most kStripColumns) of two planes:
     // returns its sum, and fills these columns of the gradient of ``scale`` times the sum over the
     // whole plane with respect to ``x``.

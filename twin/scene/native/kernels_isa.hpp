@@ -19,6 +19,7 @@ void lift_tile(const Projected*, const TileJob&, const Camera&, const Settings&,
                const float* planes, int num_planes, float* tile_planes, float* pair_sums);
 void label_tile(const Projected*, const TileJob&, const Camera&, const Settings&, const int* slots,
                 float* label_weights);
+void surface_tile(const Projected*, const TileJob&, const Camera&, const Settings&, float* plane);
 double similarity_strip(const float* x, const float* y, float* gradient, float scale, int width,
                         int height, int x0);
 void compare_row(const ColorRow&, float* compared, float* wanted, double* l1, double* squared);

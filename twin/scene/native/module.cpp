@@ -86,6 +86,16 @@ class PyRasteriser {
         return features;
     }
 
+    NewArray<float> surface_depth() {
+        const Camera& camera = rasteriser_.camera();
+        auto plane = new_array<float>({height(camera), width(camera)});
+        {
+            nb::gil_scoped_release unlocked;
+            rasteriser_.surface_depth(plane.data());
+        }
+        return plane;
+    }
+
     nb::tuple label_map(const Buffer<std::uint16_t, nb::shape<-1>>& labels) {
         check_rows(labels.shape(0));
         const Camera& camera = rasteriser_.camera();
@@ -206,6 +216,7 @@ NB_MODULE(_splat, module) {
         .def("draw_features", &PyRasteriser::draw_features, "features"_a.noconvert())
         .def("lift", &PyRasteriser::lift, "planes"_a.noconvert())
         .def("label_map", &PyRasteriser::label_map, "labels"_a.noconvert())
+        .def("surface_depth", &PyRasteriser::surface_depth)
         .def("visible", &PyRasteriser::visible)
         .def_prop_ro("num_pairs", &PyRasteriser::num_pairs)
         .def_prop_ro("isa", &PyRasteriser::isa);

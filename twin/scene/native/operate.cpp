@@ -1,5 +1,6 @@
 // The drawn image as a linear map of what the Gaussians carry: planes = A values, with A the
-// weights of the last drawing. Here A, its transpose and sums by label, one tile at a time.
+// weights of the last drawing. Here A, its transpose and sums by label, one tile at a time; and the
+// depth of the surface, which is no linear map.
 #include "tile.hpp"
 
 namespace splat::SPLAT_ISA {
@@ -99,6 +100,68 @@ void label_tile(const Projected* projected, const TileJob& job, const Camera& ca
         each_block(reach,
                    [&](int at) { store(plane + at, load(plane + at) + load(tile.weight + at)); });
     }
+}
+
+namespace {
+
+struct alignas(64) SurfaceTile {
+    float light[kTilePixels], median[kTilePixels];
+    float off[kTilePixels], weight[kTilePixels];  // sums over what lies near the median
+};
+
+// Front to back, ``visit(block, light before, light after, depth)``.
+template <class Visit>
+void each_depth(const Projected* projected, const TileJob& job, float log2_cut, float* light,
+                Visit visit) {
+    const Grid grid = block_grid();
+    for (int i = 0; i < job.count; ++i) {
+        const Projected& g = projected[job.ids[i]];
+        const Reach reach = reach_of(g, job);
+        for (int y = reach.y0; y < reach.y1; ++y) {
+            const RowShape shape = row_shape(g, job, y, grid);
+            const Floats row_depth = g.depth + g.depth_y * shape.dy;
+            for (int x = reach.x0; x < reach.x1; ++x) {
+                const int at = block_at(y, x);
+                const Floats dx = offsets(g, job, x, grid);
+                const Floats alpha = alpha_of(log2_alpha(g, shape, dx), log2_cut);
+                const Floats before = load(light + at), after = before - alpha * before;
+                store(light + at, after);
+                visit(at, before, after, row_depth + g.depth_x * dx);
+            }
+        }
+    }
+}
+
+}  // namespace
+
+void surface_tile(const Projected* projected, const TileJob& job, const Camera& camera,
+                  const Settings& settings, float* plane) {
+    SurfaceTile tile;
+    __builtin_memset(&tile, 0, sizeof tile);
+    const float log2_cut = std::log2(settings.alpha_cut);
+    start_light(job, camera, tile.light);
+    each_depth(projected, job, log2_cut, tile.light,
+               [&](int at, Floats before, Floats after, Floats depth) {
+                   const Ints here = (before > 0.5f) & (after <= 0.5f);
+                   store(tile.median + at, here ? depth : load(tile.median + at));
+               });
+    start_light(job, camera, tile.light);
+    each_depth(projected, job, log2_cut, tile.light,
+               [&](int at, Floats before, Floats after, Floats depth) {
+                   const Floats off = depth - load(tile.median + at);
+                   const Ints near = positive(off) <= kSurfaceBand * load(tile.median + at);
+                   const Floats weight = keep(near, before - after);
+                   store(tile.off + at, load(tile.off + at) + weight * off);
+                   store(tile.weight + at, load(tile.weight + at) + weight);
+               });
+    for (int at = 0; at < kTilePixels; at += kLanes) {
+        const Floats median = load(tile.median + at), weight = load(tile.weight + at);
+        const Ints there = (median > 0.0f) & (weight > 0.0f);
+        store(tile.median + at, median + keep(there, load(tile.off + at) / weight));
+    }
+    each_four(job, camera, [&](int in_tile, int in_image, int count) {
+        copy_four(plane + in_image, tile.median + in_tile, count);
+    });
 }
 
 }  // namespace splat::SPLAT_ISA

@@ -49,6 +49,12 @@ void Rasteriser::lift(const float* planes, int num, float* features) {
     }
 }
 
+void Rasteriser::surface_depth(float* plane) {
+#pragma omp parallel for schedule(dynamic, 4) num_threads(threads_)
+    for (int tile = 0; tile < num_tiles(); ++tile)
+        kernels_.surface_tile(projected_.data(), drawn_job(tile), camera_, settings_, plane);
+}
+
 namespace {
 
 // Which labels a tile shows; ``slot_of`` is -1 everywhere between two tiles.

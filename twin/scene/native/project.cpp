@@ -24,8 +24,10 @@ void seen_colors(const Splats& in, const Camera& camera, const Local& local, int
 }
 
 // The members of Projected in their order.
-enum Member { kU, kV, kA, kB, kC, kLog2Opacity, kRgb, kZ = kRgb + 3, kHalfX, kHalfY, kMembers };
-static_assert(sizeof(Projected) == kMembers * sizeof(float), "Projected is twelve floats");
+enum Member {
+    kU, kV, kA, kB, kC, kLog2Opacity, kRgb, kZ = kRgb + 3, kZx, kZy, kHalfX, kHalfY, kMembers
+};
+static_assert(sizeof(Projected) == kMembers * sizeof(float), "Projected is floats");
 
 void project_lanes(const Splats& in, const Camera& camera, const Cut& cut, int begin, int count,
                    float* out) {
@@ -53,11 +55,12 @@ void project_lanes(const Splats& in, const Camera& camera, const Cut& cut, int b
     member[kLog2Opacity] = log2(opacity);
     seen_colors(in, camera, local, begin, count, member + kRgb);
     member[kZ] = z;
+    depth_slope(local, 1.0f / det, member + kZx);
     // exp(-r^2 / 2) = cut / opacity
     const Floats radius2 = 2.0f / kLog2E * at_least(member[kLog2Opacity] - cut.log2_alpha, 0.0f);
     const Floats half_x = root(radius2 * xx), half_y = root(radius2 * yy);
     Floats total = half_x + half_y;
-    for (int k = 0; k < kZ; ++k) total += member[k];
+    for (int k = 0; k < kHalfX; ++k) total += member[k];
     shown &= total - total == 0.0f;  // all are finite
     shown &= (member[kU] + half_x > 0.0f) & (member[kU] - half_x < camera.width * 1.0f);
     shown &= (member[kV] + half_y > 0.0f) & (member[kV] - half_y < camera.height * 1.0f);

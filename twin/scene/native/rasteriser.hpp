@@ -31,6 +31,9 @@ class Rasteriser {
     void lift(const float* planes, int num, float* features);
     void label_map(const std::uint16_t* labels, std::uint16_t* ids, float* weights);
 
+    // Depth of the opaque surface of the last ``draw`` (height x width); 0 where there is none.
+    void surface_depth(float* plane);
+
     // Whether each Gaussian could touch the last image.
     bool visible(int index) const { return projected_[index].half_x >= 0; }
     int count() const { return count_; }

@@ -10,13 +10,14 @@ constexpr int kTile = 16;          // tile edge [px]
 constexpr int kTilePixels = kTile * kTile;
 constexpr int kBlockWidth = 4;     // a tile is stored in blocks of 4 x tall pixels
 constexpr int kPlanes = 5;         // red, green, blue, depth, alpha
-constexpr int kPairGradients = 10; // see PairGradient
+constexpr int kPairGradients = 12; // see PairGradient
 constexpr int kPoseEntries = 12;   // a 3 x 4 matrix
 constexpr int kHarmonics = 3;      // real spherical harmonics of degree 1
 constexpr float kHarmonicFactor = 0.4886025119029199f;  // sqrt(3 / (4 pi))
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMipVariance = 0.1f;     // added to the image covariance [px^2]
 constexpr float kMinMipRatio = 2.5e-5f;  // floor of det/det', bounds its gradient
+constexpr float kSurfaceBand = 0.02f;    // what belongs to a surface, in its depth
 constexpr float kNearDepth = 0.02f;      // nothing closer to the camera is drawn [m]
 
 // Where a pixel of a tile is stored; ``tall`` rows make a block.
@@ -63,12 +64,15 @@ struct Projected {
     float a, b, c;       // log2(alpha) = log2_opacity - (a dx^2 + b dx dy + c dy^2)
     float log2_opacity;  // after mip compensation
     float rgb[3];
-    float depth;         // along the optical axis [m]
+    float depth;         // of the centre, along the optical axis [m]
+    float depth_x, depth_y;  // how it changes over the image [m/px]
     float half_x, half_y;  // half extent where alpha reaches the cut [px]; half_x < 0: not visible
 };
 
 // Sums over the pixels of one (Gaussian, tile) pair; e = dL/dalpha * alpha.
-enum PairGradient { kE, kEx, kEy, kExx, kExy, kEyy, kRed, kGreen, kBlue, kDepth };
+enum PairGradient {
+    kE, kEx, kEy, kExx, kExy, kEyy, kRed, kGreen, kBlue, kDepth, kDepthX, kDepthY
+};
 
 struct TileJob {
     int x0, y0;                // first pixel of the tile

@@ -8,6 +8,7 @@ namespace {
 // Inverse K of the image covariance with the low-pass, and of its determinant without.
 struct Inverse {
     Floats xx, xy, yy;
+    Floats low_pass;  // 1 / det with the low-pass
     Floats raw;  // 1 / det; 0 where the mip compensation is held at its floor
 };
 
@@ -16,7 +17,7 @@ Inverse inverse_of(const Local& local) {
     const Floats det = low_pass_determinant(local, det_raw);
     const Floats inverse = 1.0f / det;
     return {(local.yy + kMipVariance) * inverse, -local.xy * inverse,
-            (local.xx + kMipVariance) * inverse,
+            (local.xx + kMipVariance) * inverse, inverse,
             keep(det_raw > kMinMipRatio * det, 1.0f / det_raw)};
 }
 
@@ -36,6 +37,21 @@ CovarianceGradient covariance_gradient(const Local& local, const Inverse& K, con
             hyx * K.xy + hyy * K.yy + half_e * (local.xx * K.raw - K.yy)};
 }
 
+// On the covariance of depth and pixel by way of the slope K (xz, yz), and on K by way of the same.
+struct SlopeGradient {
+    Floats x, y;  // dL/d(xz, yz)
+};
+
+SlopeGradient slope_gradient(const Inverse& K, const Floats* slope, const Floats* sums,
+                             CovarianceGradient* on_covariance) {
+    const Floats x = K.xx * sums[kDepthX] + K.xy * sums[kDepthY];
+    const Floats y = K.xy * sums[kDepthX] + K.yy * sums[kDepthY];
+    on_covariance->xx -= x * slope[0];
+    on_covariance->xy -= 0.5f * (x * slope[1] + y * slope[0]);
+    on_covariance->yy -= y * slope[1];
+    return {x, y};
+}
+
 // Gradient of the normalised quaternion's rotation matrix, projected back on the raw quaternion.
 void quaternion_gradient(const Local& local, const Floats* dR, Floats* out) {
     const Floats w = local.q[0], x = local.q[1], y = local.q[2], z = local.q[3];
@@ -53,11 +69,14 @@ void quaternion_gradient(const Local& local, const Floats* dR, Floats* out) {
 
 // Gradient on the centre in the camera frame.
 void point_gradient(const Local& local, const Camera& camera, const Inverse& K,
-                    const Floats* sums, const Floats* dT, Floats* dp) {
+                    const Floats* slope, const Floats* sums, const Floats* dT, Floats* dp) {
     const Floats inverse_z = local.inverse_z;
     const Floats jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
-    const Floats on_x = (K.xx * sums[kEx] + K.xy * sums[kEy]) * jx;
-    const Floats on_y = (K.xy * sums[kEx] + K.yy * sums[kEy]) * jy;
+    // A centre that moves over the image takes its sloping surface with it.
+    const Floats on_x =
+        (K.xx * sums[kEx] + K.xy * sums[kEy] - slope[0] * sums[kDepth]) * jx;
+    const Floats on_y =
+        (K.xy * sums[kEx] + K.yy * sums[kEy] - slope[1] * sums[kDepth]) * jy;
     // T = J W: row 0 is jx (W0 - tx W2), row 1 is jy (W1 - ty W2).
     Floats d_jx{}, d_jy{}, d_tx{}, d_ty{};
     for (int k = 0; k < 3; ++k) {
@@ -94,13 +113,13 @@ void harmonic_gradient(const Splats& in, const Camera& camera, const Local& loca
 
 // The camera acts on the centre, on the Jacobian's T = J W and, as -R^T t, on the viewing ray.
 void add_pose_gradient(const Local& local, const Camera& camera, Ints shown, const Floats* dp,
-                       const Floats* dT, const Floats* d_ray, Floats* pose) {
+                       const Floats* dT, const Floats* d_axis, const Floats* d_ray, Floats* pose) {
     const Floats jx = camera.fx * local.inverse_z, jy = camera.fy * local.inverse_z;
     for (int k = 0; k < 3; ++k) {
         const Floats d0 = jx * dT[k], d1 = jy * dT[3 + k], m = local.mean[k];
         pose[k] += keep(shown, dp[0] * m + d0 + camera.t[0] * d_ray[k]);
         pose[4 + k] += keep(shown, dp[1] * m + d1 + camera.t[1] * d_ray[k]);
-        pose[8 + k] += keep(shown, dp[2] * m - local.tx * d0 - local.ty * d1 +
+        pose[8 + k] += keep(shown, dp[2] * m - local.tx * d0 - local.ty * d1 + d_axis[k] +
                                        camera.t[2] * d_ray[k]);
     }
     for (int i = 0; i < 3; ++i)
@@ -115,19 +134,22 @@ void write(Floats* values, Ints shown, float* table, int begin, int count) {
     scatter<kColumns>(values, table, begin, count);
 }
 
-// dA to scales, rotation and T.
-void shape_gradient(const Local& local, const Floats* dA, Floats* d_scales, Floats* dR,
-                    Floats* dT) {
+// dA and dB to scales, rotation, T and the optical axis (last row of W).
+void shape_gradient(const Local& local, const Camera& camera, const Floats* dA, const Floats* dB,
+                    Floats* d_scales, Floats* dR, Floats* dT, Floats* d_axis) {
     for (int k = 0; k < 6; ++k) dT[k] = Floats{};
+    for (int k = 0; k < 3; ++k) d_axis[k] = Floats{};
     for (int k = 0; k < 3; ++k) {
         Floats ds{};
         for (int i = 0; i < 3; ++i) {
-            const Floats dM = local.T[i] * dA[k] + local.T[3 + i] * dA[3 + k];
+            const Floats dM =
+                local.T[i] * dA[k] + local.T[3 + i] * dA[3 + k] + camera.R[6 + i] * dB[k];
             const Floats scaled = local.R[3 * i + k] * local.s[k];
             ds += dM * local.R[3 * i + k];
             dR[3 * i + k] = dM * local.s[k];
             dT[i] += dA[k] * scaled;
             dT[3 + i] += dA[3 + k] * scaled;
+            d_axis[i] += dB[k] * scaled;
         }
         d_scales[k] = ds * local.s[k];
     }
@@ -137,19 +159,23 @@ void unproject_lanes(const Splats& in, const Camera& camera, const float* pair_s
                      const SplatGradients& out, Floats* pose, int begin, int count) {
     Local local;
     fill_local(in, camera, begin, count, &local);
-    Floats sums[kPairGradients], dA[6], dT[6], dR[9], d_scales[3], d_quats[4], logit;
+    Floats sums[kPairGradients], slope[2], dA[6], dB[3], dT[6], dR[9], d_axis[3];
+    Floats d_scales[3], d_quats[4], logit;
     gather<kPairGradients>(pair_sums, 0, count, sums);
     gather<1>(in.opacities, begin, count, &logit);
     const Inverse K = inverse_of(local);
-    const CovarianceGradient g = covariance_gradient(local, K, sums);
+    depth_slope(local, K.low_pass, slope);
+    CovarianceGradient g = covariance_gradient(local, K, sums);
+    const SlopeGradient on = slope_gradient(K, slope, sums, &g);
     for (int k = 0; k < 3; ++k) {
-        dA[k] = 2.0f * (g.xx * local.A[k] + g.xy * local.A[3 + k]);
-        dA[3 + k] = 2.0f * (g.xy * local.A[k] + g.yy * local.A[3 + k]);
+        dA[k] = 2.0f * (g.xx * local.A[k] + g.xy * local.A[3 + k]) + on.x * local.B[k];
+        dA[3 + k] = 2.0f * (g.xy * local.A[k] + g.yy * local.A[3 + k]) + on.y * local.B[k];
+        dB[k] = on.x * local.A[k] + on.y * local.A[3 + k];
     }
-    shape_gradient(local, dA, d_scales, dR, dT);
+    shape_gradient(local, camera, dA, dB, d_scales, dR, dT, d_axis);
     quaternion_gradient(local, dR, d_quats);
     Floats dp[3], d_ray[3] = {Floats{}, Floats{}, Floats{}}, d_mean[3];
-    point_gradient(local, camera, K, sums, dT, dp);
+    point_gradient(local, camera, K, slope, sums, dT, dp);
     if (in.harmonics != nullptr) {
         Floats d_harmonics[3 * kHarmonics];
         harmonic_gradient(in, camera, local, sums + kRed, begin, count, d_harmonics, d_ray);
@@ -158,7 +184,7 @@ void unproject_lanes(const Splats& in, const Camera& camera, const float* pair_s
     for (int k = 0; k < 3; ++k)
         d_mean[k] = camera.R[k] * dp[0] + camera.R[3 + k] * dp[1] + camera.R[6 + k] * dp[2] +
                     d_ray[k];
-    add_pose_gradient(local, camera, shown, dp, dT, d_ray, pose);
+    add_pose_gradient(local, camera, shown, dp, dT, d_axis, d_ray, pose);
     Floats d_logit = sums[kE] / (1.0f + exp(logit));
     write<3>(d_mean, shown, out.means, begin, count);
     write<4>(d_quats, shown, out.quats, begin, count);

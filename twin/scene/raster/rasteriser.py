@@ -21,7 +21,8 @@ from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 
 NUM_PLANES = 5
-"""Red, green, blue, sum of weighted depth, sum of weights."""
+"""Red, green, blue, sum of weighted depth, sum of weights. Depth is that of each Gaussian's own
+surface: where the ray of the pixel is densest in it, not where its centre lies."""
 
 
 class SplatExtensionMissingError(TwinError):
@@ -269,7 +270,8 @@ class View:
     image: Float32[np.ndarray, "height width 3"]
     """Colour over black, not clipped."""
     depth_m: Float32[np.ndarray, "height width"]
-    """Weighted mean depth along the optical axis; 0 where alpha is below one half."""
+    """Of the surface that takes half of the light, along the optical axis; 0 where alpha is below
+    one half. What lies within 2 % of it is averaged; what is before and behind has no say."""
     alpha: Float32[np.ndarray, "height width"]
 
     def image_u8(self) -> np.ndarray:
@@ -375,6 +377,11 @@ class Rasteriser:
         ids, weight = self._native.label_map(np.ascontiguousarray(labels))
         return ids, weight
 
+    def surface_depth(self) -> Float32[np.ndarray, "height width"]:
+        """Depth of what is opaque in the last ``draw_planes`` [m], as in ``View``."""
+        depth_m: np.ndarray = self._native.surface_depth()
+        return depth_m
+
     def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
         """Say which Gaussians could touch the last image."""
         mask: np.ndarray = self._native.visible()
@@ -390,19 +397,9 @@ class Rasteriser:
             camera: Size of the image and intrinsics.
             T_base_camera: Where the camera is.
         """
-        return view_of_planes(self.draw_planes(cloud, camera, T_base_camera))
-
-
-def view_of_planes(planes: Float32[np.ndarray, "5 height width"]) -> View:
-    """Turn weighted sums into what a camera sees."""
-    alpha = planes[4]
-    solid = alpha >= 0.5
-    depth = np.where(solid, planes[3] / np.where(solid, alpha, 1.0), 0.0)
-    return View(
-        image=np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1)),
-        depth_m=depth.astype(np.float32),
-        alpha=alpha,
-    )
+        planes = self.draw_planes(cloud, camera, T_base_camera)
+        image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
+        return View(image=image, depth_m=self.surface_depth(), alpha=planes[4])
 
 
 def psnr_db(mse: float) -> float:

@@ -55,7 +55,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 22
+METHOD_VERSION = 23
 """Counts changes of method that make older scenes out of date."""
 
 
@@ -182,7 +182,7 @@ def _fit(
     training: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output
 ) -> FitResult:
     began_s = time.monotonic()
-    first = fuse(training.points, config.initialise)
+    first = fuse(training.points, config.initialise, training.views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
     with output.progress("fit", 100) as advance:
         return fit(

@@ -42,6 +42,8 @@ MIN_POINTS = 60
 """A link seen by fewer points is not kept."""
 ROBOT_SHARE = 0.25
 """Of the budget of Gaussians, for the robot's links."""
+UNUSED = 0.25
+"""Share of a link's Gaussians that fusing leaves unused; nothing splits them later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +199,8 @@ class RobotFrames:
                 continue
             budget = max(int(ROBOT_SHARE * config.max_splats * count / total), 1)
             try:
-                clouds[link] = fuse(sets, replace(config, max_splats=budget))
+                own_budget = replace(config, max_splats=budget, growth=UNUSED)
+                clouds[link] = fuse(sets, own_budget)
             except NoSurfaceError:
                 continue
         return LitLinks(clouds=clouds, lighting=lighting)

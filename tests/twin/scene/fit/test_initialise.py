@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 import textured_room
 
+from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from twin.scene.fit.initialise import NoSurfaceError, fuse
-from twin.scene.frames.rgbd import DepthLimits, FrameSurface, trusted_depth_mask
+from twin.scene.frames.rgbd import (
+    DepthLimits,
+    FrameSurface,
+    training_view,
+    trusted_depth_mask,
+)
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
@@ -91,6 +97,50 @@ def test_the_first_gaussians_already_show_the_room() -> None:
     assert error.mean() < 0.06
     expected, _ = textured_room.depth_and_points(item.color_camera, item.T_base_color)
     assert np.median(np.abs(view.depth_m - expected)[middle]) < 0.01
+
+
+def registered_frame(index: int, depth_factor: float) -> RgbdFrame:
+    """A frame of one camera, whose depth reads too far by a factor."""
+    item = textured_room.frame(index, 6)
+    depth_m, _ = textured_room.depth_and_points(item.color_camera, item.T_base_color)
+    return replace(
+        item,
+        depth_m=(depth_factor * depth_m).astype(np.float32),
+        depth_camera=item.color_camera,
+        T_base_depth=item.T_base_color,
+    )
+
+
+def test_views_that_disagree_make_one_surface_and_not_layers() -> None:
+    """The nearest of several layers would hide the others, and depth come out too near."""
+    factors = 1.0 + np.array([-0.012, 0.008, -0.004, 0.004, -0.008, 0.012])
+    surfaces = [FrameSurface(registered_frame(i, f), LIMITS) for i, f in enumerate(factors)]
+    points = [surface.points() for surface in surfaces]
+    views = [training_view(surface) for surface in surfaces]
+    layers, surface = fuse(points, InitialiseConfig()), fuse(points, InitialiseConfig(), views)
+    assert len(surface) < 0.9 * len(layers)
+    height_m = {}
+    for name, cloud in (("layers", layers), ("surface", surface)):
+        z = cloud.means_m[cloud.means_m[:, 1] < 0.3, 2]
+        height_m[name] = np.quantile(z, 0.9) - np.quantile(z, 0.1)
+        view = Rasteriser(RasterConfig(threads=1)).view(
+            cloud, textured_room.COLOR, textured_room.camera_pose(2, 6)
+        )
+        expected, _ = textured_room.depth_and_points(
+            textured_room.COLOR, textured_room.camera_pose(2, 6)
+        )
+        middle = (slice(16, -8), slice(12, -12))
+        height_m[f"{name}, off"] = np.median(np.abs(view.depth_m - expected)[middle])
+    assert height_m["surface"] < 0.6 * height_m["layers"]
+    assert height_m["surface, off"] < 0.75 * height_m["layers, off"]
+
+
+def test_views_that_agree_move_nothing() -> None:
+    surfaces = [FrameSurface(registered_frame(i, 1.0), LIMITS) for i in range(6)]
+    points = [surface.points() for surface in surfaces]
+    cloud = fuse(points, InitialiseConfig(), [training_view(surface) for surface in surfaces])
+    table, wall = np.abs(cloud.means_m[:, 2]), np.abs(cloud.means_m[:, 1] - 0.6)
+    assert np.quantile(np.minimum(table, wall), 0.95) < 1e-3
 
 
 def test_frames_without_depth_are_refused() -> None:

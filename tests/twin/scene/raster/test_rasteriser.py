@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, concatenate
 from twin.scene.raster import rasteriser as raster
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, SplatExtensionMissingError
 
@@ -51,6 +51,42 @@ def test_a_single_gaussian_lands_on_its_pixel() -> None:
     # The centre of pixel (12, 7) is (12.5, 7.5): its neighbours see the Gaussian alike.
     assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 13], rel=1e-5)
     assert planes[4, 6, 12] == pytest.approx(planes[4, 8, 12], rel=1e-5)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 40.0, -65.0])
+def test_depth_follows_the_plane_of_a_flat_gaussian(tilt_deg: float) -> None:
+    """Not the depth of its centre: rays meet a tilted disc at other distances."""
+    half = np.radians(tilt_deg) / 2
+    disc = one_gaussian(x_px=20.0, y_px=16.5, depth_m=2.0, opacity_logit=8.0)
+    disc.quats_wxyz[:] = [np.cos(half), 0.0, np.sin(half), 0.0]
+    disc.scales_log[:] = np.log([0.2, 0.2, 1e-4])
+    depth_m = Rasteriser(RasterConfig(threads=1)).view(disc, CAMERA, IDENTITY).depth_m
+    normal = np.array([np.sin(2 * half), 0.0, np.cos(2 * half)])
+    expected = normal[2] * 2.0 / (CAMERA.rays() @ normal)
+    row = slice(15, 18)
+    shown = depth_m[row] > 0
+    assert shown.sum() >= 9
+    # What is left is of second order in the distance from the centre.
+    spread = np.ptp(expected[row][shown])
+    assert np.abs(depth_m - expected)[row][shown].max() < 0.5 * spread**2 + 1e-3
+    assert tilt_deg == 0.0 or spread > 0.05
+
+
+def test_what_shines_through_does_not_move_the_surface() -> None:
+    """The weighted mean of depth lies between a wall and what is behind its gaps; a surface no."""
+    wall = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.5, opacity_logit=1.5)
+    behind = one_gaussian(x_px=20.5, y_px=16.5, depth_m=3.0, sigma_m=3.0, opacity_logit=4.0)
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    cloud = concatenate([behind, wall])
+    planes = rasteriser.draw_planes(cloud, CAMERA, IDENTITY)
+    mean_m = (planes[3] / planes[4])[16, 20]
+    assert mean_m > 1.2
+    assert rasteriser.surface_depth()[16, 20] == pytest.approx(1.0, abs=1e-4)
+    thin = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.5, opacity_logit=-1.0)
+    assert rasteriser.view(concatenate([thin, behind]), CAMERA, IDENTITY).depth_m[
+        16, 20
+    ] == pytest.approx(3.0, abs=1e-3)
+    assert rasteriser.view(thin, CAMERA, IDENTITY).depth_m.max() == 0.0
 
 
 def test_a_gaussian_between_two_pixels_shows_in_both_alike() -> None:
