@@ -111,7 +111,7 @@ class InitialiseConfig:
 
     max_splats: int = 60_000
     """Budget of the whole fit."""
-    growth: float = 0.4
+    growth: float = 0.5
     """Share of the budget left to the fit, which splits Gaussians where the error is large;
     voxels grow until the first Gaussians fit in the others."""
     footprint_factor: float = 1.6

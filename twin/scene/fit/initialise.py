@@ -107,10 +107,10 @@ class _Voxels:
         means, normals = as_float32(self.means), as_float32(unit)
         for _ in range(SETTLE_ROUNDS):
             seen = list(_measured_offsets(means, normals, views))
-            apart = np.concatenate([np.abs(item.offset_m) / item.depth_m for item in seen])
-            if len(apart) == 0:
+            scatter = np.concatenate([np.abs(item.offset_m) / item.depth_m for item in seen])
+            if len(scatter) == 0:
                 break
-            limit = SETTLE_SIGMA * 1.4826 * np.median(apart)
+            limit = SETTLE_SIGMA * 1.4826 * np.median(scatter)
             total, weights = (np.zeros(len(means), np.float32) for _ in range(2))
             for item in seen:
                 weight = item.cosine / np.square(item.depth_m)

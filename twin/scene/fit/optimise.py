@@ -347,7 +347,7 @@ def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
 
 RATES = {
     "means_m": 0.18,  # in units of the median Gaussian's size
-    "quats_wxyz": 1.2e-2,
+    "quats_wxyz": 4e-3,
     "scales_log": 4.5e-2,
     "opacities_logit": 0.12,
     "colors": 2.4e-2,

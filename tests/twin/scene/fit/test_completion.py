@@ -75,7 +75,7 @@ def test_what_was_measured_stays_visible(
         known = (full.depth_m > 0) & (drawn.depth_m > 0)
         before = drawn.depth_m[known] < full.depth_m[known] - 0.06 - 0.03 * full.depth_m[known]
         shares.append(before.mean())
-    # At the rim of the hole pixels show half of each; the depth of what is opaque is the nearer one.
+    # At the rim of the hole pixels show half of each; what is opaque is the nearer.
     assert np.mean(shares) < 0.01
     assert max(shares) < 0.02
 
