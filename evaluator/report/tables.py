@@ -265,7 +265,7 @@ def caption_of(table: Table) -> str:
             values = {row[table.columns.index(name)] for row in table.rows} - NO_NAMES
             count = f"{len(values)} {many}"
             if len(values) > 1 and not any(
-                said in table.title for said in (count, f"{name} by {name}")
+                words in table.title for words in (count, f"{name} by {name}")
             ):
                 counts.append(count)
     over = f" over {' and '.join(counts)}" if counts else ""
