@@ -308,7 +308,6 @@ def _columns(parts: _Parts) -> Iterator[_Column]:
             yield part
 
 
-@cache
 def _parts(kind: type[Any], before: str = "") -> _Parts:
     hints = get_type_hints(kind)
     return tuple(_part(f"{before}{item.name}", hints[item.name]) for item in fields(kind))

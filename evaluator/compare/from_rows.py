@@ -209,7 +209,7 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
     if not {WITH, WITHOUT} <= conditions:
         there = ", ".join(sorted(name or "unnamed" for name in conditions))
         found.append(f"replanning gain: it needs both conditions, there is only {there}")
-    sides = (
+    sides: tuple[tuple[str, str], ...] = (
         ("sim_planned", "a decided dynamic replay of the plan sent"),
         ("verdict", "a verdict before motion"),
         ("sim_executed", "a dynamic replay of the executed joints"),

@@ -264,9 +264,7 @@ def caption_of(table: Table) -> str:
         if name in table.columns:
             values = {row[table.columns.index(name)] for row in table.rows} - NO_NAMES
             count = f"{len(values)} {many}"
-            if len(values) > 1 and not any(
-                said in table.title for said in (count, f"{name} by {name}")
-            ):
+            if len(values) > 1 and count not in table.title:
                 counts.append(count)
     over = f" over {' and '.join(counts)}" if counts else ""
     methods = [

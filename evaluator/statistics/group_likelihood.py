@@ -24,7 +24,7 @@ BEND = 2.0
 with equal steps of t."""
 MOST = 200
 """A larger side is taken as one of so many trials: its rate is as good as known then."""
-TASK_NODES = 3
+TASK_NODES = 4
 """Nodes for each side of a task's mean."""
 BATCH = 200_000
 """Numbers on the grid that are held at once: what a processor's cache holds."""

@@ -406,19 +406,30 @@ def population(
     nodes: Nodes,
 ) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, " nodes"]]:
     """Return correlation and mean difference of true rates over all groups, for each node."""
+    size = max(1, BATCH // POPULATION_NODES**2)
     first, second, shared = nodes.total
+    found = [
+        _population(nodes.mean[part], first[part], second[part], shared[part])
+        for part in (slice(at, at + size) for at in range(0, len(first), size))
+    ]
+    r, gap = (np.concatenate(each) for each in zip(*found, strict=True))
+    return r, gap
+
+
+def _population(
+    mean: Float64[np.ndarray, "nodes 2"],
+    first: Float64[np.ndarray, " nodes"],
+    second: Float64[np.ndarray, " nodes"],
+    shared: Float64[np.ndarray, " nodes"],
+) -> tuple[Float64[np.ndarray, " nodes"], Float64[np.ndarray, " nodes"]]:
     z = np.linspace(-4.0, 4.0, POPULATION_NODES)
     w = np.exp(-0.5 * z**2)
     w /= w.sum()
-    recorded = expit(nodes.mean[:, [0]] + np.sqrt(first)[:, None] * z)
+    recorded = expit(mean[:, [0]] + np.sqrt(first)[:, None] * z)
     slope = shared / np.sqrt(first)
     rest = np.sqrt(np.maximum(second - slope**2, 0.0))
-    logits = (
-        nodes.mean[:, 1, None, None]
-        + slope[:, None, None] * z[:, None]
-        + rest[:, None, None] * z[None, :]
-    )
-    sim = expit(logits)
+    middle = mean[:, [1]] + slope[:, None] * z
+    sim = expit(middle[:, :, None] + (rest[:, None] * z)[:, None, :])
     given = sim @ w
     mean_r, mean_s = recorded @ w, given @ w
     var_r = (recorded**2) @ w - mean_r**2
