@@ -364,7 +364,8 @@ def _laboratory(
             log = logs / f"{name}_{index}.log"
             return stack.enter_context(running(arguments, log)), log
 
-        recorder, _ = start("record", ["record", str(run.path), "--listen", endpoint])
+        own = ["--listen", endpoint, "--shares-folder"]  # each job numbers its own episodes
+        recorder, _ = start("record", ["record", str(run.path), *own])
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
         there = [recorder]
         gate, gate_log = start("gate", ["gate", str(run.path), *connect])

@@ -87,6 +87,9 @@ class RecorderConfig:
     """Name of this recorder in its control keys ``rec/NAME/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
+    shares_folder: bool = False
+    """Let other recorders that have this option, too, record into the run folder at the same time;
+    whoever starts episodes gives each an id of its own."""
     contract: str | None = None
     """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
     ``cell.toml`` holds, if there is one."""

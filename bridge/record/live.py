@@ -244,7 +244,7 @@ class LiveRecorder:
         if rules and not config.preroll_s:
             raise TriggerError("triggers need the seconds before: add --preroll-s 5.")
         self.run = run
-        self._folder_lock = _lock_folder(run)
+        self._folder_lock = _lock_folder(run, shared=config.shares_folder)
         self._recorder = config.recorder
         self.session = session
         reports = recover_parts(run)
@@ -446,15 +446,19 @@ def open_recorder(
             raise recorder.core.error
 
 
-def _lock_folder(run: RunFolder) -> int | None:
+def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
     """Keep other recorders out of a run folder, until the process ends.
+
+    Args:
+        run: Where the recorder writes.
+        shared: Only those out that do not share it.
 
     Raises:
         FolderTakenError: When another one is at work there.
     """
     descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(descriptor)
         raise FolderTakenError(run=run.path) from error

@@ -143,3 +143,16 @@ def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(tmp_path: Path
         path.name for path in [*part, *cut]
     }
     assert trials._clear(run, left, QUIET) == left
+
+
+@pytest.mark.slow
+def test_two_laboratories_record_into_one_run_at_once(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    built_in = [replace(job, policy="perturbed") for job in jobs()]
+    with (
+        trials._laboratory(run, STUDY, built_in, 0) as (one, first),
+        trials._laboratory(run, STUDY, built_in, 1) as (other, second),
+    ):
+        assert one != other
+        for process in (*first, *second):
+            process.check()

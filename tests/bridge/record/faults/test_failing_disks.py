@@ -197,3 +197,18 @@ def test_a_second_recorder_on_one_folder_is_refused(cell: FaultCell) -> None:
     assert f"another recorder records into {cell.run} already" in second.said()
     first.finish()
     cell.record().finish()  # the folder is free again
+
+
+def test_recorders_that_share_a_folder_keep_others_out_of_it(cell: FaultCell) -> None:
+    first = cell.record("--shares-folder")
+    elsewhere = free_endpoint()
+    second = cell.record("--shares-folder", endpoint=elsewhere)
+    third = cell.start_recording(endpoint=free_endpoint())
+    assert third.process.wait(timeout=WAIT_S) == 2
+    assert "already" in third.said()
+    assert second.process.poll() is None
+    first.finish()
+    fourth = cell.start_recording(endpoint=free_endpoint())
+    assert fourth.process.wait(timeout=WAIT_S) == 2, "one of two is still at work"
+    second.finish()
+    cell.record().finish()
