@@ -34,7 +34,9 @@ EXTRAS = {
         "evaluate: tables, figures, report",
         ("jinja2", "pandas", "pyarrow", "scipy", "matplotlib", "pillow"),
     ),
-    "dashboard": Extra("review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk")),
+    "dashboard": Extra(
+        "review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk", "simplejpeg")
+    ),
     "standin": Extra(
         "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
     ),

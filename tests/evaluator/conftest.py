@@ -22,6 +22,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
 from evaluator.compare import Comparison, compare_run
+from evaluator.statistics.hierarchical import AgreementModel
 
 START_NS = 10_000_000_000
 STEP_NS = 100_000_000
@@ -330,3 +331,9 @@ def evaluation_run(evaluation_run_once: RunFolder, tmp_path: Path) -> RunFolder:
 def load_golden_script() -> Callable[[str], ModuleType]:
     """For tests in the folders below, which cannot import this file."""
     return golden_script
+
+
+@pytest.fixture
+def few_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Integrate the model of agreement coarsely: for tests of what is said, not of how exactly."""
+    monkeypatch.setattr(AgreementModel, "_enough", lambda _: 512)

@@ -34,7 +34,9 @@ GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
 def room() -> tuple[GaussianCloud, list[ImageObservation]]:
     """Sixty Gaussians and three half-size images, each with a hole and a brightness of its own."""
     surfaces = [FrameSurface(textured_room.frame(i, 3), LIMITS) for i in range(3)]
-    cloud = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=80))
+    cloud = fuse(
+        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=80, growth=0.25)
+    )
     observations = []
     for index, surface in enumerate(surfaces):
         view = training_view(surface)

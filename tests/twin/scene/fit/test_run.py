@@ -26,7 +26,9 @@ ADAM_ALONE = FitConfig(
 @pytest.fixture(scope="module")
 def room() -> tuple[GaussianCloud, list[TrainingView]]:
     surfaces = [FrameSurface(textured_room.frame(i, 4), LIMITS) for i in range(4)]
-    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    start = fuse(
+        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000, growth=0.25)
+    )
     return start, [training_view(surface) for surface in surfaces]
 
 
@@ -100,7 +102,9 @@ def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
 @pytest.mark.slow
 def test_refining_poses_brings_shaken_cameras_back() -> None:
     surfaces = [FrameSurface(textured_room.frame(i, 8), LIMITS) for i in range(8)]
-    start = fuse([surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000))
+    start = fuse(
+        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000, growth=0.25)
+    )
     views = [training_view(surface) for surface in surfaces]
     rng = np.random.default_rng(1)
     shaken = list(views)

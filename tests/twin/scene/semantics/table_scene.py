@@ -307,7 +307,7 @@ def make_world(
     train, held_out = shots[:num_train], shots[num_train:]
     limits = DepthLimits(max_depth_m=2.0, flying_fraction=0.03)
     clouds = [FrameSurface(shot.frame, limits).points() for shot in train]
-    cloud = fuse(clouds, InitialiseConfig(max_splats=60_000))
+    cloud = fuse(clouds, InitialiseConfig(max_splats=60_000, growth=0.25))
     return World(pieces, names or TABLETOP_NAMES, train, held_out, cloud)
 
 
