@@ -122,11 +122,11 @@ def _bias_words(row: Row) -> str:
         word = "above" if bias > 0 else "below"
         points = f"{_points(bias)} {word} the recorded rate" if round(bias) else "no gap"
         return f"the twin shows {points}, without an interval"
-    ends = f"[{low:+.0f}, {high:+.0f}]"
+    ends = f"[{round(low):+d}, {round(high):+d}]"
     found = direction(low, high)
     if found:
         return f"the twin is {found} by {_points(bias)} {_sized(low, high)}"
-    return f"no bias is shown: {bias:+.0f} points {ends}"
+    return f"no bias is shown: {round(bias):+d} points {ends}"
 
 
 def _points(value: float) -> str:
