@@ -41,8 +41,9 @@ def for_other_viewers(
     less = np.minimum(less, variance)
     directions = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-9)
     directions = directions @ T_base_camera[:3, :3].T
-    before = _on_image(cloud, variance, directions)
-    after = _on_image(cloud, less, directions) + THEIR_VARIANCE_PX2 * np.eye(2)
+    across = _across(cloud, directions)
+    before = _on_image(across, variance)
+    after = _on_image(across, less) + THEIR_VARIANCE_PX2 * np.eye(2)
     share = np.sqrt(np.maximum(np.linalg.det(before), 0.0) / np.linalg.det(after))
     opacity = np.clip(cloud.opacities() * np.minimum(share, 1.0), *OPACITY_ENDS)
     return GaussianCloud(
@@ -56,16 +57,20 @@ def for_other_viewers(
     )
 
 
-def _on_image(
-    cloud: GaussianCloud,
-    variance_px2: Float[np.ndarray, "num_splats 3"],
-    directions: Float[np.ndarray, "num_splats 3"],
-) -> Float[np.ndarray, "num_splats 2 2"]:
-    """Covariances across the line of sight [px^2]."""
+def _across(
+    cloud: GaussianCloud, directions: Float[np.ndarray, "num_splats 3"]
+) -> Float[np.ndarray, "num_splats 2 3"]:
+    """Two directions across each line of sight, in the axes of the Gaussian."""
     q = cloud.quats_wxyz.astype(np.float64)
     R = se3.rotation_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
     other = np.where(np.abs(directions[:, :1]) < 0.5, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(directions, other)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    across = np.stack([first, np.cross(directions, first)], axis=1) @ R
+    return np.asarray(np.stack([first, np.cross(directions, first)], axis=1) @ R)
+
+
+def _on_image(
+    across: Float[np.ndarray, "num_splats 2 3"], variance_px2: Float[np.ndarray, "num_splats 3"]
+) -> Float[np.ndarray, "num_splats 2 2"]:
+    """Covariances across the line of sight [px^2]."""
     return np.asarray((across * variance_px2[:, None, :]) @ np.swapaxes(across, 1, 2))

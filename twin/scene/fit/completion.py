@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from bridge.geometry import se3
 from twin.scene.fit.initialise import flat_gaussians
+from twin.scene.frames.plane_sweep import without_specks
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -95,9 +96,6 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
     target = view.half
     drawn = rasteriser.view(cloud, target.camera, view.T_base_color)
     empty = target.static_mask & (drawn.alpha < HOLE_ALPHA)
-    labels, count = ndimage.label(empty)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    sizes[0] = 0
     is_known = drawn.depth_m > 0
     beside = np.zeros_like(drawn.depth_m)
     if is_known.any():
@@ -105,7 +103,7 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
             ~is_known, return_distances=False, return_indices=True
         )
         beside = drawn.depth_m[rows, columns]
-    mask = (sizes >= LEAST_PX)[labels] & (beside > 0)
+    mask = without_specks(empty, LEAST_PX) & (beside > 0)
     return _Hole(view=view, mask=mask, beside_m=beside)
 
 

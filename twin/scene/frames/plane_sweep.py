@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy import ndimage
 
 from bridge.geometry import se3
@@ -257,7 +257,14 @@ def _confirmed(
         there[inside] = depths[k][v[inside], u[inside]]
         count += (there > 0) & (np.abs(there - z) < np.maximum(AGREE_FRACTION, step * z) * z)
     kept = (depth > 0) & (count >= min(CONFIRMED_BY, max(len(references), 1)))
-    labels, number = ndimage.label(kept)
+    return np.where(without_specks(kept, SPECKLE_PX), depth, np.float32(0.0))
+
+
+def without_specks(
+    mask: Bool[np.ndarray, "height width"], least_px: int
+) -> Bool[np.ndarray, "height width"]:
+    """The patches of a mask that have at least so many pixels."""
+    labels, number = ndimage.label(mask)
     sizes = np.bincount(labels.ravel(), minlength=number + 1)
     sizes[0] = 0
-    return np.where((sizes >= SPECKLE_PX)[labels], depth, np.float32(0.0))
+    return np.asarray((sizes >= least_px)[labels])

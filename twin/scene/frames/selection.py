@@ -295,8 +295,17 @@ def find_sources(run: RunFolder) -> Sources:
 
 def rgbd_camera_ids(episode: Episode) -> list[str]:
     """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
+    return cameras_with(episode, (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO))
+
+
+def cameras_with(episode: Episode, others: Sequence[str]) -> list[str]:
+    """Cameras that have colour and some other topics; never those of stand-in truth.
+
+    Args:
+        episode: Whose topics are looked at.
+        others: Ends of the topics a camera has beside its colour images.
+    """
     topics = {topic for topic in episode.topics() if not is_truth(topic)}
-    others = (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
     stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
     return sorted(
         stem.split("/")[-1] for stem in stems if all(stem + ending in topics for ending in others)

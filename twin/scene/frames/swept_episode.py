@@ -5,7 +5,7 @@ depth by plane sweep at a smaller size; everything after reads it as any RGB-D s
 held out have no depth in it and give none to others.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from bridge.episode import provenance, schema, streams
 from bridge.episode.cdr.codec import decode
 from bridge.episode.cdr.messages import (
+    CameraInfo,
     DepthImage,
     FrameTransform,
     color_from_message,
@@ -30,7 +31,6 @@ from bridge.episode.topics import (
     DEPTH_INFO,
     TF,
     camera_topic,
-    is_truth,
 )
 from bridge.episode.transforms import TransformTree
 from bridge.episode.writer import EpisodeWriter
@@ -39,7 +39,7 @@ from bridge.geometry.cameras_view import distance_to_what_is_seen
 from bridge.terminal import Output
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.frames.plane_sweep import PosedView, posed_view, sweep
-from twin.scene.frames.selection import NoFramesError, Sources, find_sources, spread
+from twin.scene.frames.selection import NoFramesError, Sources, cameras_with, find_sources, spread
 from twin.scene.settings import FrameConfig
 
 ENGINE = "plane sweep"
@@ -84,7 +84,8 @@ class _PosedScan:
 
     episode: Episode
     tree: TransformTree
-    camera_ids: tuple[str, ...]
+    infos: Mapping[str, CameraInfo]
+    """Of its cameras."""
 
     @property
     def source(self) -> dict[str, Any]:
@@ -104,22 +105,16 @@ def _posed_scans(run: RunFolder) -> list[_PosedScan]:
             if episode.info.kind != "scan":
                 continue
             tree = base_tree(episode)
-            known = tuple(
-                camera_id
-                for camera_id in _color_cameras(episode)
-                if streams.camera_info(episode, camera_id).frame_id in tree.frames()
-            )
+            infos = {
+                camera_id: streams.camera_info(episode, camera_id)
+                for camera_id in cameras_with(episode, (COLOR_INFO,))
+            }
         except BridgeError:
             continue
-        if known:
-            found.append(_PosedScan(episode=episode, tree=tree, camera_ids=known))
+        posed = {name: info for name, info in infos.items() if info.frame_id in tree.frames()}
+        if posed:
+            found.append(_PosedScan(episode=episode, tree=tree, infos=posed))
     return found
-
-
-def _color_cameras(episode: Episode) -> list[str]:
-    topics = {topic for topic in episode.topics() if not is_truth(topic)}
-    stems = (topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE))
-    return sorted(stem.split("/")[-1] for stem in stems if stem + COLOR_INFO in topics)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +137,8 @@ def _with_depth(run: RunFolder, scan: _PosedScan, config: FrameConfig, output: O
         "max_train_frames": config.max_train_frames,
         "max_holdout_frames": config.max_holdout_frames,
     }
-    key = provenance.hash_settings(settings | {"source": scan.episode.sha256()})[:8]
+    source_sha256 = scan.episode.sha256()
+    key = provenance.hash_settings(settings | {"source": source_sha256})[:8]
     path = run.derived_dir / f"{scan.episode.path.stem}.depth.{key}.mcap"
     if path.is_file():
         return Episode.open(path)
@@ -162,7 +158,7 @@ def _with_depth(run: RunFolder, scan: _PosedScan, config: FrameConfig, output: O
     derived = Derived(
         kind="depth",
         source_episode=scan.episode.info.id,
-        source_sha256=scan.episode.sha256(),
+        source_sha256=source_sha256,
         engine=ENGINE,
         settings=settings | {"near_m": near, "far_m": far, "is_metric": scan.is_metric},
     )
@@ -176,15 +172,17 @@ def _images(scan: _PosedScan, config: FrameConfig, output: Output) -> list[_Imag
         config.max_holdout_frames, config.max_train_frames // (config.holdout_every - 1)
     )
     found: list[_Image] = []
-    for camera_id in scan.camera_ids:
-        info = streams.camera_info(scan.episode, camera_id)
+    for camera_id, info in scan.infos.items():
         found_topic = streams.find_camera_topic(scan.episode, camera_id, "color/image")
         topics = [found_topic] if found_topic else []
         stamps = np.array(
-            [stamp_of(decode(m.type_name, m.data)) for m in scan.episode.messages(topics)]
+            [
+                stamp_of(decode(m.type_name, m.data))
+                for m in streams.image_messages(scan.episode, topics)
+            ]
         )
         posed = stamps[~unknown_mask(scan.tree, [info.frame_id], stamps)]
-        chosen = spread(np.unique(posed), max(1, most // len(scan.camera_ids))).tolist()
+        chosen = spread(np.unique(posed), max(1, most // len(scan.infos))).tolist()
         held = set(chosen[config.first_holdout :: config.holdout_every])
         wanted = set(chosen)
         for message in streams.image_messages(scan.episode, topics):
@@ -233,7 +231,7 @@ def _write(
         for image in images:
             shape = image.view.features.shape[1:]
             depth_m = np.zeros(shape) if image.is_held_out else next(depths)
-            color = streams.camera_info(scan.episode, image.camera_id)
+            color = scan.infos[image.camera_id]
             topic = camera_topic(cell, image.camera_id)
             millimetres = np.clip(np.rint(depth_m * 1e3), 0, MAX_MM).astype(np.uint16)
             depth = DepthImage(

@@ -8,6 +8,9 @@ from jaxtyping import Bool, Float, Float32, UInt16
 
 from twin.errors import TwinError
 
+UNKNOWN_SHAPE = "toy"
+"""Word in labels for a shape that is no box, cylinder, ball or container."""
+
 
 class SemanticsError(TwinError):
     """Masks, features or a query do not fit the scene they are meant for."""
@@ -23,10 +26,6 @@ class Mask:
     """What the segmenter calls it; may be empty."""
     score: float = 1.0
     """The segmenter's confidence, 0..1."""
-
-
-UNKNOWN_SHAPE = "toy"
-"""Word in labels for a shape that is no box, cylinder, ball or container."""
 
 
 @dataclass(frozen=True, kw_only=True)

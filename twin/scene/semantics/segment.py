@@ -124,8 +124,9 @@ def segment_points(
     labels[above] = _things(points.take(above), height[above], voxel_m, config)
     labels = _largest_first(labels)
     low = free & (np.abs(height) <= config.min_height_m)
-    _add_feet(labels, points, low, height, voxel_m, config)
-    labels = _without_relief(labels, points, low, height, config)
+    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+    _add_feet(labels, points.p_m, lab, low, height, voxel_m, config)
+    labels = _without_relief(labels, lab, low, height, config)
     things = tuple(
         _thing(points.take(labels == number), height[labels == number], voxel_m, config)
         for number in range(1, int(labels.max(initial=0)) + 1)
@@ -225,7 +226,8 @@ def _largest_first(labels: np.ndarray) -> np.ndarray:
 
 def _add_feet(
     labels: np.ndarray,
-    points: SurfacePoints,
+    p_m: Float[np.ndarray, "num_points 3"],
+    lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
     height_m: np.ndarray,
     voxel_m: float,
@@ -238,14 +240,13 @@ def _add_feet(
     plane = low & (np.abs(height_m) < 0.5 * config.min_height_m)
     if not plane.any():
         return
-    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
     to_plane = np.linalg.norm(lab - np.median(lab[plane], axis=0), axis=1)
     reach = config.min_height_m + 1.5 * voxel_m
     for _ in range(MAX_FOOT_ROUNDS):
         firm, feet = np.flatnonzero(labels > 0), np.flatnonzero(low & (labels == 0))
         if not len(firm) or not len(feet):
             return
-        gap, nearest = cKDTree(points.p_m[firm]).query(points.p_m[feet], distance_upper_bound=reach)
+        gap, nearest = cKDTree(p_m[firm]).query(p_m[feet], distance_upper_bound=reach)
         near = np.isfinite(gap)
         feet, thing = feet[near], firm[nearest[near]]
         to_thing = np.linalg.norm(lab[feet] - lab[thing], axis=1)
@@ -260,7 +261,7 @@ def _add_feet(
 
 def _without_relief(
     labels: Int[np.ndarray, " num_points"],
-    points: SurfacePoints,
+    lab: Float[np.ndarray, "num_points 3"],
     low: Bool[np.ndarray, " num_points"],
     height_m: np.ndarray,
     config: SegmentConfig,
@@ -269,7 +270,6 @@ def _without_relief(
     plane = low & (labels == 0)
     if not plane.any():
         return labels
-    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
     middle = np.median(lab[plane], axis=0)
     own = float(np.quantile(np.linalg.norm(lab[plane] - middle, axis=1), PLANE_COLOURS))
     kept = np.zeros_like(labels)

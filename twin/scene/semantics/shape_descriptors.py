@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from twin.scene.semantics.result import SemanticsError
+from twin.scene.semantics.result import UNKNOWN_SHAPE, SemanticsError
 
 UP = np.array([0.0, 0.0, 1.0])
 """Against gravity in the root frame of a robot cell."""
@@ -371,7 +371,7 @@ def _word(
                 return "flat box"
             return "cube" if max(size_m) < 1.3 * min(size_m) else "box"
         return "cylinder"
-    return "ball" if _is_ball(xyh_m, long) else "toy"
+    return "ball" if _is_ball(xyh_m, long) else UNKNOWN_SHAPE
 
 
 def _is_ball(points: np.ndarray, diameter_m: float) -> bool:
