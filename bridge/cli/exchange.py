@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -12,6 +12,9 @@ from bridge.episode.schema import StampedMessage
 from bridge.exchange.lerobot.layout import LeRobotConfig
 from bridge.sources.folder.config import FolderConfig, PosedConfig
 from bridge.terminal import Output
+
+if TYPE_CHECKING:
+    from bridge.episode.metadata import EpisodeInfo
 
 OUTPUT = Output()
 LEROBOT = LeRobotConfig()
@@ -305,8 +308,6 @@ def import_rgbd(
         output: How to talk.
     """
     from bridge.episode.metadata import EpisodeInfo
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.rgbd import write_scan
     from bridge.sources.folder.messages import (
         describe_folder,
         folder_messages,
@@ -321,15 +322,7 @@ def import_rgbd(
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
     source = describe_folder(index, config)
     total = num_frames(index, config)
-
-    with output.progress("import", total) as advance:
-
-        def messages() -> Iterator[StampedMessage]:
-            for done, frame in enumerate(folder_messages(index, config, None), start=1):
-                yield from frame
-                advance(done, "")
-
-        path = write_scan(RunFolder.create(run), info, messages(), source=source)
+    path = _import_scan(run, info, folder_messages(index, config, None), total, source, output)
     left_out = index.num_unposed + index.num_unpaired
     data = {
         "file": str(path),
@@ -340,6 +333,28 @@ def import_rgbd(
     }
     output.result(data, f"{path}: {total} frames of a folder in {index.layout} layout")
     return 0
+
+
+def _import_scan(
+    run: Path,
+    info: "EpisodeInfo",
+    frames: Iterator[list[StampedMessage]],
+    total: int,
+    source: dict[str, Any],
+    output: Output,
+) -> Path:
+    """Write one scan episode, frame by frame; the run folder is made where needed."""
+    from bridge.episode.run_folder import RunFolder
+    from bridge.exchange.rgbd import write_scan
+
+    with output.progress("import", total) as advance:
+
+        def messages() -> Iterator[StampedMessage]:
+            for done, frame in enumerate(frames, start=1):
+                yield from frame
+                advance(done, "")
+
+        return write_scan(RunFolder.create(run), info, messages(), source=source)
 
 
 POSED = PosedConfig()
@@ -367,8 +382,6 @@ def import_images(
         output: How to talk.
     """
     from bridge.episode.metadata import EpisodeInfo
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.rgbd import write_scan
     from bridge.sources.folder.posed_index import read_posed_index
     from bridge.sources.folder.posed_messages import describe_posed, posed_messages
 
@@ -383,14 +396,8 @@ def import_images(
             "--metres-per-unit says how long a unit of the folder is"
         )
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
-    with output.progress("import", len(index.images)) as advance:
-
-        def messages() -> Iterator[StampedMessage]:
-            for done, image in enumerate(posed_messages(index, config), start=1):
-                yield from image
-                advance(done, "")
-
-        path = write_scan(RunFolder.create(run), info, messages(), source=source)
+    images = posed_messages(index, config)
+    path = _import_scan(run, info, images, len(index.images), source, output)
     data = {"file": str(path), "images": len(index.images), **source}
     output.result(data, f"{path}: {len(index.images)} posed images without depth")
     return 0

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, UInt8, UInt16
 
 from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.media.color import UnreadableImageError
+from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
 from bridge.media.depth import decode_depth_png
 from bridge.sources.folder.config import FolderConfig, FolderError
 
@@ -97,6 +97,52 @@ def checked_rotation(
             hint="Poses are camera-to-world, row by row.",
         )
     return se3.nearest_rotation(R)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredColor:
+    """A colour image as it lies in a folder."""
+
+    stored: bytes
+    image_u8: UInt8[np.ndarray, "height width 3"]
+
+    def as_jpeg(self) -> bytes:
+        """The stored bytes where they are JPEG, else the image compressed."""
+        return self.stored if self.stored[:2] == JPEG_MAGIC else encode_jpeg(self.image_u8)
+
+
+def read_color(path: Path) -> StoredColor:
+    """Read a colour image.
+
+    Raises:
+        FolderError: When it is none.
+    """
+    try:
+        stored = path.read_bytes()
+        return StoredColor(stored=stored, image_u8=decode_color(stored))
+    except (UnreadableImageError, OSError) as error:
+        raise FolderError(
+            path=path, found=str(error), hint="Restore the file or remove the frame."
+        ) from error
+
+
+def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
+    """Refuse an image of another size than its camera's.
+
+    Args:
+        path: The image, for the error.
+        shape: Its height and width.
+        camera: What it was taken with.
+
+    Raises:
+        FolderError: When the sizes differ.
+    """
+    if shape != (camera.height, camera.width):
+        raise FolderError(
+            path=path,
+            found=f"{shape[1]} x {shape[0]} pixels, camera {camera.width} x {camera.height}",
+            hint="Correct the intrinsics or the image.",
+        )
 
 
 def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:

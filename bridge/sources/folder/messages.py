@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import UInt16
 
 from bridge.clock import ns_from_s
 from bridge.episode import schema
@@ -26,10 +26,16 @@ from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import COLOR_IMAGE, DEPTH_IMAGE, TF, TF_STATIC, camera_topic
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry.camera import Camera
-from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
 from bridge.media.depth import to_millimetres
 from bridge.sources.folder.config import DEFAULT_RATE_HZ, FolderConfig, FolderError
-from bridge.sources.folder.frames import FolderFrame, FolderIndex, read_stored_depth
+from bridge.sources.folder.frames import (
+    FolderFrame,
+    FolderIndex,
+    StoredColor,
+    check_size,
+    read_color,
+    read_stored_depth,
+)
 from bridge.sources.folder.scene_json import INDEX_NAME, read_scene
 from bridge.sources.folder.sevenscenes import find_frames, read_sevenscenes
 from bridge.sources.folder.tum import find_lists, read_tum
@@ -177,10 +183,10 @@ def folder_messages(
     color_camera: Camera | None = None
     next_info_ns = min(times[0])
     for number, (frame, stamps) in enumerate(zip(index.frames, times, strict=False), start=1):
-        color = _read_color(frame)
+        color = read_color(frame.color_path)
         if color_camera is None:
-            color_camera = _color_camera(index, color.shape)
-        _check_size(frame.color_path, color.shape[:2], color_camera)
+            color_camera = _color_camera(index, color.image_u8.shape)
+        check_size(frame.color_path, color.image_u8.shape[:2], color_camera)
         messages = []
         if min(stamps) >= next_info_ns:
             messages += _calibration(index, config, color_camera, min(stamps))
@@ -220,7 +226,7 @@ def _images(
     index: FolderIndex,
     config: FolderConfig,
     frame: FolderFrame,
-    color: UInt8[np.ndarray, "height width 3"],
+    color: StoredColor,
     stamps: tuple[int, int],
 ) -> list[StampedMessage]:
     color_ns, depth_ns = stamps
@@ -229,12 +235,11 @@ def _images(
         frame_id=f"{config.camera}_depth_optical",
         depth_mm=_read_depth(index, frame),
     )
-    stored = frame.color_path.read_bytes()
     image = CompressedColor(
         stamp_ns=color_ns,
         frame_id=f"{config.camera}_color_optical",
         format="jpeg",
-        data=stored if stored[:2] == JPEG_MAGIC else encode_jpeg(color),
+        data=color.as_jpeg(),
     )
     prefix = camera_topic(config.cell, config.camera)
     return [
@@ -273,30 +278,12 @@ def _color_camera(index: FolderIndex, shape: tuple[int, ...]) -> Camera:
     return index.depth_camera.scaled(shape[1] / index.depth_camera.width)
 
 
-def _read_color(frame: FolderFrame) -> UInt8[np.ndarray, "height width 3"]:
-    try:
-        return decode_color(frame.color_path.read_bytes())
-    except (UnreadableImageError, OSError) as error:
-        raise FolderError(
-            path=frame.color_path, found=str(error), hint="Restore the file or remove the frame."
-        ) from error
-
-
 def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:
     stored = read_stored_depth(frame.depth_path)
-    _check_size(frame.depth_path, stored.shape, index.depth_camera)
+    check_size(frame.depth_path, stored.shape, index.depth_camera)
     return to_millimetres(
         stored,
         unit_m=index.depth_unit_m,
         invalid_values=index.depth_invalid_values,
         encoding=index.depth_encoding,
     )
-
-
-def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
-    if shape != (camera.height, camera.width):
-        raise FolderError(
-            path=path,
-            found=f"{shape[1]} x {shape[0]} pixels, camera {camera.width} x {camera.height}",
-            hint="Correct the intrinsics or the image.",
-        )

@@ -1,6 +1,7 @@
 """A folder of posed colour images as the messages of cameras that see no depth."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.schema import StampedMessage
 from bridge.episode.topics import COLOR_IMAGE, COLOR_INFO, TF, camera_topic
 from bridge.geometry.camera import Camera
-from bridge.media.color import JPEG_MAGIC, UnreadableImageError, decode_color, encode_jpeg
-from bridge.sources.folder.config import FolderError, PosedConfig
+from bridge.media.color import encode_jpeg
+from bridge.sources.folder.config import PosedConfig
+from bridge.sources.folder.frames import check_size, read_color
 from bridge.sources.folder.messages import WORLD
 from bridge.sources.folder.posed_index import Lens, PosedImage, PosedIndex
 
@@ -110,8 +112,9 @@ class Undistortion:
         self._uv: Float[np.ndarray, "height width 2"] | None = None
         if lens.is_straight:
             return
-        for zoom in np.geomspace(1.0, MOST_ZOOM, ZOOM_STEPS):
-            self.camera = _zoomed(lens.camera, float(zoom))
+        for zoom in np.geomspace(1.0, MOST_ZOOM, ZOOM_STEPS).tolist():
+            focal = {"fx": lens.camera.fx * zoom, "fy": lens.camera.fy * zoom}
+            self.camera = replace(lens.camera, **focal)
             self._uv = _distorted(lens, self.camera.rays())
             if _inside(lens.camera, self._uv):
                 break
@@ -139,17 +142,6 @@ def _inside(camera: Camera, uv: Float[np.ndarray, "height width 2"]) -> bool:
     return bool(((u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)).all())
 
 
-def _zoomed(camera: Camera, zoom: float) -> Camera:
-    return Camera(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx * zoom,
-        fy=camera.fy * zoom,
-        cx=camera.cx,
-        cy=camera.cy,
-    )
-
-
 def _distorted(
     lens: Lens, rays: Float[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width 2"]:
@@ -165,24 +157,11 @@ def _distorted(
 
 def _jpeg(image: PosedImage, view: Undistortion) -> bytes:
     """The stored bytes where they can stay as they are."""
-    try:
-        stored = image.path.read_bytes()
-        pixels = decode_color(stored)
-    except (UnreadableImageError, OSError) as error:
-        raise FolderError(
-            path=image.path, found=str(error), hint="Restore the file or remove the image."
-        ) from error
-    camera = view.lens.camera
-    if pixels.shape[:2] != (camera.height, camera.width):
-        raise FolderError(
-            path=image.path,
-            found=f"{pixels.shape[1]} x {pixels.shape[0]} pixels, "
-            f"camera {camera.width} x {camera.height}",
-            hint="Correct the intrinsics or the image.",
-        )
+    color = read_color(image.path)
+    check_size(image.path, color.image_u8.shape[:2], view.lens.camera)
     if view.lens.is_straight:
-        return stored if stored[:2] == JPEG_MAGIC else encode_jpeg(pixels)
-    return encode_jpeg(view.of(pixels), quality=UNDISTORTED_QUALITY)
+        return color.as_jpeg()
+    return encode_jpeg(view.of(color.image_u8), quality=UNDISTORTED_QUALITY)
 
 
 def _pose(camera: str, T_world_camera: Float[np.ndarray, "4 4"], stamp_ns: int) -> StampedMessage:
