@@ -107,16 +107,17 @@ def read_training_set(
         moved = with_corrections(choices, choice_of_view, views, refined.corrections)
     reference_views = choose_reference_views(views)
     moving = find_moving(points, reference_views)
-    static = [moving.drop_from(item) for item in points]
-    total_points = max(sum(len(p.p_m) for p in points), 1)
-    gone = sum(len(p.p_m) - len(s.p_m) for p, s in zip(points, static, strict=True)) / total_points
+    num_points = sum(len(item.p_m) for item in points)
+    for place in range(len(points)):  # one by one, so that memory holds the frames once
+        points[place], views[place] = moving.drop_from(points[place]), moving.mask_in(views[place])
+    gone = (num_points - sum(len(item.p_m) for item in points)) / max(num_points, 1)
     report = replace(report, moving_fraction=round(gone, 4), ego_mask_shares=shares)
     for remark in report.remarks():
         output.say(remark)
     return TrainingSet(
         choices=moved,
-        points=static,
-        views=[moving.mask_in(view) for view in views],
+        points=points,
+        views=views,
         choice_of_view=choice_of_view,
         moving=moving,
         ego_masks=ego_masks,

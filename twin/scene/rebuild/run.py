@@ -55,7 +55,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 23
+METHOD_VERSION = 24
 """Counts changes of method that make older scenes out of date."""
 
 

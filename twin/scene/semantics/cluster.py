@@ -335,10 +335,10 @@ def _first_dependent(
 
 def _overlap(a_m: np.ndarray, b_m: np.ndarray) -> float:
     """Share of one set of points within the other's outline seen from above, the larger."""
-    return max(float(_within(a_m, b_m).mean()), float(_within(b_m, a_m).mean()))
+    return max(float(_within_outline(a_m, b_m).mean()), float(_within_outline(b_m, a_m).mean()))
 
 
-def _within(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
+def _within_outline(points: np.ndarray, outline: np.ndarray) -> Bool[np.ndarray, " num_points"]:
     try:
         hull = Delaunay(outline[:, :2])
     except (QhullError, ValueError):
@@ -437,9 +437,10 @@ def _smallest_marking(
         largest = int(neighbours[np.argmax(counts[neighbours])])
         if min(gaps) < config.min_colour_gap:
             return int(piece), int(neighbours[int(np.argmin(gaps))])
-        if counts[piece] >= config.min_piece_fraction * counts[largest]:
-            continue
         if counts[piece] >= 20 and _lies_in(pieces == piece, pieces == largest, voxels, height_m):
+            continue
+        inside = _is_set_in(pieces == piece, pieces == largest, voxels, height_m)
+        if counts[piece] >= config.min_piece_fraction * counts[largest] and not inside:
             continue
         return int(piece), largest
     return None
@@ -450,6 +451,19 @@ def _neighbours(pieces: np.ndarray, pairs: np.ndarray, piece: int) -> np.ndarray
     return np.unique(
         np.concatenate([b[(a == piece) & (b != piece)], a[(b == piece) & (a != piece)]])
     )
+
+
+SET_IN_SHARE = 0.5
+"""Of a marking's outline within that of what it is on."""
+STANDS_ON = 0.8
+"""What begins above this quantile of the other's heights stands on it."""
+
+
+def _is_set_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: np.ndarray) -> bool:
+    """Whether one piece lies in the other's surface, seen from above, and does not stand on it."""
+    if np.quantile(height_m[inner], 0.1) > np.quantile(height_m[outer], STANDS_ON):
+        return False
+    return bool(_within_outline(voxels.p_m[inner], voxels.p_m[outer]).mean() > SET_IN_SHARE)
 
 
 def _lies_in(inner: np.ndarray, outer: np.ndarray, voxels: Voxels, height_m: np.ndarray) -> bool:

@@ -1,18 +1,21 @@
 """From sets of Gaussians to instances: colour, box, parts and keypoints."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import cKDTree
 
+from bridge.geometry import se3
 from bridge.terminal import Advance
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.frames.rgbd import NEAR_M
+from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.associate import AssociateConfig, SmoothConfig, associate, smooth_shares
 from twin.scene.semantics.colour import colour_name
-from twin.scene.semantics.language import NAMED, kind_of, label_of, numbered
+from twin.scene.semantics.language import NAMED, Numbered, kind_of, label_of, numbered
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
 from twin.scene.semantics.part_segmentation import Parts, PartsConfig, find_parts
 from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
@@ -24,19 +27,26 @@ from twin.scene.semantics.segment import (
     segment_points,
     solid_splats,
 )
-from twin.scene.semantics.shape_descriptors import (
-    CONTAINER,
+from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
+from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
     SupportPlane,
     find_support,
-    measure_shape,
+    level_frame,
 )
 
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
 MIN_SHOWN_PX = 20.0
 """A frame shows a thing when its Gaussians give this many pixels of the image."""
+MIN_WHOLE, MIN_WHOLE_SHARE = 2, 0.4
+"""Frames that show all of a thing, and of all that show it: what most frames cut off goes on,
+nobody knows how far."""
+EDGE_SHARE = 0.01
+"""Of an image's width: what reaches this near to its edge is cut off."""
+WHOLE_SHARE = 0.98
+"""Of a thing's Gaussians within the edges."""
 FOUND, SHOWN = 30, 70
 """Percent of the work when things are found, and when the frames that show them are counted."""
 
@@ -114,8 +124,10 @@ def scene_by_default(
 ) -> SemanticScene:
     """Segment the fused Gaussians with the default segmenter.
 
-    Support and seen count the viewpoints that show an instance. A scene without a level plane,
-    or with nothing on it, gives only what is known already, and a remark that says so.
+    Support and seen count the viewpoints that show an instance; what fewer than two of them show
+    whole is left out. A scene without a level plane, or with nothing on it, gives only what is
+    known already, and a remark that says so. Where z of the scene's frame does not point up, the
+    work is done in a frame where it does, and a remark says that, too.
 
     Args:
         cloud: The scene.
@@ -129,12 +141,23 @@ def scene_by_default(
             are told apart on these, which are thinner than any coat of Gaussians.
         advance: Told the percentage done.
     """
-    labels = np.zeros(len(cloud), dtype=np.uint16)
+    frames = list(viewpoints)
     ids = np.flatnonzero(solid_splats(cloud))
+    config = config or SegmentConfig()
+    points = points_of(cloud.take(ids))
+    Ts = [frame.T_base_camera for frame in frames]
+    T_level_base = level_frame(points.p_m, points.normals, Ts, config.support)
+    is_level = np.array_equal(T_level_base, np.eye(4))
+    if not is_level:
+        cloud = moved_cloud(cloud, T_level_base)
+        frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
+        robot_m = None if robot_m is None else se3.apply(T_level_base, robot_m)
+        surfaces_m = {key: se3.apply(T_level_base, p) for key, p in (surfaces_m or {}).items()}
+    labels = np.zeros(len(cloud), dtype=np.uint16)
     things: tuple[Thing, ...] = ()
     plane: SupportPlane | None = None
     try:
-        found = segment_points(points_of(cloud.take(ids)), config or SegmentConfig(), robot_m)
+        found = segment_points(points_of(cloud.take(ids)), config, robot_m)
     except NoSupportError as error:
         remark = str(error)
     else:
@@ -143,8 +166,9 @@ def scene_by_default(
     advance(FOUND, f"{len(things)} things found")
     final = numbered(labels, known or {})
     total = len(final.keys) + len(final.others)
-    looked = _told(viewpoints, FOUND, SHOWN, advance, "frames looked at")
-    shown = _num_shown(cloud, final.labels, total, looked, rasteriser)
+    looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
+    shown, whole = _num_shown(cloud, final.labels, total, looked, rasteriser)
+    final, kept = _seen_whole(final, shown, whole, min(MIN_WHOLE, len(frames)))
     named = [(key, "", 1.0, NAMED) for key in final.keys]
     named += [("", things[n - 1].label, things[n - 1].score, SOURCE) for n in final.others]
     reporting = _told(named, SHOWN, 100, advance, "things measured")
@@ -155,8 +179,8 @@ def scene_by_default(
             mask=final.labels == number,
             key=key,
             label=label,
-            support=shown[number],
-            seen=shown[number],
+            support=shown[kept[number - 1]],
+            seen=shown[kept[number - 1]],
             score=score,
             source=source,
             plane=plane,
@@ -164,7 +188,30 @@ def scene_by_default(
         )
         for number, (key, label, score, source) in enumerate(reporting, start=1)
     )
+    if not is_level:
+        up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
+        remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
+        instances = tuple(_moved(item, se3.invert(T_level_base)) for item in instances)
     return SemanticScene(instances=instances, labels=final.labels, source=SOURCE, remark=remark)
+
+
+def _moved(item: Instance, T: Float[np.ndarray, "4 4"]) -> Instance:
+    """The same instance in another frame."""
+    keypoints = {name: se3.apply(T, point[None])[0] for name, point in item.keypoints_m.items()}
+    return replace(item, T_base_instance=T @ item.T_base_instance, keypoints_m=keypoints)
+
+
+def _seen_whole(
+    found: Numbered, shown: Sequence[int], whole: Sequence[int], least: int
+) -> tuple[Numbered, list[int]]:
+    """Drop what too few frames show whole; known objects stay. Also the old number of each."""
+    others = range(len(found.keys) + 1, len(found.keys) + len(found.others) + 1)
+    firm = [n for n in others if whole[n] >= max(least, MIN_WHOLE_SHARE * shown[n])]
+    kept = [*range(1, len(found.keys) + 1), *firm]
+    new_number = np.zeros(len(whole), dtype=np.uint16)
+    new_number[kept] = np.arange(1, len(kept) + 1)
+    things = tuple(found.others[n - 1 - len(found.keys)] for n in kept[len(found.keys) :])
+    return replace(found, labels=new_number[found.labels], others=things), kept
 
 
 def _told(
@@ -183,16 +230,34 @@ def _num_shown(
     num_things: int,
     viewpoints: Iterable[Viewpoint],
     rasteriser: Rasteriser,
-) -> list[int]:
-    """For each label the number of viewpoints that show it."""
+) -> tuple[list[int], list[int]]:
+    """For each label the number of viewpoints that show it, and of those that show it whole."""
     shown = np.zeros(num_things + 1, dtype=np.int64)
+    whole = np.zeros(num_things + 1, dtype=np.int64)
+    size = np.maximum(np.bincount(labels, minlength=num_things + 1), 1)
     if num_things:
         for viewpoint in viewpoints:
             weight: Float32[np.ndarray, " num_splats"]
             weight = visible_weight(rasteriser, cloud, viewpoint)
             pixels = np.bincount(labels, weights=weight, minlength=num_things + 1)
+            inside = _within_edges(cloud.means_m, viewpoint)
+            share = np.bincount(labels, weights=inside, minlength=num_things + 1) / size
             shown += pixels >= MIN_SHOWN_PX
-    return [int(count) for count in shown]
+            whole += (pixels >= MIN_SHOWN_PX) & (share >= WHOLE_SHARE)
+    return shown.tolist(), whole.tolist()
+
+
+def _within_edges(
+    p_m: Float[np.ndarray, "num_splats 3"], viewpoint: Viewpoint
+) -> Bool[np.ndarray, " num_splats"]:
+    """Which points a camera has well inside its image, hidden ones included."""
+    camera = viewpoint.camera
+    p = se3.apply(se3.invert(viewpoint.T_base_camera), p_m.astype(np.float64))
+    front = p[:, 2] > NEAR_M
+    uv, _ = camera.project(np.where(front[:, None], p, 1.0))
+    edge = EDGE_SHARE * camera.width
+    inside = np.all((uv > edge) & (uv < [camera.width - edge, camera.height - edge]), axis=1)
+    return np.asarray(front & inside)
 
 
 def support_of(cloud: GaussianCloud) -> SupportPlane | None:

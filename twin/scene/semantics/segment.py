@@ -4,7 +4,7 @@ Things are what stands on the largest level plane and hangs together, cut where 
 says that two things touch. Works on the points of one RGB-D view and on a fused cloud.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,18 +24,23 @@ from twin.scene.semantics.cluster import (
     split_by_valleys,
 )
 from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
-from twin.scene.semantics.shape_descriptors import (
-    ShapeDescriptors,
+from twin.scene.semantics.patches import PatchConfig, cut_into_patches
+from twin.scene.semantics.shape_descriptors import ShapeDescriptors, measure_shape
+from twin.scene.semantics.support import (
+    NoSupportError,
     SupportConfig,
     SupportPlane,
     find_support,
-    measure_shape,
+    no_support,
+    roughness_m,
 )
 
 SOURCE = "default segmenter"
 MAX_FOOT_ROUNDS = 8
 MIN_FRAGMENT = 8
 """Voxels of the smallest fragment that may be joined to a thing."""
+FINE_M = 0.01
+"""A plane that asks for a larger least height is rough."""
 PLANE_COLOURS = 0.75
 """This share of the plane's points says how much its colour varies."""
 
@@ -50,6 +55,10 @@ class SegmentConfig:
     """When things touch."""
     min_height_m: float = 0.007
     """Above the plane; lower points belong to a thing only by colour."""
+    relief_factor: float = 2.5
+    """On a rough plane, what has its colour is a thing only from so many least heights on."""
+    roughness_factor: float = 3.0
+    """And above so many times the roughness of the plane, as it was measured."""
     max_height_m: float = 0.6
     """Higher points belong to the surroundings."""
     voxel_m: float = 0.004
@@ -61,7 +70,9 @@ class SegmentConfig:
     min_size_m: float = 0.012
     """Things have at least this extent in two directions."""
     max_size_m: float = 0.45
-    """Larger groups are furniture or the robot."""
+    """Larger groups are furniture, the robot, or things that touch a wall: they are cut."""
+    patches: PatchConfig = field(default_factory=PatchConfig)
+    """How."""
     robot_distance_m: float = 0.015
     """Points this near to the robot's surface are robot."""
     foot_colour_gap: float = 12.0
@@ -90,7 +101,8 @@ class Segmentation:
     """Index of the thing plus one; 0 is the background."""
     things: tuple[Thing, ...]
     """Largest first."""
-    plane: SupportPlane
+    plane: SupportPlane | None
+    """What they stand on; None where nothing level was measured."""
     remark: str
     """Why nothing was found; empty otherwise."""
 
@@ -108,23 +120,28 @@ def segment_points(
         robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
 
     Raises:
-        NoSupportError: When there is no level plane to stand on.
+        NoSupportError: When there is no level plane to stand on, and nothing stands out.
     """
-    plane = find_support(points.p_m, points.normals, config.support)
+    try:
+        plane = find_support(points.p_m, points.normals, config.support)
+    except NoSupportError:
+        return _without_support(points, config, robot_m)
+    roughness = roughness_m(points.p_m, points.normals, plane, config.support)
+    least = max(config.min_height_m, config.roughness_factor * roughness)
+    config = replace(config, min_height_m=least)
     height = plane.height_m(points.p_m)
     free = plane.under(points.p_m) & (height < config.max_height_m)
-    if robot_m is not None and len(robot_m):
-        distance, _ = cKDTree(robot_m).query(
-            points.p_m, distance_upper_bound=config.robot_distance_m
-        )
-        free &= ~np.isfinite(distance)
-    above = np.flatnonzero(free & (height > config.min_height_m))
+    free &= ~_on_robot(points.p_m, robot_m, config)
+    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+    raised = free & (height > config.min_height_m)
+    if least > FINE_M:
+        raised &= ~_is_relief(lab, height, plane.under(points.p_m), config)
+    above = np.flatnonzero(raised)
     labels = np.zeros(len(points), dtype=np.int64)
     voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[above]))
     labels[above] = _things(points.take(above), height[above], voxel_m, config)
     labels = _largest_first(labels)
     low = free & (np.abs(height) <= config.min_height_m)
-    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
     _add_feet(labels, points.p_m, lab, low, height, voxel_m, config)
     labels = _without_relief(labels, lab, low, height, config)
     things = tuple(
@@ -140,6 +157,47 @@ def segment_points(
         )
     )
     return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
+
+
+def _is_relief(
+    lab: np.ndarray, height_m: np.ndarray, under: np.ndarray, config: SegmentConfig
+) -> Bool[np.ndarray, " num_points"]:
+    """Where a rough plane bulges: low and of its colour."""
+    plane = under & (np.abs(height_m) < config.min_height_m)
+    middle = np.median(lab[plane], axis=0)
+    away = np.linalg.norm(lab - middle, axis=1)
+    own = max(float(np.quantile(away[plane], PLANE_COLOURS)), config.foot_colour_gap)
+    return np.asarray((height_m < config.relief_factor * config.min_height_m) & (away < own))
+
+
+def _on_robot(p_m: np.ndarray, robot_m: np.ndarray | None, config: SegmentConfig) -> np.ndarray:
+    if robot_m is None or not len(robot_m):
+        return np.zeros(len(p_m), dtype=bool)
+    distance, _ = cKDTree(robot_m).query(p_m, distance_upper_bound=config.robot_distance_m)
+    return np.asarray(np.isfinite(distance))
+
+
+def _without_support(
+    points: SurfacePoints, config: SegmentConfig, robot_m: np.ndarray | None
+) -> Segmentation:
+    """Things where nothing level was measured, a shelf of bare metal: all of it is cut.
+
+    Raises:
+        NoSupportError: When nothing is found in this way either.
+    """
+    free = np.flatnonzero(~_on_robot(points.p_m, robot_m, config))
+    labels = np.zeros(len(points), dtype=np.int64)
+    spacing_m = _spacing(points.p_m[free])
+    labels[free] = cut_into_patches(points.take(free), spacing_m, config.patches)
+    if not labels.any():
+        raise NoSupportError(no_support(points.p_m, points.normals, config.support))
+    labels = _largest_first(labels)
+    things = []
+    for number in range(1, int(labels.max()) + 1):
+        mine = points.take(labels == number)
+        height = mine.p_m[:, 2] - float(np.quantile(mine.p_m[:, 2], 0.01))
+        things.append(_thing(mine, height, config.patches.voxel_m, config))
+    return Segmentation(labels=labels, things=tuple(things), plane=None, remark="")
 
 
 def _spacing(p_m: np.ndarray) -> float:
@@ -163,17 +221,25 @@ def _things(
     group = components(len(voxels), pairs)
     labels = np.zeros(len(voxels), dtype=np.int64)
     pieces: list[np.ndarray] = []
+    too_large = np.zeros(len(voxels), dtype=bool)
     for number in np.flatnonzero(np.bincount(group) >= MIN_FRAGMENT):
         ids = np.flatnonzero(group == number)
         if _extent(voxels.p_m[ids])[0] <= config.max_size_m:
             pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
+        else:
+            too_large[ids] = True
     found = 0
     for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
         extent = _extent(voxels.p_m[piece])
         if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
             found += 1
             labels[piece] = found
-    return np.asarray(labels[voxels.of_point])
+    of_points = np.asarray(labels[voxels.of_point])
+    left = np.flatnonzero(too_large[voxels.of_point])
+    if len(left):
+        cut = cut_into_patches(points.take(left), voxel_m / 2, config.patches)
+        of_points[left] = np.where(cut > 0, cut + found, 0)
+    return of_points
 
 
 def _extent(p_m: np.ndarray) -> np.ndarray:

@@ -1,7 +1,4 @@
-"""Describe the shape of a thing on its support plane: height map, cavity, box, and a word for it.
-
-The support plane is nearly level, found by RANSAC and refined by least squares.
-"""
+"""Describe the shape of a thing on its support plane: height map, cavity, box and a word."""
 
 from dataclasses import dataclass
 
@@ -10,167 +7,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from twin.scene.semantics.result import UNKNOWN_SHAPE, SemanticsError
-
-UP = np.array([0.0, 0.0, 1.0])
-"""Against gravity in the root frame of a robot cell."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SupportConfig:
-    """What counts as the supporting plane."""
-
-    max_tilt_rad: float = 0.14
-    """From level: poses may be wrong by a few degrees, a ramp is no table."""
-    tolerance_m: float = 0.006
-    """Points this near belong to the plane."""
-    num_trials: int = 500
-    """Triples of points to try."""
-    max_points: int = 6000
-    """Points that vote; more are thinned out evenly."""
-    min_points: int = 100
-    """A plane with fewer points carries nothing."""
-    num_candidates: int = 3
-    """Planes among which the one that carries most is chosen (table and floor)."""
-    separation_m: float = 0.04
-    """Level planes nearer than this are one surface that is not quite flat."""
-    cell_m: float = 0.02
-    """Size of the cells that say where the plane extends."""
-    seed: int = 0
-    """Of the random triples."""
-
-
-class NoSupportError(SemanticsError):
-    """No level plane was found."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SupportPlane:
-    """Points p of the plane fulfil ``normal . p = offset_m``."""
-
-    normal: Float[np.ndarray, "3"]
-    """Unit vector, upwards."""
-    offset_m: float
-    num_points: int
-    """Points that voted for it."""
-    footprint: Bool[np.ndarray, "num_x num_y"]
-    """Where it extends, seen along z: cells with support and the holes between them."""
-    corner_m: tuple[float, float]
-    """Lower x and y of the first cell."""
-    cell_m: float
-
-    def height_m(self, p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
-        """Distance above the plane; negative below [m]."""
-        return np.asarray(p_m @ self.normal - self.offset_m)
-
-    def under(self, p_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
-        """Say which points lie above or below where the plane extends."""
-        cells = np.floor((p_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
-        inside = np.all((cells >= 0) & (cells < self.footprint.shape), axis=1)
-        cells[~inside] = 0
-        return np.asarray(inside & self.footprint[cells[:, 0], cells[:, 1]])
-
-
-def find_support(
-    p_m: Float[np.ndarray, "num_points 3"],
-    normals: Float[np.ndarray, "num_points 3"],
-    config: SupportConfig,
-) -> SupportPlane:
-    """Find the level plane that carries most of what is near it.
-
-    Fischler and Bolles 1981 on the points whose normal is upright, with the tilt bounded. Of the
-    largest few planes the one with most points on it and just above it wins: a floor may be
-    larger than the table, but less stands on the part of it that is seen.
-
-    Args:
-        p_m: Points of the scene, z up.
-        normals: Unit vectors at the points.
-        config: Tolerances, and how many planes are compared.
-
-    Raises:
-        NoSupportError: When no level plane has enough points.
-    """
-    upright = np.abs(normals @ UP) > np.cos(3 * config.max_tilt_rad)
-    left = p_m[upright]
-    planes: list[tuple[int, SupportPlane]] = []
-    for _ in range(config.num_candidates):
-        found = _largest_plane(left, config)
-        if found is None:
-            break
-        plane = found
-        height = plane.height_m(p_m)
-        carried = (height > 2 * config.tolerance_m) & (height < 0.3)
-        carried[carried] = plane.under(p_m[carried])
-        planes.append((plane.num_points + int(carried.sum()), plane))
-        left = left[np.abs(plane.height_m(left)) > config.separation_m]
-    if not planes:
-        message = (
-            f"no level plane among {len(p_m)} points, {int(upright.sum())} of them upright. The "
-            "default segmenter needs a table in view and z up in the root frame."
-        )
-        raise NoSupportError(message)
-    return max(planes, key=lambda item: item[0])[1]
-
-
-def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
-    if len(p_m) < config.min_points:
-        return None
-    rng = np.random.default_rng(config.seed)
-    some = p_m[:: max(1, len(p_m) // config.max_points)]
-    triples = some[rng.integers(0, len(some), (config.num_trials, 3))]
-    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    normals /= np.maximum(length, 1e-12)[:, None]
-    normals *= np.sign(normals[:, 2:] + 1e-12)
-    level = (length > 1e-9) & (normals @ UP > np.cos(config.max_tilt_rad))
-    # The exactly level plane through one point is always among the trials.
-    normals[~level] = UP
-    offsets = (normals * triples[:, 0]).sum(axis=1)
-    votes = (np.abs(normals @ some.T - offsets[:, None]) < config.tolerance_m).sum(axis=1)
-    best = int(np.argmax(votes))
-    normal, offset = normals[best], float(offsets[best])
-    for _ in range(3):
-        inside = np.abs(p_m @ normal - offset) < config.tolerance_m
-        if inside.sum() < config.min_points:
-            return None
-        normal, offset = _refined(p_m[inside], config)
-    inside = np.abs(p_m @ normal - offset) < config.tolerance_m
-    if inside.sum() < config.min_points:
-        return None
-    footprint, corner = _footprint(p_m[inside], config.cell_m)
-    return SupportPlane(
-        normal=normal,
-        offset_m=offset,
-        num_points=int(inside.sum()),
-        footprint=footprint,
-        corner_m=corner,
-        cell_m=config.cell_m,
-    )
-
-
-def _refined(p_m: np.ndarray, config: SupportConfig) -> tuple[np.ndarray, float]:
-    """Least squares for z over x and y, the tilt bounded."""
-    centre = p_m.mean(axis=0)
-    away = p_m - centre
-    scatter = away[:, :2].T @ away[:, :2] + 1e-9 * len(p_m) * np.eye(2)
-    slope = np.linalg.solve(scatter, away[:, :2].T @ away[:, 2])
-    steepness = float(np.linalg.norm(slope))
-    slope *= min(1.0, np.tan(config.max_tilt_rad) / max(steepness, 1e-12))
-    normal = np.array([-slope[0], -slope[1], 1.0])
-    normal /= np.linalg.norm(normal)
-    return normal, float(normal @ centre)
-
-
-def _footprint(p_m: np.ndarray, cell_m: float) -> tuple[np.ndarray, tuple[float, float]]:
-    """Cells with points, small gaps closed, and the holes where things stand."""
-    cells = np.floor(p_m[:, :2] / cell_m).astype(np.int64)
-    low = cells.min(axis=0) - 3
-    grid = np.zeros(cells.max(axis=0) - low + 4, dtype=bool)
-    grid[tuple((cells - low).T)] = True
-    closed = ndimage.binary_closing(grid, iterations=3)
-    filled = np.asarray(ndimage.binary_fill_holes(closed | grid))
-    return filled, (float(low[0] * cell_m), float(low[1] * cell_m))
-
+from twin.scene.semantics.result import UNKNOWN_SHAPE
 
 CONTAINER_RATIO = 1.8
 """Convex hull over filled volume; more, with a cavity that opens upwards, is a container."""
@@ -353,6 +190,10 @@ def _rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
     return centre, sides, yaw, float(hull.volume / max(areas[best], 1e-12))
 
 
+LEAST_OF_A_BALL = 0.5
+"""Shortest over longest side of what may be a ball, of which little more than half is seen."""
+
+
 def _word(
     xyh_m: np.ndarray,
     heights: HeightMap,
@@ -371,7 +212,8 @@ def _word(
                 return "flat box"
             return "cube" if max(size_m) < 1.3 * min(size_m) else "box"
         return "cylinder"
-    return "ball" if _is_ball(xyh_m, long) else UNKNOWN_SHAPE
+    is_round = min(size_m) > LEAST_OF_A_BALL * long and _is_ball(xyh_m, long)
+    return "ball" if is_round else UNKNOWN_SHAPE
 
 
 def _is_ball(points: np.ndarray, diameter_m: float) -> bool:

@@ -26,6 +26,8 @@ MIN_POINTS = 100
 POINTS_PER_VIEW = 2000
 OBJECT_MARGIN_VOXELS = 1.5
 """Voxels this near to an object were seen as the object; the scene is free of them."""
+VOXELS_AT_ONCE = 100_000
+"""Looked up in the objects' distances together: some 300 bytes each."""
 
 Distance = Callable[[Float[np.ndarray, "num_points 3"]], Float[np.ndarray, " num_points"]]
 
@@ -166,9 +168,11 @@ def static_sdf(
     evidence = gather(box, masked, truncation, min_free_views=2)
     free = evidence.empty.ravel()
     taken = np.flatnonzero(~free if objects else [])
-    places = box.centres_m(taken)
-    for distance in objects:
-        free[taken[distance(places) < OBJECT_MARGIN_VOXELS * box.voxel_m]] = True
+    for first in range(0, len(taken), VOXELS_AT_ONCE):
+        some = taken[first : first + VOXELS_AT_ONCE]
+        places = box.centres_m(some)
+        for distance in objects:
+            free[some[distance(places) < OBJECT_MARGIN_VOXELS * box.voxel_m]] = True
     free = free.reshape(box.counts)
     surface = evidence.weight > 0
     if table_z_m is not None:

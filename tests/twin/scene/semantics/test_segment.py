@@ -13,7 +13,7 @@ from twin.scene.semantics.segment import (
     points_of,
     segment_points,
 )
-from twin.scene.semantics.shape_descriptors import NoSupportError
+from twin.scene.semantics.support import NoSupportError
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
@@ -113,7 +113,7 @@ def test_without_a_level_plane_it_says_what_is_missing() -> None:
     ball = points_of(cloud)
     p = rng.normal(size=(len(ball), 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
-    with pytest.raises(NoSupportError, match="z up in the root frame"):
+    with pytest.raises(NoSupportError, match="needs a table in view, or things"):
         segment_points(type(ball)(p_m=5.0 * p, normals=p, colors=ball.colors), SegmentConfig())
 
 

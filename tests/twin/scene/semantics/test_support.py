@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from twin.scene.semantics.shape_descriptors import NoSupportError, SupportConfig, find_support
+from twin.scene.semantics.support import (
+    NoSupportError,
+    SupportConfig,
+    find_support,
+    level_frame,
+    roughness_m,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -67,3 +73,60 @@ def test_a_rough_table_does_not_stand_on_its_own_underside() -> None:
     p = np.concatenate([sheet(rng, 0.0, 0.4, 9000), below])
     plane = find_support(p, np.tile(UP, (len(p), 1)), SupportConfig())
     assert abs(plane.offset_m) < 0.003
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    """A frame whose z lies along the view of a camera, as that of a foreign scan."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    T = np.eye(4)
+    T[:3, :3] = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ np.array(
+        [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    )
+    return T
+
+
+def room(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """A table, twice as much wall, and cameras that look down at it."""
+    wall = np.column_stack([rng.normal(0.5, 0.001, 6000), rng.uniform(-1, 1, (6000, 2))])
+    p = np.concatenate([sheet(rng, 0.0, 0.4, 3000), wall])
+    normals = np.concatenate([np.tile(UP, (3000, 1)), np.tile([-1.0, 0.0, 0.0], (6000, 1))])
+    down = np.array([[0, -0.5, 0.866], [-1, 0, 0], [0, -0.866, -0.5]])
+    T = np.eye(4)
+    T[:3, :3] = down
+    T[:3, 3] = [-0.6, 0.0, 0.5]
+    return p, normals, [T]
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.3, -0.4])
+def test_up_is_found_in_a_frame_that_is_not_level(angle_rad: float) -> None:
+    p, normals, Ts = room(np.random.default_rng(6))
+    R = turned(angle_rad)[:3, :3]
+    moved = [turned(angle_rad) @ T for T in Ts]
+    T_level = level_frame(p @ R.T, normals @ R.T, moved, SupportConfig())
+    np.testing.assert_allclose(T_level[:3, :3] @ R @ UP, UP, atol=0.01)
+    np.testing.assert_allclose(T_level[:3, :3] @ T_level[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T_level[:3, :3]) == pytest.approx(1.0)
+
+
+def test_a_level_frame_stays_as_it_is() -> None:
+    p, normals, Ts = room(np.random.default_rng(7))
+    assert np.array_equal(level_frame(p, normals, Ts, SupportConfig()), np.eye(4))
+    assert np.array_equal(level_frame(p, normals, [], SupportConfig()), np.eye(4))
+
+
+def test_the_top_of_a_thing_and_a_ceiling_are_no_support() -> None:
+    rng = np.random.default_rng(8)
+    small = sheet(rng, 0.0, 0.1, 3000)
+    with pytest.raises(NoSupportError):
+        find_support(small, np.tile(UP, (3000, 1)), SupportConfig())
+    with pytest.raises(NoSupportError):
+        find_support(sheet(rng, 1.0, 0.5, 3000), np.tile(-UP, (3000, 1)), SupportConfig())
+
+
+def test_roughness_is_the_noise_of_the_plane() -> None:
+    rng = np.random.default_rng(9)
+    p = sheet(rng, 0.0, 0.4, 9000)
+    p[:, 2] += rng.normal(0, 0.004, len(p))
+    normals = np.tile(UP, (len(p), 1))
+    plane = find_support(p, normals, SupportConfig())
+    assert roughness_m(p, normals, plane, SupportConfig()) == pytest.approx(0.0041, rel=0.1)

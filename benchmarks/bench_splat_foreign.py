@@ -1,0 +1,179 @@
+"""Objects found in scenes that no task describes, against what a person sees there.
+
+The real shelf with its supplied masks, and the real kitchen with the list
+``semantics/kitchen_objects.json``, which was made by eye and committed before the search was run on
+it; what counts as found or false is in ``semantics/seen_objects.py``. Both are rebuilt by the
+command's own code, for a number of images. A scene's name as an argument measures that one only and
+stores nothing; with ``--keep FOLDER`` the rebuilt runs stay there and are used again.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from measure import ROOT, Target, print_targets, report_targets
+
+sys.path.insert(0, str(ROOT / "benchmarks" / "semantics"))
+
+import shelf
+from seen_objects import Judged, SeenObject, judge, read_list
+from splat.kitchen import kitchen_folder
+from splat.scans import QUIET, shelf_folder, shelf_scan
+
+from bridge.episode.run_folder import RunFolder
+from bridge.sources.folder.messages import read_index
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.rebuild.run import rebuild
+from twin.scene.semantics.lift import Viewpoint, render_labels
+from twin.scene.semantics.result import SemanticScene
+from twin.scene.semantics.store import BACKGROUND_KEY, read_semantics
+from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
+from twin.scene.store.folder import read_scene
+
+IMAGES = 100
+MIN_FOUND, MAX_FALSE = 0.7, 0.3
+FRAMES = {
+    "kitchen": FrameConfig(train_every=5, holdout_every=5, holdout_offset=2, max_holdout_frames=4),
+    "shelf": FrameConfig(),
+}
+LIST = ROOT / "benchmarks" / "semantics" / "kitchen_objects.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What a person marked in a scene, and the frames it was marked in."""
+
+    objects: list[SeenObject]
+    views: Mapping[int, Viewpoint]
+
+
+def kitchen_truth(folder: Path) -> Truth:
+    """The list, and the colour cameras of its frames."""
+    objects, index = read_list(LIST), read_index(folder)
+    wanted = {frame for item in objects for frame in item.boxes}
+    views = {}
+    for frame in index.frames:
+        number = int(frame.color_path.name.split(".")[0].split("-")[1])
+        if number in wanted:
+            T = frame.T_world_depth @ index.T_depth_color
+            camera = index.color_camera or index.depth_camera
+            views[number] = Viewpoint(camera=camera, T_base_camera=T)
+    return Truth(objects=objects, views=views)
+
+
+def shelf_truth(_folder: Path) -> Truth:
+    """The supplied masks of all frames."""
+    shots = shelf.load_shots()
+    numbers = sorted({int(n) for shot in shots for n in np.unique(shot.ids)} - {0})
+    return Truth(
+        objects=[
+            SeenObject(
+                name=f"object {number}",
+                group="asked",
+                masks={key: shot.ids == number for key, shot in enumerate(shots)},
+            )
+            for number in numbers
+        ],
+        views={key: shot.viewpoint for key, shot in enumerate(shots)},
+    )
+
+
+TRUTHS = {"kitchen": kitchen_truth, "shelf": shelf_truth}
+
+
+def rebuilt(name: str, source: Path, folder: Path) -> tuple[RunFolder, SemanticScene, float]:
+    """Import and rebuild; the things found, and the CPU seconds of all of it."""
+    began = time.process_time()
+    run = RunFolder.open(folder) if folder.is_dir() else shelf_scan(source, folder)
+    config = RebuildConfig(frames=FRAMES[name], fit=FitConfig(iterations=IMAGES, threads=1))
+    record = rebuild(run, config, QUIET)
+    rows = {BACKGROUND_KEY: record["background"]["num_splats"]}
+    return run, read_semantics(run.scene_dir, rows), time.process_time() - began
+
+
+def judged(run: RunFolder, scene: SemanticScene, truth: Truth) -> Judged:
+    """Draw the things into the frames that a person marked, and compare."""
+    cloud, rasteriser = read_scene(run).background, Rasteriser(RasterConfig(threads=1))
+    labels = {
+        key: render_labels(rasteriser, cloud, scene.labels, view).astype(np.int64)
+        for key, view in truth.views.items()
+    }
+    return judge(truth.objects, labels, [item.id for item in scene.instances])
+
+
+def rows_of(name: str, source: Path, folder: Path) -> list[Target]:
+    """Found and false per object, and one printed line for each object and each false thing."""
+    run, scene, seconds = rebuilt(name, source, folder)
+    truth = TRUTHS[name](source)
+    result = judged(run, scene, truth)
+    names = {item.id: item.name for item in scene.instances}
+    print(f"{name}: {scene.remark or f'{len(names)} things'}; {seconds:.1f} CPU seconds")
+    for item in truth.objects:
+        as_what = names[result.found[item.name][0]] if item.name in result.found else "-"
+        print(f"  {item.group:<8} {item.name:<32} {result.best[item.name]:.2f}  {as_what}")
+    for number in result.false:
+        print(f"  false    {names[number]}")
+    asked = [item.name for item in truth.objects if item.group == "asked"]
+    found = [key for key in asked if key in result.found]
+    missed = ", ".join(key for key in asked if key not in result.found) or "none"
+    others = [item.name for item in truth.objects if item.group == "beyond"]
+    beyond = sum(key in result.found for key in others)
+    rows = [
+        Target(
+            what=f"{name}: objects found",
+            measured=len(found) / len(asked),
+            limit=MIN_FOUND,
+            at_most=False,
+            reference=f"{len(found)} of {len(asked)}, missed: {missed}",
+        ),
+        Target(
+            what=f"{name}: false things for each object",
+            measured=len(result.false) / len(asked),
+            limit=MAX_FALSE,
+            reference=f"{len(result.false)}: {'; '.join(names[k] for k in result.false) or 'none'}",
+        ),
+    ]
+    if others:
+        row = Target(
+            what=f"{name}: objects found, those beyond 2 m included",
+            measured=(len(found) + beyond) / (len(asked) + len(others)),
+            limit=MIN_FOUND,
+            at_most=False,
+            reference=f"{beyond} of the {len(others)} beyond",
+        )
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    """Both scenes, or the one that is named."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", nargs="?", choices=[*TRUTHS], help="default: both")
+    parser.add_argument("--keep", type=Path, help="where the rebuilt runs stay")
+    given = parser.parse_args()
+    rows: list[Target] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, source in (("shelf", shelf_folder()), ("kitchen", kitchen_folder())):
+            if given.scene and name != given.scene:
+                continue
+            if source is None:
+                print(f"splat_foreign: no {name} here (GST_SHARED_DATA); its rows are left out")
+                continue
+            rows += rows_of(name, source, (given.keep or Path(scratch)) / name)
+    if given.scene:
+        print_targets(rows)
+    else:
+        report_targets("splat_foreign", rows, note=f"{IMAGES} training images, no task")
+
+
+if __name__ == "__main__":
+    main()

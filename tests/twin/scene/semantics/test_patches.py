@@ -1,0 +1,88 @@
+"""What touches a wall is found without a table, and patches obey the laws of a partition."""
+
+import numpy as np
+import pytest
+
+from twin.scene.semantics.cluster import SurfacePoints
+from twin.scene.semantics.patches import PatchConfig, cut_into_patches
+from twin.scene.semantics.segment import SegmentConfig, segment_points
+
+WOOD, RED, BLUE = (0.55, 0.42, 0.30), (0.8, 0.1, 0.1), (0.1, 0.25, 0.75)
+SPACING_M = 0.004
+
+
+def face(
+    corner: list[float], along: list[float], across: list[float], color: tuple[float, float, float]
+) -> SurfacePoints:
+    """A rectangle sampled on a grid; it faces ``along x across``."""
+    a, b = np.array(along), np.array(across)
+    steps = [np.arange(0, np.linalg.norm(v), SPACING_M) / np.linalg.norm(v) for v in (a, b)]
+    s, t = (grid.reshape(-1, 1) for grid in np.meshgrid(*steps))
+    normal = np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+    p = np.array(corner) + s * a + t * b
+    return SurfacePoints(
+        p_m=p, normals=np.tile(normal, (len(p), 1)), colors=np.tile(color, (len(p), 1))
+    )
+
+
+def together(*parts: SurfacePoints) -> SurfacePoints:
+    """All of them, with half a millimetre of noise."""
+    rng = np.random.default_rng(0)
+    p = np.concatenate([part.p_m for part in parts])
+    return SurfacePoints(
+        p_m=p + rng.normal(0, 0.0005, p.shape),
+        normals=np.concatenate([part.normals for part in parts]),
+        colors=np.concatenate([part.colors for part in parts]),
+    )
+
+
+WALL = face([0, -0.3, 0], [0, 0.6, 0], [0, 0, 0.5], WOOD)
+"""At x = 0, seen from +x."""
+PARCEL = [
+    face([0.1, -0.2, 0.1], [0, 0.12, 0], [0, 0, 0.14], RED),
+    face([0, -0.2, 0.24], [0.1, 0, 0], [0, 0.12, 0], RED),
+    face([0, -0.08, 0.1], [0, 0, 0.14], [0.1, 0, 0], RED),
+    face([0, -0.2, 0.1], [0.1, 0, 0], [0, 0, 0.14], RED),
+]
+"""A box whose back is against the wall."""
+POSTER = face([0.0015, 0.05, 0.15], [0, 0.2, 0], [0, 0, 0.15], BLUE)
+
+
+def share(labels: np.ndarray, mine: np.ndarray) -> float:
+    """IoU of the best label."""
+    best = [((labels == k) & mine).sum() / ((labels == k) | mine).sum() for k in np.unique(labels)]
+    return float(max(best[1:], default=0.0))
+
+
+def test_a_box_against_a_wall_is_a_thing_and_a_poster_on_it_is_none() -> None:
+    wall = WALL.take(
+        ~((np.abs(WALL.p_m[:, 1] + 0.14) < 0.06) & (np.abs(WALL.p_m[:, 2] - 0.17) < 0.07))
+    )
+    points = together(wall, *PARCEL, POSTER)
+    is_parcel = np.zeros(len(points), dtype=bool)
+    is_parcel[len(wall) : len(points) - len(POSTER)] = True
+    labels = cut_into_patches(points, SPACING_M, PatchConfig())
+    assert labels.max() == 1
+    assert share(labels, is_parcel) > 0.85
+    found = segment_points(points, SegmentConfig())
+    assert found.plane is None
+    assert [thing.label.split()[0] for thing in found.things] == ["red"]
+
+
+def test_a_box_of_the_colour_of_the_wall_is_part_of_it() -> None:
+    painted = [
+        SurfacePoints(p_m=f.p_m, normals=f.normals, colors=np.tile(WOOD, (len(f), 1)))
+        for f in PARCEL
+    ]
+    assert not cut_into_patches(together(WALL, *painted), SPACING_M, PatchConfig()).any()
+
+
+@pytest.mark.parametrize("num", [0, 1, 30])
+def test_next_to_nothing_holds_no_thing(num: int) -> None:
+    labels = cut_into_patches(WALL.take(np.arange(num)), SPACING_M, PatchConfig())
+    assert labels.shape == (num,)
+    assert not labels.any()
+
+
+def test_points_too_sparse_for_a_surface_hold_no_thing() -> None:
+    assert not cut_into_patches(together(WALL, *PARCEL), 0.05, PatchConfig()).any()

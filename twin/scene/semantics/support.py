@@ -1,0 +1,275 @@
+"""What things stand on, and which way is up.
+
+The support plane is nearly level, found by RANSAC and refined by least squares. In a robot cell z
+points up. The frame of a foreign scan may be that of its first camera: there up is the direction
+that most surfaces face which the cameras saw from above.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from twin.scene.semantics.result import SemanticsError
+
+UP = np.array([0.0, 0.0, 1.0])
+"""Against gravity in the root frame of a robot cell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupportConfig:
+    """What counts as the supporting plane."""
+
+    max_tilt_rad: float = 0.14
+    """From level: poses may be wrong by a few degrees, a ramp is no table."""
+    tolerance_m: float = 0.006
+    """Points this near belong to the plane."""
+    num_trials: int = 500
+    """Triples of points to try."""
+    max_points: int = 6000
+    """Points that vote; more are thinned out evenly."""
+    min_points: int = 100
+    """A plane with fewer points carries nothing."""
+    min_area_m2: float = 0.06
+    """Neither does a smaller one: it is the top of a thing."""
+    num_candidates: int = 3
+    """Planes among which the one that carries most is chosen (table and floor)."""
+    separation_m: float = 0.04
+    """Level planes nearer than this are one surface that is not quite flat."""
+    cell_m: float = 0.02
+    """Size of the cells that say where the plane extends."""
+    seed: int = 0
+    """Of the random triples."""
+
+
+class NoSupportError(SemanticsError):
+    """No level plane was found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupportPlane:
+    """Points p of the plane fulfil ``normal . p = offset_m``."""
+
+    normal: Float[np.ndarray, "3"]
+    """Unit vector, upwards."""
+    offset_m: float
+    num_points: int
+    """Points that voted for it."""
+    footprint: Bool[np.ndarray, "num_x num_y"]
+    """Where it extends, seen along z: cells with support and the holes between them."""
+    corner_m: tuple[float, float]
+    """Lower x and y of the first cell."""
+    cell_m: float
+
+    @property
+    def area_m2(self) -> float:
+        """Of the footprint, seen along z."""
+        return float(self.footprint.sum()) * self.cell_m**2
+
+    def height_m(self, p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
+        """Distance above the plane; negative below [m]."""
+        return np.asarray(p_m @ self.normal - self.offset_m)
+
+    def under(self, p_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        """Say which points lie above or below where the plane extends."""
+        cells = np.floor((p_m[:, :2] - self.corner_m) / self.cell_m).astype(np.int64)
+        inside = np.all((cells >= 0) & (cells < self.footprint.shape), axis=1)
+        cells[~inside] = 0
+        return np.asarray(inside & self.footprint[cells[:, 0], cells[:, 1]])
+
+
+def find_support(
+    p_m: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    config: SupportConfig,
+) -> SupportPlane:
+    """Find the level plane that carries most of what is near it.
+
+    Fischler and Bolles 1981 on the points that face upwards, with the tilt bounded. Of the
+    largest few planes the one with most points on it and just above it wins: a floor may be
+    larger than the table, but less stands on the part of it that is seen.
+
+    Args:
+        p_m: Points of the scene, z up.
+        normals: Unit vectors at the points.
+        config: Tolerances, and how many planes are compared.
+
+    Raises:
+        NoSupportError: When no level plane has enough points.
+    """
+    upright = normals @ UP > np.cos(3 * config.max_tilt_rad)
+    left = p_m[upright]
+    planes: list[tuple[int, SupportPlane]] = []
+    for _ in range(config.num_candidates):
+        found = _largest_plane(left, config)
+        if found is None:
+            break
+        plane = found
+        left = left[np.abs(plane.height_m(left)) > config.separation_m]
+        if plane.area_m2 < config.min_area_m2:
+            continue
+        height = plane.height_m(p_m)
+        carried = (height > 2 * config.tolerance_m) & (height < 0.3)
+        carried[carried] = plane.under(p_m[carried])
+        planes.append((plane.num_points + int(carried.sum()), plane))
+    if not planes:
+        raise NoSupportError(no_support(p_m, normals, config))
+    return max(planes, key=lambda item: item[0])[1]
+
+
+def no_support(p_m: np.ndarray, normals: np.ndarray, config: SupportConfig) -> str:
+    """What to tell somebody whose scene has no level plane, nor anything that stands out."""
+    upright = normals @ UP > np.cos(3 * config.max_tilt_rad)
+    return (
+        f"no level plane among {len(p_m)} points, {int(upright.sum())} of them facing up, and "
+        "nothing that stands out. The default segmenter needs a table in view, or things before a "
+        "wall."
+    )
+
+
+def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
+    if len(p_m) < config.min_points:
+        return None
+    rng = np.random.default_rng(config.seed)
+    some = p_m[:: max(1, len(p_m) // config.max_points)]
+    triples = some[rng.integers(0, len(some), (config.num_trials, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals /= np.maximum(length, 1e-12)[:, None]
+    normals *= np.sign(normals[:, 2:] + 1e-12)
+    level = (length > 1e-9) & (normals @ UP > np.cos(config.max_tilt_rad))
+    # The exactly level plane through one point is always among the trials.
+    normals[~level] = UP
+    offsets = (normals * triples[:, 0]).sum(axis=1)
+    votes = (np.abs(normals @ some.T - offsets[:, None]) < config.tolerance_m).sum(axis=1)
+    best = int(np.argmax(votes))
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        inside = np.abs(p_m @ normal - offset) < config.tolerance_m
+        if inside.sum() < config.min_points:
+            return None
+        normal, offset = _refined(p_m[inside], config)
+    inside = np.abs(p_m @ normal - offset) < config.tolerance_m
+    if inside.sum() < config.min_points:
+        return None
+    footprint, corner = _footprint(p_m[inside], config.cell_m)
+    return SupportPlane(
+        normal=normal,
+        offset_m=offset,
+        num_points=int(inside.sum()),
+        footprint=footprint,
+        corner_m=corner,
+        cell_m=config.cell_m,
+    )
+
+
+def _refined(p_m: np.ndarray, config: SupportConfig) -> tuple[np.ndarray, float]:
+    """Least squares for z over x and y, the tilt bounded."""
+    centre = p_m.mean(axis=0)
+    away = p_m - centre
+    scatter = away[:, :2].T @ away[:, :2] + 1e-9 * len(p_m) * np.eye(2)
+    slope = np.linalg.solve(scatter, away[:, :2].T @ away[:, 2])
+    steepness = float(np.linalg.norm(slope))
+    slope *= min(1.0, np.tan(config.max_tilt_rad) / max(steepness, 1e-12))
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    normal /= np.linalg.norm(normal)
+    return normal, float(normal @ centre)
+
+
+def _footprint(p_m: np.ndarray, cell_m: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """Cells with points, small gaps closed, and the holes where things stand."""
+    cells = np.floor(p_m[:, :2] / cell_m).astype(np.int64)
+    low = cells.min(axis=0) - 3
+    grid = np.zeros(cells.max(axis=0) - low + 4, dtype=bool)
+    grid[tuple((cells - low).T)] = True
+    closed = ndimage.binary_closing(grid, iterations=3)
+    filled = np.asarray(ndimage.binary_fill_holes(closed | grid))
+    return filled, (float(low[0] * cell_m), float(low[1] * cell_m))
+
+
+MIN_SHARE_OF_BEST = 0.3
+"""z is up where at least this share of the points that face the best direction face z."""
+FACING_RAD = 0.14
+"""Surfaces face a direction within this angle."""
+UPWARDS = 0.5
+"""Cosine between up and the mean of the cameras' upper edges: nobody scans upside down."""
+MAX_NORMALS, MAX_DIRECTIONS = 8000, 400
+REFINEMENTS = 2
+
+
+def level_frame(
+    p_m: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    Ts_base_camera: Sequence[Float[np.ndarray, "4 4"]],
+    config: SupportConfig,
+) -> Float[np.ndarray, "4 4"]:
+    """Turn the scene so that z points up: ``T_level_base``, exactly the identity where it does.
+
+    A direction counts by the points that face it. Up must lie within 60 degrees of what the
+    cameras on average have as their image's upper edge, which leaves walls out. Then the support
+    plane found along it says exactly where up is.
+
+    Args:
+        p_m: Points of the scene.
+        normals: Unit vectors at the points, towards whoever saw them.
+        Ts_base_camera: Where the cameras stood; none: z is up.
+        config: What counts as a support plane.
+    """
+    if not len(Ts_base_camera) or len(p_m) < config.min_points:
+        return np.eye(4)
+    camera_up = -np.mean([T[:3, 1] for T in Ts_base_camera], axis=0)
+    camera_up /= max(float(np.linalg.norm(camera_up)), 1e-9)
+    some = normals[:: max(1, len(normals) // MAX_NORMALS)]
+    directions = some[some @ camera_up > UPWARDS]
+    directions = directions[:: max(1, len(directions) // MAX_DIRECTIONS)]
+    if not len(directions):
+        return np.eye(4)
+    limit = np.cos(FACING_RAD)
+    facing = (directions @ some.T > limit).sum(axis=1)
+    if int((some @ UP > limit).sum()) >= MIN_SHARE_OF_BEST * int(facing.max()):
+        return np.eye(4)
+    up = directions[int(facing.argmax())]
+    up = _normalised(some[some @ up > limit].mean(axis=0))
+    for _ in range(REFINEMENTS):
+        T = _turned_up(up)
+        try:
+            plane = find_support(p_m @ T[:3, :3].T, normals @ T[:3, :3].T, config)
+        except NoSupportError:
+            break
+        up = T[:3, :3].T @ plane.normal
+    return _turned_up(up)
+
+
+def _normalised(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / max(float(np.linalg.norm(v)), 1e-12))
+
+
+def _turned_up(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """A rotation that carries ``up`` to z; x stays as near to the old x (or y) as it can."""
+    other = np.eye(3)[int(np.abs(up[0]) > np.abs(up[1]))]
+    x = _normalised(other - up * (other @ up))
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(up, x), up])
+    return T
+
+
+def roughness_m(
+    p_m: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    plane: SupportPlane,
+    config: SupportConfig,
+) -> float:
+    """Standard deviation of what belongs to the plane across it, by the median: noise and warp.
+
+    Args:
+        p_m: Points of the scene, z up.
+        normals: Unit vectors at the points.
+        plane: What things stand on.
+        config: How near counts as the plane: five tolerances, upright points only.
+    """
+    height = plane.height_m(p_m)
+    near = (np.abs(height) < 5 * config.tolerance_m) & (normals @ UP > np.cos(FACING_RAD))
+    near[near] = plane.under(p_m[near])
+    return 1.4826 * float(np.median(np.abs(height[near]))) if near.any() else 0.0
