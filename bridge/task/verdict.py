@@ -68,6 +68,9 @@ class Verdict:
     """What became of each grasp in the simulation: object, touched and held (yes or no), and
     p_object_m, where the tool was in the object's frame when a finger first touched it; a planner
     steers by them."""
+    nearest: Mapping[str, Any] | None = None
+    """Where the smallest clearance was, of the pairs that may not touch: t_ns, distance_m, bodies,
+    and p_m, the nearest point of each in the base frame. None where nothing was measured."""
 
     def factors(self) -> dict[str, Factor]:
         """All factors by name, in the order in which a plan is examined."""
@@ -95,6 +98,8 @@ class Verdict:
         record = json.loads(json.dumps(record))
         if not record["grasps"]:
             del record["grasps"]
+        if record["nearest"] is None:
+            del record["nearest"]
         check_record(record, name="verdict")
         return json.dumps(record, separators=(",", ":")).encode()
 

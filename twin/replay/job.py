@@ -58,7 +58,7 @@ from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
-REPLAY_VERSION = 22
+REPLAY_VERSION = 23
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 START_KNOWN_NS = 1_000_000_000

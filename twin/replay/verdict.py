@@ -253,6 +253,19 @@ class Commanded:
     """Of the checks beside I(tau)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Moved:
+    """How everything moved, and how much of that was computed."""
+
+    states: States
+    clearance_m: Float[np.ndarray, " num_steps"]
+    monitor: ClearanceMonitor
+    """What it saw, in those states or before them."""
+    by_physics: bool
+    measured: bool
+    """Whether clearances are of the whole motion, not of its first state alone."""
+
+
 def _replay(
     commanded: Commanded,
     plan: Plan,
@@ -261,35 +274,14 @@ def _replay(
     *,
     refuse_early: bool = False,
 ) -> ReplayResult:
-    path, checks = commanded.path, commanded.checks
-    unreachable_ns = commanded.unreachable_ns
     robot = load_robot(scene.urdf)
-    hulls = hulls_of(robot)
-    failures = commanded.failures + check_path(path, robot, hulls, config)
+    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot), config)
+    commanded = replace(commanded, failures=failures)
     plan = limited_to_task(plan, scene.task)
-    dynamic = config.mode == "dynamic"
-    if dynamic:
+    if config.mode == "dynamic":
         scene = free_start(scene, soft_models(scene), config.start_overlap_m)
-    monitor = ClearanceMonitor(scene, plan, hulls, config)
-    _pre_grasp(monitor, path, config)
-    states, physics, measured = None, dynamic, True
-    if dynamic and refuse_early:
-        measured = not (failures or monitor.failures or any(checks.values()))
-        states = follow(path, scene, config)
-        ahead = ClearanceMonitor(scene, plan, hulls, config)
-        if measured:
-            _clearance_m(ahead, states, [])
-        physics = measured and not ahead.failures
-    if physics:
-        states = simulate(path, scene, hulls, config)
-    elif states is None:
-        states = follow(path, scene, config)
-    if not measured:
-        states = first_of(states)
-    clearance_m = _clearance_m(monitor, states, list(scene.movable()))
-    if physics and commanded.trajectory == "planned":
-        simulated = simulated_limit_failures(path, states, robot)
-        checks = {**checks, "limits": checks["limits"] + simulated}
+    moved = _move(commanded, plan, scene, config, refuse_early=refuse_early)
+    states = moved.states
     result = ReplayResult(
         verdict=_undecided(plan, commanded.trajectory, config, scene),
         stamps_ns=states.stamps_ns,
@@ -298,38 +290,93 @@ def _replay(
         Ts_base_tcp=robot.Ts_base_tcp(states.joints_rad),
         Ts_base_object=states.Ts_base_object,
         finger_contact=states.finger_contact,
-        clearance_m=clearance_m,
-        contacts=monitor.contacts(),
+        clearance_m=moved.clearance_m,
+        contacts=moved.monitor.contacts(),
         nodes_m=states.nodes_m,
         extents_m=states.extents_m,
         broken=states.broken,
     )
-    # What was executed is judged by where things end: it is known whether they were dropped.
-    slipped: list[Failure] = []
-    planned = physics and commanded.trajectory == "planned"
-    if planned and config.max_slip_m is not None:
-        slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
-    terminal = terminal_factor(
-        result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+    verdict = _judge(result, commanded, moved, plan, scene, config)
+    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
+
+
+def _move(
+    commanded: Commanded,
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+    *,
+    refuse_early: bool,
+) -> Moved:
+    """Follow the path, with physics unless it is refused before."""
+    path, hulls = commanded.path, hulls_of(load_robot(scene.urdf))
+    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    _pre_grasp(monitor, path, config)
+    dynamic = config.mode == "dynamic"
+    states, by_physics, measured = None, dynamic, True
+    if dynamic and refuse_early:
+        found = commanded.failures or monitor.failures or any(commanded.checks.values())
+        measured = not found
+        states = follow(path, scene, config)
+        ahead = ClearanceMonitor(scene, plan, hulls, config)
+        if measured:
+            _clearance_m(ahead, states, [])
+        by_physics = measured and not ahead.failures
+    if by_physics:
+        states = simulate(path, scene, hulls, config)
+    elif states is None:
+        states = follow(path, scene, config)
+    if not measured:
+        states = first_of(states)
+    return Moved(
+        states=states,
+        clearance_m=_clearance_m(monitor, states, list(scene.movable())),
+        monitor=monitor,
+        by_physics=by_physics,
+        measured=measured,
     )
-    if dynamic and not physics:
+
+
+def _judge(
+    result: ReplayResult,
+    commanded: Commanded,
+    moved: Moved,
+    plan: Plan,
+    scene: ReplayScene,
+    config: ReplayConfig,
+) -> Verdict:
+    """Every factor and check, and what is worth knowing beside them."""
+    path, checks, states = commanded.path, commanded.checks, moved.states
+    # What was executed is judged by where things end: it is known whether they were dropped.
+    planned = moved.by_physics and commanded.trajectory == "planned"
+    slipped: list[Failure] = []
+    if planned:
+        simulated = simulated_limit_failures(path, states, load_robot(scene.urdf))
+        checks = {**checks, "limits": checks["limits"] + simulated}
+        if config.max_slip_m is not None:
+            slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
+    unreachable_ns = commanded.unreachable_ns
+    if moved.by_physics or config.mode == "kinematic":
+        terminal = terminal_factor(
+            result, scene, config, unreachable_ns=unreachable_ns, burst=states.burst
+        )
+    else:
         terminal = Factor(value=None, detail=REFUSED_BEFORE)
-    verdict = replace(
+    undecided = (
+        _clearance_undecided(scene, unreachable_ns, states) if moved.measured else REFUSED_BEFORE
+    )
+    findings = findings_of(scene.task, result.rollout(), "replayed") if moved.by_physics else ()
+    return replace(
         result.verdict,
-        ik=factor_from(failures),
-        clearance=factor_from(
-            monitor.failures,
-            undecided=_clearance_undecided(scene, unreachable_ns, states)
-            if measured
-            else REFUSED_BEFORE,
-        ),
+        ik=factor_from(commanded.failures),
+        clearance=factor_from(moved.monitor.failures, undecided=undecided),
         terminal=unless_slipped(terminal, slipped),
         warnings=warnings_of(scene, result),
-        findings=tuple(findings_of(scene.task, result.rollout(), "replayed")) if physics else (),
+        findings=tuple(findings),
         checks={name: factor_from(found) for name, found in checks.items()},
         grasps=grasps_seen(plan, path, result) if planned else (),
+        nearest=moved.monitor.nearest() if moved.measured else None,
     )
-    return replace(result, verdict=replace(verdict, reason=reason_of(verdict)))
 
 
 def _clearance_m(

@@ -34,9 +34,10 @@ SEEN_NS = 5_000_000_000
 def verdict(plan: Plan, accepted: bool) -> Verdict:
     yes = Factor(value=True)
     terminal = Factor(value=accepted, cause=None if accepted else "inside", bodies=("cube", "box"))
+    nearest = {"t_ns": 0, "distance_m": 0.1, "bodies": ["gripper", "box"], "p_m": [[0.0] * 3] * 2}
     return Verdict(
         plan_id=plan.id, trajectory="planned", mode="dynamic", engine="test", seed=0,
-        ik=yes, clearance=yes, terminal=terminal,
+        ik=yes, clearance=yes, terminal=terminal, nearest=nearest,
     )  # fmt: skip
 
 

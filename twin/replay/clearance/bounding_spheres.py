@@ -137,9 +137,7 @@ def bounding_spheres_of(
         corners_m: Corners of the piece, in the frame the spheres are wanted in.
         fine_m: No part of the hull's surface lies farther than this from one of the finest points.
     """
-    hull = ConvexHull(corners_m)
-    # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
-    levels = [_divided(corners_m[hull.simplices], fine_m * np.sqrt(3.0))]
+    levels = [surface_points(corners_m, fine_m)]
     parents: list[Int[np.ndarray, " num_points"]] = []
     for radius in reversed(PATCHES_M):
         chosen = levels[0][_spread(levels[0], radius)]
@@ -166,6 +164,19 @@ def bounding_spheres_of(
         num_roots=len(levels[0]),
         cover_m=fine_m,
     )
+
+
+def surface_points(
+    corners_m: Float[np.ndarray, "num_corners 3"], fine_m: float = FINE_M
+) -> Float[np.ndarray, "num_points 3"]:
+    """Points on the surface of a convex hull, so close that nothing of it is far from all of them.
+
+    Args:
+        corners_m: Corners of the piece; the points are in the same frame.
+        fine_m: No part of the surface lies farther than this from one of the points.
+    """
+    # A triangle with edges of at most e leaves nothing farther from its corners than e / sqrt(3).
+    return _divided(corners_m[ConvexHull(corners_m).simplices], fine_m * np.sqrt(3.0))
 
 
 def _radii(

@@ -175,6 +175,8 @@ happen before the next state is bounded: steps of up to twice as far need no sta
 _FINE_TRAVEL_M = 0.001
 """Motion between two states that is not looked into further: half of it is what may be missed."""
 _MAX_HALVINGS = 10
+_DIGITS = 6
+"""Of the points that a verdict keeps [m]."""
 
 
 Allowed = frozenset[frozenset[str]]
@@ -215,6 +217,7 @@ class ClearanceMonitor:
         self._contacts: dict[tuple[str, str, bool], list[Contact]] = {}
         self._last: _Look | None = None
         self._last_ns = 0
+        self._nearest: tuple[float, Pair, State] | None = None
         self._first_centre: dict[str, Float[np.ndarray, " 3"]] = {}
 
     def measure(
@@ -318,12 +321,15 @@ class ClearanceMonitor:
         """Note every pair of a state that is too close; return its delta."""
         t_ns = look.state.t_ns
         ordered = sorted(look.distances.items(), key=lambda item: item[1])
-        judged = [
-            self._judge(t_ns, pair[0], pair[2], distance, look.allowed)
-            for pair, distance in ordered
-        ]
+        least_m = float("inf")
+        for pair, distance in ordered:
+            counted_m = self._judge(t_ns, pair[0], pair[2], distance, look.allowed)
+            if counted_m < least_m:
+                least_m = counted_m
+                if self._nearest is None or counted_m < self._nearest[0]:
+                    self._nearest = (counted_m, pair, look.state)
         self._last_ns = t_ns
-        return min(judged, default=float("inf"))
+        return least_m
 
     def check_pre_grasp(
         self, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], width_m: float
@@ -365,6 +371,23 @@ class ClearanceMonitor:
         """Stretches of time in which two bodies were closer than the margin."""
         collected = [contact for stretch in self._contacts.values() for contact in stretch]
         return sorted(collected, key=lambda contact: (contact.start_ns, contact.bodies))
+
+    def nearest(self) -> dict[str, Any] | None:
+        """Return where the smallest clearance so far was, as a verdict keeps it; None: nowhere.
+
+        ``t_ns``, ``distance_m``, ``bodies`` and ``p_m``, the nearest point of each, base frame.
+        """
+        if self._nearest is None:
+            return None
+        distance_m, pair, state = self._nearest
+        self.hulls.place(state.joints_rad, state.width_m)
+        points = self._around.closest_points(pair, state.Ts_base_object, state.nodes_m)
+        return {
+            "t_ns": state.t_ns,
+            "distance_m": distance_m,
+            "bodies": [pair[0], pair[2]],
+            "p_m": [[round(float(x), _DIGITS) for x in point] for point in points],
+        }
 
     def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
         start = self._scene.Ts_base_object[name]
