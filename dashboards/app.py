@@ -166,7 +166,8 @@ class Pages:
             library: The runs that are shown.
             live: Where the recorder is.
             door: Lets phones in at the operator's console, where it is open.
-            looks_beside: Whether runs in the same folder may be compared with them.
+            looks_beside: Whether runs in the same folder may be compared with them, and images
+                outside of a run be shown.
         """
         self._live, self._door = live, door
         self._console: ConsolePages | None = None
@@ -179,6 +180,7 @@ class Pages:
             lambda run: library.others(run, beside=looks_beside),
             self._part,
             live,
+            looks_outside=looks_beside,
         )
 
     def _part(self, name: str, state: object) -> str:

@@ -122,6 +122,9 @@ def build_compare(
     }
     theirs = others.get(query.get("with", ""))
     kind, first, second = (query.get(name, "") for name in ("by", "a", "b"))
+    if not first and not second:  # an address that only says by what
+        offer = next((each for each in offered if each.kind == kind), None)
+        first, second = ("", "") if offer is None else (offer.first, offer.second)
     try:
         if theirs is not None:
             name = query["with"]

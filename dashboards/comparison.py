@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 WAITED_FOR = 3_000
 """Files of a run that a page waits for; a larger run is brought up to date behind the page."""
+RENDERS = "image."
+"""Begins the ids of numbers about folders of renders."""
 LOOKED_AT_S = 5.0
 """A larger run's files are looked at again after this; its folders at each page."""
 
@@ -56,6 +58,11 @@ class Judgement:
     def has_results(self) -> bool:
         """Whether the run was evaluated and its results can be read."""
         return self.index is not None and self.about["results_reason"] is None
+
+    @property
+    def has_methods(self) -> bool:
+        """Whether renders of several methods were compared, which have a page of their own."""
+        return any(item.id.startswith(RENDERS) for item in self.measurements)
 
     @property
     def rows(self) -> tuple[IndexedTrial, ...]:

@@ -271,9 +271,6 @@ def ending_on_signals() -> Iterator[None]:
 def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     """Do the steps 1 to 4, as far as they have not been done, and say what there is then."""
     path = str(run.path)
-    fit = ["--iterations", str(config.iterations), "--budget", config.limit]
-    rebuild = ["rebuild", path, *fit]
-    label = f"3/6 rebuilding the scene ({config.iterations} images)"
     found = look(run, config)
     useless = found.unusable | found.void
     for episode, why in useless.items():
@@ -283,7 +280,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     if found.has_scan and not found.missing:
         output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
         if not _scene(run):
-            step(output, label, rebuild)
+            _rebuild(path, config, output)
         return found
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     logs = run.notes_dir / "logs"
@@ -300,7 +297,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
         if found.has_scan and _scene(run):
             output.say("3/6 the scene is rebuilt; it is kept and used")
         else:
-            step(output, label, rebuild, recorder)
+            _rebuild(path, config, output, recorder)
         if found.missing:
             _record_trials(run, config, endpoint, standin, found.missing, recorder, output)
     found = look(run, config)
@@ -313,6 +310,14 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
         message = f"{count} of {asked} trials have no outcome: {cause}. "
         raise DashboardError(f"{message}Start the demo again; it adds what is missing.")
     return found
+
+
+def _rebuild(path: str, config: DemoConfig, output: Output, *beside: Background) -> None:
+    cameras = ["calibrate", path, "--cameras"]
+    step(output, "3/6 finding where the cameras really are", cameras, *beside)
+    fit = ["--iterations", str(config.iterations), "--budget", config.limit]
+    label = f"3/6 rebuilding the scene ({config.iterations} images)"
+    step(output, label, ["rebuild", path, *fit], *beside)
 
 
 def _record_trials(

@@ -46,6 +46,13 @@ class VerdictView:
     counts: bool
     """False for a replay that was redone since, with other settings or in another scene, and for
     one in an engine that never counts."""
+    nearest: str
+    """Where the smallest clearance was, in words; empty where the verdict does not say."""
+
+    @property
+    def is_main(self) -> bool:
+        """Whether it is of the plan that was sent, and counts; the others are folded away."""
+        return self.of_sent_plan and self.counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +296,16 @@ def _view(
         file=source.path.name,
         of_sent_plan=sent_id is None or verdict.plan_id == sent_id,
         counts=counts,
+        nearest=_nearest_words(verdict),
     )
+
+
+def _nearest_words(verdict: Verdict) -> str:
+    found = verdict.nearest
+    if found is None:
+        return ""
+    one, other = found["bodies"]
+    return f"{found['distance_m'] * 1e3:.1f} mm: {one} – {other}"
 
 
 def _camera(

@@ -6,8 +6,10 @@ from glob import escape
 from pathlib import Path
 
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import UsageError
 from dashboards.errors import NotHereError
 
+RESULTS = "results.json"
 MOST_BESIDE = 500
 """Folders that are looked at for runs."""
 
@@ -20,10 +22,20 @@ class Library:
 
     @staticmethod
     def open(paths: Sequence[Path]) -> "Library":
-        """Open every run folder; folders of the same name get a number."""
+        """Open every run folder; folders of the same name get a number.
+
+        Raises:
+            UsageError: When a path is not a run folder, or holds results alone.
+        """
         runs: dict[str, RunFolder] = {}
         for path in paths:
             run = RunFolder.open(path)
+            if (path / RESULTS).is_file() and not run.results_dir.is_dir():
+                message = (
+                    f"{path} holds the results of an evaluation and no run. Give them a folder for "
+                    f"the pages: robot-gst evaluate ... --out {path}/results; then open {path}."
+                )
+                raise UsageError(message)
             base = path.resolve().name or "run"
             name, number = base, 2
             while name in runs:

@@ -371,6 +371,8 @@ class Overview:
     outdated: str | None
     """A message that the numbers are older than the run, naming the first that differs."""
     next_command: str | None
+    has_methods: bool
+    """Whether renders of methods were compared."""
     is_old: bool
     is_being_read: bool
 
@@ -443,6 +445,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         notices=_notices(judgement),
         outdated=_outdated(judgement),
         next_command=_next_command(run, judgement),
+        has_methods=judgement.has_methods,
         is_old=judgement.is_old,
         is_being_read=judgement.is_being_updated,
     )
@@ -547,6 +550,8 @@ def _outdated(judgement: Judgement) -> str | None:
         return None
     name = next(side.id for side in found if side is not None)
     was, now = (wording.headline(m) if m else "not measured" for m in found)
+    if was == now:  # they differ beyond the digits that are shown
+        was, now = (repr(m.value) if m else "not measured" for m in found)
     return (
         f"The numbers on this page are older than the run: {name} was {was} and is now {now}, "
         "computed from the present recordings, labels and replays."
@@ -559,6 +564,8 @@ def _next_command(run: RunFolder, judgement: Judgement) -> str | None:
         return f"robot-gst evaluate {path}"
     trials, recorded, replayed = judgement.index.totals()
     if not trials and next(run.episodes_dir.glob("*.mcap"), None) is None:
+        if judgement.has_methods:
+            return None
         return f"robot-gst record {path}"
     if recorded and not replayed:
         has_scene = (run.scene_dir / "scene.json").is_file() or any(run.derived_dir.glob("*.mcap"))

@@ -116,6 +116,12 @@ class RerunFile:
         )
         self.rows(entity, track.stamps_ns, columns)
 
+    def place(self, entity: str, T_base_entity: Float[np.ndarray, "4 4"]) -> None:
+        """Log where an entity stands at all times; nothing where that is the base itself."""
+        if not np.array_equal(T_base_entity, np.eye(4)):
+            placed = rr.Transform3D(translation=T_base_entity[:3, 3], mat3x3=T_base_entity[:3, :3])
+            self.always(entity, placed)
+
     def __enter__(self) -> "RerunFile":
         """Write inside the block."""
         return self

@@ -25,8 +25,9 @@ from bridge.task.plan import CandidateGrasp, Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording
-from dashboards.rerun_entities import log_object, log_robot
+from dashboards.rerun_entities import log_robot
 from dashboards.rerun_file import RerunFile
+from dashboards.rerun_objects import log_object
 from dashboards.wording import verdict_word
 
 NOT_IN_A_PATH = r"[^A-Za-z0-9_.-]"
@@ -57,6 +58,11 @@ class ShownPlan:
     def entity(self) -> str:
         """Everything of it is below."""
         return f"{ROOT}/{re.sub(NOT_IN_A_PATH, '_', self.plan.id)}"
+
+    @property
+    def tool_path(self) -> str:
+        """Its way."""
+        return f"{self.entity}/tool_path"
 
     @property
     def color(self) -> tuple[int, int, int]:
@@ -146,12 +152,17 @@ def log_plans(
             log_object(file, f"{each.entity}/predicted/{name}", track, task)
     if not shown:
         return False
-    last = next((each for each in shown[::-1] if each.start_ns != each.stamp_ns), shown[-1])
+    last = counted_plan(shown)
     joints, widths = _tracks(last)
     if joints is None:
         file.note(f"plan {last.plan.id} says nothing of the arm's joints")
         return False
     return log_robot(file, urdf, ARM, joints=joints, widths=widths)
+
+
+def counted_plan(shown: Sequence[ShownPlan]) -> ShownPlan:
+    """The last plan that was executed, else the last one."""
+    return next((each for each in shown[::-1] if each.start_ns != each.stamp_ns), shown[-1])
 
 
 def _log_way(file: RerunFile, shown: ShownPlan) -> None:
@@ -161,7 +172,7 @@ def _log_way(file: RerunFile, shown: ShownPlan) -> None:
     way = rr.LineStrips3D.columns(
         strips=[plan.positions_m()], radii=[PATH_RADIUS_M], colors=[shown.color]
     )
-    file.rows(f"{shown.entity}/tool_path", stamps, way)
+    file.rows(shown.tool_path, stamps, way)
     changes = [
         (one.p_m, "closes" if one.g else "opens")
         for before, one in zip(plan.tau, plan.tau[1:], strict=False)

@@ -1,13 +1,14 @@
 """One episode with its replays as a Rerun file (``.rrd``), on the recorded cell's source time.
 
 ``/recorded/...`` is the episode, ``/replayed/<planned|executed>/<dynamic|kinematic>/...`` what the
-twin made of it, ``/localised/...`` where it found the objects, ``/scene/background`` the rebuilt
-scene, ``/plans/<id>`` what a planner had in mind. Stand-in truth is never shown.
+twin made of it, ``/localised/...`` where it found the objects, and the hand carried them,
+``/scene/background`` the rebuilt scene, ``/plans/<id>`` what a planner had in mind. Stand-in truth
+is never shown.
 """
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,27 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import Task
 from bridge.task.verdict import Verdict
 from dashboards.recording import PageClock, Recording, read_recording
-from dashboards.rerun_entities import log_cameras, log_object, log_robot, log_splats
+from dashboards.rerun_entities import log_cameras, log_robot
 from dashboards.rerun_file import TIMELINE, RerunFile
-from dashboards.rerun_plan import ARM, NOT_IN_A_PATH, ROOT, ShownPlan, log_plans, shown_plans
+from dashboards.rerun_objects import (
+    SCENE,
+    ShownObjects,
+    begun_at,
+    gather_objects,
+    log_nearest,
+    log_recorded,
+    log_replayed,
+    log_splats,
+)
+from dashboards.rerun_plan import (
+    ARM,
+    NOT_IN_A_PATH,
+    ROOT,
+    ShownPlan,
+    counted_plan,
+    log_plans,
+    shown_plans,
+)
 from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
@@ -37,7 +56,8 @@ PLANS_EYE_M, PLANS_TARGET_M = (1.15, -0.45, 0.5), (0.42, 0.02, 0.14)
 """Nearer, for grasps are small."""
 GOOD, WARN = "INFO", "WARN"
 MIN_CLEARANCE = "clearance_m"
-PATH_RADIUS_M = 0.0025
+PATH_RADIUS_M, REPLAYED_RADIUS_M, OTHER_RADIUS_M = 0.0025, 0.0015, 0.0006
+"""Of ways of the tool; the plan's own is between the first two."""
 AXES_M = 0.05
 RECORDED_WIDTH, REPLAYED_WIDTH = 3.0, 1.5
 """Points; a replay stays visible on the recorded line."""
@@ -60,6 +80,9 @@ class Side:
     color: tuple[int, int, int]
     place_ns: Callable[[Int[np.ndarray, " num_stamps"]], Int[np.ndarray, " num_stamps"]]
     """Converts its stamps to the recorded cell's source time [ns]."""
+    counts: bool = True
+    """False for replays of plans that were sent back, and those that never count: their objects
+    are outlines from where they begin."""
 
     @property
     def name(self) -> str:
@@ -67,24 +90,53 @@ class Side:
         return self.prefix.removeprefix("replayed/").replace("/", " ")
 
     @property
+    def has_nearest(self) -> bool:
+        """Whether its smallest clearance is shown: of a replay that counts, with physics."""
+        derived = self.recording.derived
+        is_dynamic = derived is not None and derived.mode == "dynamic"
+        return self.counts and is_dynamic and bool(self.recording.verdicts)
+
+    @property
+    def path_radius_m(self) -> float:
+        """Of its tool's way: recorded, counting and other replays get thinner."""
+        if self.recording.derived is None:
+            return PATH_RADIUS_M
+        return REPLAYED_RADIUS_M if self.counts else OTHER_RADIUS_M
+
+    @property
     def width(self) -> float:
         """Width of its lines [points]."""
         return RECORDED_WIDTH if self.recording.derived is None else REPLAYED_WIDTH
 
 
-def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
+def log_side(
+    file: RerunFile,
+    side: Side,
+    task: Task | None,
+    shown: ShownObjects,
+    first_ns: int,
+) -> None:
     """Log everything of one recording that is a number over time, a pose or a line of text.
 
     Args:
         file: The Rerun file being written; it notes what could not be read.
         side: The recording or a replay, and where it goes.
         task: Knows the shapes of objects; None draws axes instead.
+        shown: What objects look like.
+        first_ns: From then on the objects of a replay that counts stand where it begins.
     """
     _log_series(file, side)
     _log_tool(file, side)
-    for name, track in side.recording.objects.items():
-        entity = f"{side.prefix}/objects/{name}"
-        log_object(file, entity, _placed(side, track), task)
+    tracks = {name: _placed(side, track) for name, track in side.recording.objects.items()}
+    if side.counts:
+        tracks = {name: begun_at(track, first_ns) for name, track in tracks.items()}
+    else:
+        shown = replace(shown, clouds={})
+    log_replayed(file, side.prefix, tracks, shown, task, color=side.color)
+    start_ns = side.recording.first_stamp_ns()
+    if side.has_nearest and start_ns is not None:
+        placed_ns = int(side.place_ns(np.array([start_ns]))[0])
+        log_nearest(file, side.prefix, side.recording.verdicts[-1][1], placed_ns)
     _log_events(file, side)
     for problem in side.recording.problems:
         file.note(f"{side.recording.path.name}: {problem}")
@@ -125,7 +177,7 @@ def _log_tool(file: RerunFile, side: Side) -> None:
     entity = f"{side.prefix}/tcp"
     file.poses(entity, track)
     file.rows(entity, track.stamps_ns[:1], rr.TransformAxes3D.columns(axis_length=[AXES_M]))
-    strip = rr.LineStrips3D([track.p_m], radii=[PATH_RADIUS_M], colors=[side.color])
+    strip = rr.LineStrips3D([track.p_m], radii=[side.path_radius_m], colors=[side.color])
     file.always(f"{side.prefix}/tcp_path", strip)
 
 
@@ -192,6 +244,8 @@ class Shown:
     clearance: bool
     stages: bool
     plans: bool
+    planned_path: str | None
+    """Entity of the way of the plan that counts."""
     plans_first: bool
     """Whether the view begins with them."""
 
@@ -235,6 +289,7 @@ def layout(shown: Shown) -> rrb.Blueprint:
 def _space(shown: Shown) -> rrb.Spatial3DView:
     """Show all poses; depth as points only where there are no splats, which show the same."""
     contents = ["+ /**", f"- /{ROOT}/**", f"- /{ARM}/**"]
+    contents += [] if shown.planned_path is None else [f"+ /{shown.planned_path}"]
     if shown.splats:
         contents += [
             f"- /{entity}/**" for entity in shown.camera_entities if entity.endswith("/depth")
@@ -317,9 +372,12 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
         splats = run is not None and log_splats(file, run.scene_dir)
         if run is None:
             file.note("no replays and no rebuilt scene: the episode is not in a run folder")
+        shown = gather_objects(file, run, recording)
+        if splats:
+            file.place(SCENE, shown.T_base_root)
         for side in sides:
-            log_side(file, side, task)
-        _localised(file, recording, task, run)
+            log_side(file, side, task, shown, clock.zero_ns)
+        log_recorded(file, shown, task)
         plans = shown_plans(file, recording, clock, run)
         log_plans(file, plans, task, urdf)
         outcome = _outcome(file, episode, run)
@@ -335,6 +393,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
                     clearance=any(side.recording.clearance is not None for side in sides),
                     stages=any(side.recording.events for side in sides),
                     plans=bool(plans),
+                    planned_path=counted_plan(plans).tool_path if plans else None,
                     plans_first=run is not None and episode_path.parent == run.plans_dir,
                 )
             )
@@ -400,7 +459,8 @@ def _replays(
         else:
             taken.add(prefix)
             color = _color(derived.trajectory)
-            yield Side(prefix=prefix, recording=replay, color=color, place_ns=place)
+            counts = prefix == f"replayed/{derived.trajectory}/{derived.mode}"
+            yield Side(prefix=prefix, recording=replay, color=color, place_ns=place, counts=counts)
 
 
 def _placer(
@@ -423,33 +483,6 @@ def _task(file: RerunFile, recording: Recording) -> Task | None:
     except GstError as error:
         file.note(f"objects are shown as axes, not boxes: {error}")
         return None
-
-
-def _localised(
-    file: RerunFile, recording: Recording, task: Task | None, run: RunFolder | None
-) -> None:
-    """Log where the twin found the objects, from the moment of localisation on."""
-    if run is None or recording.derived is not None:
-        return
-    paths = run.derived(f"{recording.info.id}.localised.*")
-    if not paths:
-        file.note("objects were not localised")
-        return
-    newest = max(paths, key=lambda path: path.stat().st_mtime_ns)
-    try:
-        records = streams.localisations(Episode.open(newest))
-    except GstError as error:
-        file.note(f"localised objects are not shown: {error}")
-        return
-    for record in records:
-        pose = record.get("T_base_object")
-        if not record["found"] or pose is None:
-            file.note(f"object {record['object']!r} was not found by the twin")
-            continue
-        track = PoseTrajectory(
-            np.array([record["stamp_ns"]]), np.array([pose["p_m"]]), np.array([pose["q_wxyz"]])
-        )
-        log_object(file, f"localised/{record['object']}", track, task)
 
 
 def _camera_entities(episode: Episode, prefix: str, cameras: list[str]) -> Iterator[str]:

@@ -176,7 +176,8 @@ def gather_scene(
     )
     postures = problems.attempt(lambda: posture_track(episode), None)
     robot = None if postures is None else problems.attempt(lambda: load_robot(postures.urdf), None)
-    tracks = problems.attempt(lambda: _localised(gathering, postures), ObjectTracks())
+    known = postures if robot is not None else None
+    tracks = problems.attempt(lambda: _localised(gathering, known), ObjectTracks())
     problems.texts.extend(tracks.notes)
     sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():

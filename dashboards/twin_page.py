@@ -47,6 +47,8 @@ class TwinPage:
     problems: tuple[str, ...]
     next_command: str
     stand_in: bool | None
+    has_methods: bool
+    """Whether renders of other methods were compared."""
 
 
 def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
@@ -75,6 +77,7 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         problems=tuple(problems),
         next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}",
         stand_in=judgement.stand_in,
+        has_methods=judgement.has_methods,
     )
 
 
@@ -82,7 +85,7 @@ def _views(
     run: RunFolder, path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]
 ) -> list[HeldOutView]:
     tracks = camera_tracks(path)
-    source = _source_of(run, path)
+    source = source_of(run, path)
     recorded = {**(camera_tracks(source) if source else {}), **tracks}
     views = []
     for name, track in tracks.items():
@@ -105,7 +108,7 @@ def _views(
     return views
 
 
-def _source_of(run: RunFolder, path: Path) -> Path | None:
+def source_of(run: RunFolder, path: Path) -> Path | None:
     """Return the recorded episode a views episode was made from, where it is still there."""
     derived = Episode.open(path).derived
     try:
@@ -153,7 +156,7 @@ def view_image(
         raise NotHereError(message)
     holder: Path | None = path
     if camera_id not in camera_tracks(path):
-        holder = _source_of(run, path)
+        holder = source_of(run, path)
     if holder is None:
         message = f"the recording that {path.name} was made from is not in this run."
         raise NotHereError(message)

@@ -1,5 +1,6 @@
 """A run with everything that the Rerun file shows, made for tests."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -115,9 +116,11 @@ def extra(start: int, description: str) -> list[tuple[str, str, bytes, int]]:
     return found
 
 
-def write_localised(run: RunFolder, episode: str, start: int) -> None:
+def write_localised(
+    run: RunFolder, episode: str, start: int, p_m: Sequence[float] = (0.4, 0.1, 0.02)
+) -> None:
     """Where the twin found the cube, and that it did not find the box."""
-    pose = {"p_m": [0.4, 0.1, 0.02], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    pose = {"p_m": list(p_m), "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
     with EpisodeWriter(run.derived_dir / f"{episode}.localised.0a0b.mcap") as writer:
         writer.describe(
             EpisodeInfo(id=episode, kind="trial"),

@@ -110,6 +110,11 @@ def test_two_conditions_are_paired_by_start(shared_run: RunFolder, browser: Any)
     assert "−0.500" in seen
 
 
+def test_an_address_that_only_says_by_what_shows_the_first_two(browser: Any) -> None:
+    text = browser.get("/compare?by=condition").text
+    assert words(text) == words(browser.get(BOTH).text)
+
+
 def test_a_start_that_was_tried_twice_or_elsewhere_is_no_pair(shared_run: RunFolder) -> None:
     read = read_run(shared_run, SummaryCache(None))
     names = ("without_replanning", "with_replanning")

@@ -196,9 +196,9 @@ def test_a_trial_set_aside_takes_its_label_and_its_replays_along(
         demo.run_demo(run.path, QUICK, QUIET)
     moved = [each.name for each in run.notes_dir.rglob("trial_0002*")]
     assert sorted(moved) == ["trial_0002.mcap", "trial_0002.replay.planned.mcap"]
-    assert [words[0] for words in asked] == ["record", "rebuild", "gate", "publish"]
-    assert "--missing" in asked[3]
-    assert "--no-scan" in asked[3]
+    assert [words[0] for words in asked] == ["record", "calibrate", "rebuild", "gate", "publish"]
+    assert "--missing" in asked[4]
+    assert "--no-scan" in asked[4]
 
 
 def test_every_interrupted_step_leads_to_the_steps_after_it(
@@ -207,13 +207,20 @@ def test_every_interrupted_step_leads_to_the_steps_after_it(
     asked = without_commands(monkeypatch)
     with pytest.raises(DashboardError, match="there is no scan"):
         demo.run_demo(run.path, QUICK, QUIET)
-    assert [words[0] for words in asked] == ["record", "publish", "rebuild", "gate", "publish"]
+    assert [words[0] for words in asked] == [
+        "record",
+        "publish",
+        "calibrate",
+        "rebuild",
+        "gate",
+        "publish",
+    ]
     record_all(run)
     asked.clear()
     with pytest.raises(FileNotFoundError):  # nobody evaluated
         demo.run_demo(run.path, QUICK, QUIET)
-    assert [words[0] for words in asked] == ["rebuild", "replay", "evaluate"]
-    assert "--iterations" in asked[0]
+    assert [words[0] for words in asked] == ["calibrate", "rebuild", "replay", "evaluate"]
+    assert "--iterations" in asked[1]
     run.scene_dir.mkdir()
     (run.scene_dir / "scene.json").write_text('{"fit": {}}')
     asked.clear()

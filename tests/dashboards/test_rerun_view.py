@@ -23,8 +23,9 @@ from bridge.errors import UsageError
 from bridge.robots.default import ARM_JOINTS
 from bridge.robots.robot import read_robot
 from dashboards.errors import DashboardError
-from dashboards.rerun_entities import drawable, read_splats
+from dashboards.rerun_entities import drawable
 from dashboards.rerun_file import RerunFile
+from dashboards.rerun_objects import read_splats
 from dashboards.rerun_view import Exported, export_rrd, run_of
 
 
@@ -134,15 +135,15 @@ def test_images_are_byte_for_byte_the_recorded_ones(
     assert [bytes(row[0]) for row in rows if row] == recorded
 
 
-def test_an_object_is_a_box_of_the_task_that_appears_with_its_first_pose(
-    content: dict[str, dict[str, list[object]]],
+def test_an_object_is_a_box_of_the_task_from_the_first_instant_on(
+    synthetic: ModuleType, content: dict[str, dict[str, list[object]]]
 ) -> None:
     cube = content["/localised/cube"]
     assert [row for row in cube["Transform3D:translation"] if row] == [
         [pytest.approx([0.4, 0.1, 0.02])]
     ]
     assert len([row for row in cube["Boxes3D:half_sizes"] if row]) == 1
-    assert None not in cube["source_time"]
+    assert {stamp for stamp in cube["source_time"] if stamp is not None} == {synthetic.START_NS}
 
 
 def test_splats_are_given_as_rerun_wants_them(content: dict[str, dict[str, list[object]]]) -> None:
@@ -157,7 +158,7 @@ def test_splats_are_given_as_rerun_wants_them(content: dict[str, dict[str, list[
 def test_what_is_not_shown_is_said_in_words(
     exported: Exported, content: dict[str, dict[str, list[object]]]
 ) -> None:
-    assert any("'box' was not found" in note for note in exported.notes)
+    assert "box was not localised: not drawn" in exported.notes
     assert sum("not in the robot description" in note for note in exported.notes) == 7
     text = content["/about"]["TextDocument:text"][0][0]
     assert "**Stand-in**" in text

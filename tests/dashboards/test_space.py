@@ -97,10 +97,14 @@ def write_scene(run: RunFolder) -> None:
 
 @pytest.fixture
 def run(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
-    """Return one trial with a fixed camera, the default robot, a replay and a rebuilt scene."""
-    run = RunFolder.create(tmp_path / "run")
+    return write_space_run(tmp_path, synthetic)
+
+
+def write_space_run(folder: Path, synthetic: ModuleType) -> RunFolder:
+    """Write one trial with a fixed camera, the default robot, a replay and a rebuilt scene."""
+    run = RunFolder.create(folder / "run")
     trial = synthetic.TRIALS[0]
-    recorded = synthetic.write_trial(RunFolder.create(tmp_path / "source"), trial, images=False)
+    recorded = synthetic.write_trial(RunFolder.create(folder / "source"), trial, images=False)
     start = synthetic.START_NS
     opened = Episode.open(recorded)
     frame = "eye_color_optical"
