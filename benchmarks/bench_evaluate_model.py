@@ -1,8 +1,9 @@
 """Does the model of agreement cover? On the truths of ``agreement_truths.py``, fixed beforehand.
 
-``MODEL_DRAWS`` (2) sets the draws of each truth, number of groups and number of trials. Both sides
-are unpaired, the twin has as many trials or ten times as many. Few draws of one combination say
-little; many combinations together do.
+``MODEL_DRAWS`` (2) sets the draws of each truth, number of groups and number of trials, and
+``MODEL_FIRST_DRAW`` (0) where they begin: other draws are other studies of the same truths. Both
+sides are unpaired, the twin has as many trials or ten times as many. Few draws of one combination
+say little; many combinations together do.
 """
 
 import os
@@ -20,12 +21,13 @@ from evaluator.statistics.hierarchical import AgreementModel
 
 FULL_DRAWS = 2
 DRAWS = int(os.environ.get("MODEL_DRAWS", FULL_DRAWS))
+FIRST_DRAW = int(os.environ.get("MODEL_FIRST_DRAW", "0"))
 NODES, NODES_IN_TASKS = 2048, 1024
 """Fewer than the evaluator uses (16,384, 8192): the ends of intervals move by some hundredths."""
 WHOLE = 1.98
 """Width of r from which on an interval says nothing."""
 LOG = "MODEL_LOG" in os.environ
-if DRAWS != FULL_DRAWS:
+if DRAWS != FULL_DRAWS or FIRST_DRAW:
     os.environ.setdefault("GST_BENCH_RESULTS", str(ROOT / "build" / "quick_results"))
 
 
@@ -44,7 +46,7 @@ class Shot:
 def shots() -> Iterator[Shot]:
     """Draw studies, fit the model, and compare its intervals with the population."""
     known = [truth.population() for truth in TRUTHS]
-    for draw in range(DRAWS):
+    for draw in range(FIRST_DRAW, FIRST_DRAW + DRAWS):
         for number, (truth, (r, bias)) in enumerate(zip(TRUTHS, known, strict=True)):
             for num_groups in NUM_GROUPS:
                 if truth.clustered and num_groups < FEWEST_CLUSTERED:

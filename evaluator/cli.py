@@ -19,9 +19,9 @@ from evaluator.review_index import RESULTS
 
 if TYPE_CHECKING:
     from evaluator.compare import Comparison
-    from evaluator.compare.published import Finding
+    from evaluator.compare.published import Finding, PublishedCheck
     from evaluator.result import Results
-    from evaluator.thresholds import Missed
+    from evaluator.thresholds import Missed, Threshold
 
 LIVE = LiveConfig()
 STUDY, WANTED = StudyOptions(), Wanted()
@@ -71,41 +71,47 @@ def evaluate(
         live: Follow a session instead of evaluating what is there.
         output: How to talk.
     """
-    from bridge.errors import UsageError
-    from evaluator.compare.published import check_published as recompute
-    from evaluator.report.figures.beside import beside
-    from evaluator.report.write import summary_text, write_report
-    from evaluator.thresholds import missed, parse_thresholds
+    from evaluator.thresholds import parse_thresholds
 
     if goal is not None and not 0 < goal < 1:
+        from bridge.errors import UsageError
+
         message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
-    source = sources[0] if sources else None
-    began_ns = time.time_ns()
     if live.live:
         return _follow(sources, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
-    published = None if check_published is None else recompute(check_published, options=tables)
-    second = beside(source)
-    if source is not None:
-        asked = _Asked(interval=interval, goal=goal, tables=tables, images=images, force=force)
-        comparison, folder = _compare(sources, asked, output)
-        comparison = _with_others(comparison, sources, against, reviews, tables, output)
-        if published is not None:
-            comparison = _beside(comparison, published.comparison)
-    elif published is not None and check_published is not None:
-        comparison = published.comparison
-        folder = check_published.with_name(f"{check_published.stem}_results")
-    elif images.renders:
-        comparison, folder = _compare_images(images)
-    else:
-        message = (
-            "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
-            "FOLDER with --renders METHOD=FOLDER."
-        )
-        raise UsageError(message)
+    asked = _Asked(
+        interval=interval,
+        goal=goal,
+        tables=tables,
+        images=images,
+        force=force,
+        check_published=check_published,
+        against=against,
+        reviews=reviews,
+    )
     with without_collecting():
-        written = write_report(comparison, out or folder, second)
+        return _evaluate(sources, asked, out, thresholds, output)
+
+
+def _evaluate(
+    sources: Sequence[Path],
+    asked: "_Asked",
+    out: Path | None,
+    thresholds: "Sequence[Threshold]",
+    output: Output,
+) -> int:
+    """Compare, write and say; return the exit code."""
+    from evaluator.report.figures.beside import beside
+    from evaluator.report.write import summary_text, write_report
+    from evaluator.thresholds import missed
+
+    began_ns = time.time_ns()
+    published = _recomputed(asked)
+    second = beside(sources[0] if sources else None)
+    comparison, folder = _found(sources, asked, published, output)
+    written = write_report(comparison, out or folder, second)
     results = written.content
     if len(sources) == 1 and written.results == sources[0] / RESULTS:
         from bridge.episode.run_folder import RunFolder
@@ -120,6 +126,39 @@ def evaluate(
         output.say(text)
     _refuse_only_broken(results)
     return THRESHOLD_NOT_MET if failed else 0
+
+
+def _recomputed(asked: "_Asked") -> "PublishedCheck | None":
+    from evaluator.compare.published import check_published
+
+    table = asked.check_published
+    return None if table is None else check_published(table, options=asked.tables)
+
+
+def _found(
+    sources: Sequence[Path], asked: "_Asked", published: "PublishedCheck | None", output: Output
+) -> "tuple[Comparison, Path]":
+    """Return what was found, and the folder for the results where no other is asked for.
+
+    Raises:
+        UsageError: When there is nothing to evaluate.
+    """
+    if sources:
+        comparison, folder = _compare(sources, asked, output)
+        comparison = _with_others(comparison, sources, asked, output)
+        return (_beside(comparison, published.comparison) if published else comparison), folder
+    if published is not None and asked.check_published is not None:
+        name = f"{asked.check_published.stem}_results"
+        return published.comparison, asked.check_published.with_name(name)
+    if asked.images.renders:
+        return _compare_images(asked.images)
+    from bridge.errors import UsageError
+
+    message = (
+        "evaluate needs a run folder or a table, --check-published TABLE, or --reference "
+        "FOLDER with --renders METHOD=FOLDER."
+    )
+    raise UsageError(message)
 
 
 def _refuse_only_broken(results: "Results") -> None:
@@ -146,6 +185,9 @@ class _Asked:
     tables: TableOptions
     images: ImageOptions
     force: bool
+    check_published: Path | None
+    against: Path | None
+    reviews: Sequence[Path]
 
 
 def design(
@@ -174,7 +216,6 @@ def design(
     output.result(design_record(made, written), design_text(made, written, run, study))
 
 
-@without_collecting()
 def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[Comparison, Path]":
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
@@ -209,22 +250,20 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
 
 
 def _with_others(
-    comparison: "Comparison",
-    sources: Sequence[Path],
-    against: Path | None,
-    reviews: Sequence[Path],
-    tables: TableOptions,
-    output: Output,
+    comparison: "Comparison", sources: Sequence[Path], asked: _Asked, output: Output
 ) -> "Comparison":
     """Hold the results against another twin's, and against other raters' labels."""
     from bridge.exchange.reviews import FOLDER, read_reviews
     from evaluator.compare.raters import with_reviews
     from evaluator.compare.several import with_against
 
-    if against is not None:
-        comparison = with_against(comparison, sources[0], against, options=tables, output=output)
+    tables = asked.tables
+    if asked.against is not None:
+        comparison = with_against(
+            comparison, sources[0], asked.against, options=tables, output=output
+        )
     kept = [source / FOLDER for source in sources if (source / FOLDER).is_dir()]
-    found = [review for path in (*kept, *reviews) for review in read_reviews(path, tables)]
+    found = [review for path in (*kept, *asked.reviews) for review in read_reviews(path, tables)]
     return with_reviews(comparison, found) if found else comparison
 
 

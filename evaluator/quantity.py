@@ -77,7 +77,7 @@ class Quantity:
 
 
 REGISTRY: list[Quantity] = []
-"""In the order of docs/metrics.md."""
+"""All that were defined so far."""
 
 
 def quantity_of(measurement_id: str) -> Quantity | None:

@@ -1,6 +1,7 @@
 """``--fail-under``: what must be reached for an evaluation to count as passed."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bridge.errors import UsageError
@@ -73,7 +74,7 @@ def _parse(part: str) -> Threshold:
     return Threshold(name=name, id=SHORT.get(name, name), limit=limit)
 
 
-def missed(thresholds: list[Threshold], results: Results) -> list[Missed]:
+def missed(thresholds: Sequence[Threshold], results: Results) -> list[Missed]:
     """Return what was not reached; an undefined number reaches nothing.
 
     Args:

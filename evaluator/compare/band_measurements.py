@@ -11,15 +11,6 @@ from jaxtyping import Float
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import interval_or_reason, measured
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import (
-    BAND_ALONG_PATH,
-    BAND_DISTANCES,
-    BAND_MEDIAN,
-    BAND_WIDTH,
-    BAND_WITHOUT_OFFSET,
-    INSIDE_BAND,
-    REPEATABILITY,
-)
 from evaluator.metrics.trajectory import (
     BandDistance,
     Repeatability,
@@ -29,6 +20,15 @@ from evaluator.metrics.trajectory import (
     path_distance_m,
     repeatability,
     without_rigid_motion,
+)
+from evaluator.motion_measurements import (
+    BAND_ALONG_PATH,
+    BAND_DISTANCES,
+    BAND_MEDIAN,
+    BAND_WIDTH,
+    BAND_WITHOUT_OFFSET,
+    INSIDE_BAND,
+    REPEATABILITY,
 )
 from evaluator.result import Interval, Measurement
 from evaluator.statistics.intervals import median_interval

@@ -26,7 +26,9 @@ from evaluator.compare.end_points import compare_end_points
 from evaluator.compare.measure import Part, degrees, millimetres
 from evaluator.compare.trial import tcp_track
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import (
+from evaluator.measurements import Quantity
+from evaluator.metrics.trajectory import band_distance, moving_part, repeatability
+from evaluator.motion_measurements import (
     BAND_ALONG_PATH,
     BAND_DISTANCES,
     BAND_WIDTH,
@@ -34,9 +36,7 @@ from evaluator.measurements import (
     INSIDE_BAND,
     MOVING,
     REPEATABILITY,
-    Quantity,
 )
-from evaluator.metrics.trajectory import band_distance, moving_part, repeatability
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 

@@ -16,8 +16,9 @@ from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.band_measurements import Side
 from evaluator.compare.measure import Part, ends, interval_or_reason, measured, millimetres
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import BODY_DISTANCES, Defined
+from evaluator.measurements import Defined
 from evaluator.metrics.trajectory import MOVING_THRESHOLD_M, NORMALISED_SAMPLES, moving_part
+from evaluator.motion_measurements import BODY_DISTANCES
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.intervals import median_interval
 

@@ -8,6 +8,8 @@ the planned replay: what the twin's own arm made of the difference.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +20,6 @@ from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from evaluator.compare.measure import Part, average, degrees, measured, millimetres, milliseconds
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import MOTIONS
 from evaluator.memory import Packed, packed
 from evaluator.metrics.trajectory import (
     NORMALISED_SAMPLES,
@@ -30,6 +31,7 @@ from evaluator.metrics.trajectory import (
     relative_errors,
     without_rigid_motion,
 )
+from evaluator.motion_measurements import MOTIONS
 from evaluator.result import Cell, Measurement, Table
 from evaluator.run_reader.tracks import Tracks, read_tracks
 
@@ -282,18 +284,18 @@ def group_table(groups: Groups) -> Table:
                     "against": name,
                     "trials": len(members),
                     "mean distance (mm)": millimetres(
-                        average(members, lambda m: m.position_mean_m)
+                        average(members, attrgetter("position_mean_m"))
                     ),
-                    "end point (mm)": millimetres(average(members, lambda m: m.end_point_m)),
-                    "mean angle (deg)": degrees(average(members, lambda m: m.rotation_mean_rad)),
-                    "delay (ms)": milliseconds(average(members, lambda m: m.lag_s)),
+                    "end point (mm)": millimetres(average(members, attrgetter("end_point_m"))),
+                    "mean angle (deg)": degrees(average(members, attrgetter("rotation_mean_rad"))),
+                    "delay (ms)": milliseconds(average(members, attrgetter("lag_s"))),
                     "without delay (mm)": millimetres(
-                        average(members, lambda m: m.without_lag_mean_m)
+                        average(members, attrgetter("without_lag_mean_m"))
                     ),
                     "without offset (mm)": millimetres(
-                        average(members, lambda m: m.without_offset_mean_m)
+                        average(members, attrgetter("without_offset_mean_m"))
                     ),
-                    "joints, RMS (deg)": degrees(average(members, lambda m: m.joint_rms_rad)),
+                    "joints, RMS (deg)": degrees(average(members, attrgetter("joint_rms_rad"))),
                 }
             )
     return Table.of(
@@ -393,17 +395,20 @@ def motion_results(motions: Sequence[MotionSummary]) -> Part:
 
 def _measure(name: str, motions: Sequence[MotionSummary]) -> list[Measurement]:
     how = sorted({motion.aligned_by for motion in motions})
+    everything = [motion.episode for motion in motions]
     measurements = []
     for field, quantity in MOTIONS.items():
-        known = [(m.episode, v) for m in motions if (v := getattr(m, field)) is not None]
+        values = list(map(attrgetter(field), motions))
+        there = [value is not None for value in values]
+        known = list(compress(values, there))
         measurements.append(
             measured(
                 quantity.of(against=name, meaning=MEANING[name], how=" or ".join(how) or "stamps"),
-                partial(_mean, [value for _, value in known], name),
+                partial(_mean, known, name),
                 n=len(known),
                 counted="trial",
                 reason_without_interval=SHARED,
-                episodes=[episode for episode, _ in known],
+                episodes=compress(everything, there),
             )
         )
     return measurements

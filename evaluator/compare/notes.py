@@ -212,17 +212,22 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
         derived: All derived episodes of the run.
     """
     used = [file for trial in trials for file in trial.replays.values()]
-    replays = [file for file in derived if file.derived.kind == "replay"]
-    found = list(_passed_over(replays))
+    reasons = [file.why_not_counted for file in derived]
+    known = list(zip(derived, reasons, strict=True))
+    found = list(_passed_over(why for file, why in known if file.derived.kind == "replay"))
     if used:
-        may_count = [file for file in derived if not file.why_not_counted]
+        may_count = [file for file, why in known if not why]
         found += [*_scenes(used, derived), *_settings(used), *_tried(used, may_count)]
     return [(ABOUT, text) for text in found]
 
 
-def _passed_over(replays: Iterable[DerivedFile]) -> Iterable[str]:
-    """Say which replays are shown and never counted, and why."""
-    for why, count in Counter(file.why_not_counted for file in replays).items():
+def _passed_over(reasons: Iterable[str]) -> Iterable[str]:
+    """Say which replays are shown and never counted, and why.
+
+    Args:
+        reasons: One for each replay; empty for one that may count.
+    """
+    for why, count in Counter(reasons).items():
         if why:
             yield f"{count} that never count were {why}"
 
@@ -255,10 +260,14 @@ def _counted(values: Counter[str]) -> str:
 
 def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
     """Name the first setting in which replays that count differ."""
-    # Nearly always all are equal: those in a row are laid flat once.
+    # Nearly always all are equal: many files share one record, and equal ones are laid flat once.
+    records: dict[int, dict[str, Any]] = {}
+    for file in used:
+        if id(file.derived.settings) not in records:
+            records[id(file.derived.settings)] = _made_with(file)
     runs = [
         (dict(_leaves(made)), sum(1 for _ in same))
-        for made, same in groupby(map(_made_with, used))
+        for made, same in groupby(records[id(file.derived.settings)] for file in used)
         if made
     ]
     for name in dict.fromkeys(chain.from_iterable(settings for settings, _ in runs)):

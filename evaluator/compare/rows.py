@@ -63,6 +63,8 @@ class TrialRow:
     """The plan actually sent: the last one whose execution started."""
     num_plans: int = 0
     num_plans_sent: int = 0
+    nothing_executed: bool = False
+    """No plan was sent, though plans were published or the label says so."""
     sim_planned: bool | None = None
     """Headline sim: the sent plan, planned trajectory, dynamic, in the twin."""
     sim_executed: bool | None = None

@@ -78,6 +78,7 @@ def compare_run(
         bands=bands.curves,
         paths=bands.paths,
         views=(*views.views, *methods.views),
+        provenance={**base.provenance, **images.origin()},
     )
 
 

@@ -19,8 +19,9 @@ from evaluator.compare.measure import (
     millimetres,
 )
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import STATES, Defined
+from evaluator.measurements import Defined
 from evaluator.metrics.state import extents_difference_m, turn_between_rad, turns_alike
+from evaluator.motion_measurements import STATES
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.run_reader.object_states import (
     ObjectState,

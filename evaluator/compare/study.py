@@ -47,7 +47,8 @@ class StudyStart:
     def executed(self, *arms: str) -> bool:
         """Whether something was executed in all of these arms; a table knows outcomes, no plans."""
         trials = [self.trials[arm] for arm in arms]
-        return all(each.plan_id is not None or each.recorded is not None for each in trials)
+        known = [each.plan_id is not None or each.recorded is not None for each in trials]
+        return all(known) and not any(each.nothing_executed for each in trials)
 
 
 def study_starts(

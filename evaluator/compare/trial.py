@@ -8,7 +8,7 @@ from pathlib import Path
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue_store import UNLABELLED
-from bridge.episode.metadata import Outcome, treatment_of
+from bridge.episode.metadata import NOTHING_EXECUTED, Outcome, treatment_of
 from bridge.episode.reader import Episode
 from bridge.episode.streams import pose_track
 from bridge.episode.topics import TCP_POSE
@@ -124,6 +124,13 @@ def _why_unknown(outcome: Outcome | None) -> str:
     return (outcome.detail or UNLABELLED) if outcome.result == "unknown" else ""
 
 
+def _nothing_executed(facts: RecordedFacts) -> bool:
+    """Whether no plan was sent; without plans and a word about it, a robot moved by other means."""
+    detail = facts.outcome.detail if facts.outcome is not None else None
+    labelled_so = (detail or "").startswith(NOTHING_EXECUTED)
+    return facts.plan_id is None and (labelled_so or facts.num_plans > 0)
+
+
 def _impossible_count(outcome: Outcome | None) -> str:
     """Say what is wrong with a count of objects or sub-tasks; nothing where it can be."""
     if outcome is None or outcome.unit == "trial":
@@ -163,6 +170,7 @@ def _row(
         plan_id=facts.plan_id,
         num_plans=facts.num_plans,
         num_plans_sent=facts.num_plans_sent,
+        nothing_executed=_nothing_executed(facts),
         sim_planned=planned.accepted,
         sim_executed=found["executed"].accepted,
         verdict=None if verdict is None else verdict.accepted,

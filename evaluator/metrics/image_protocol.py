@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from bridge.errors import UsageError
 
@@ -171,6 +171,14 @@ class ImageOptions:
         """The backbones that were given."""
         found: dict[NetName, Path | None] = {"vgg": self.lpips_vgg, "alex": self.lpips_alex}
         return {net: path for net, path in found.items() if path is not None}
+
+    def origin(self) -> dict[str, Any]:
+        """Say where the images are, for a page that shows them; nothing without renders."""
+        if not self.renders:
+            return {}
+        reference = None if self.reference is None else str(self.reference.resolve())
+        methods = {name: str(folder.resolve()) for name, folder in self.methods().items()}
+        return {"reference": reference, "methods": methods}
 
     def refuse_unused(self) -> None:
         """Refuse settings that nothing would be compared with.

@@ -18,7 +18,7 @@ from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.run import compare_run
 from evaluator.compare.stages import first_failed_stage
-from evaluator.measurements import BAND_WIDTH
+from evaluator.motion_measurements import BAND_WIDTH
 from evaluator.quantity import slug
 from evaluator.report.front import CLOSE_PP, answer, conclusions, front, next_trials, sentence
 from evaluator.report.page import grid

@@ -16,7 +16,7 @@ from evaluator.report.figures.selection import drawable, drawings_of
 from evaluator.report.methods import methods
 from evaluator.report.page import name_shared, page
 from evaluator.report.sections import TRIALS
-from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
+from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text, latex
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
@@ -148,7 +148,26 @@ def _figure_files(
     for item in rendered:
         files[folder / f"{item.drawing.id}.svg"] = item.svg
         files[folder / f"{item.drawing.id}.pdf"] = item.pdf
+        files[folder / f"{item.drawing.id}.tex"] = figure_latex(item.drawing).encode()
     return files
+
+
+def figure_latex(drawing: Drawing) -> str:
+    r"""Write a figure for a paper: as wide as it was drawn, or as the column where that is less.
+
+    The document needs ``\usepackage{graphicx}`` and the folder ``figures`` beside it.
+    """
+    width = f"{drawing.width_in:g}in"
+    lines = (
+        r"\begin{figure}[t]",
+        r"\centering",
+        rf"\includegraphics[width=\ifdim\linewidth<{width}\linewidth\else{width}\fi]"
+        rf"{{figures/{drawing.id}.pdf}}",
+        rf"\caption{{{latex(f'{drawing.title}. {drawing.caption}')}}}",
+        rf"\label{{fig:{drawing.id}}}",
+        r"\end{figure}",
+    )
+    return "\n".join(lines) + "\n"
 
 
 def _old_files(folder: Path, results: Results) -> list[Path]:
@@ -178,7 +197,7 @@ def _remove_old(folder: Path, not_drawn: Sequence[NotDrawn], old: Sequence[Path]
     for path in old:
         path.unlink(missing_ok=True)
     for item in not_drawn:
-        for ending in ("csv", "svg", "pdf"):
+        for ending in ("csv", "svg", "pdf", "tex"):
             (folder / "figures" / f"{item.id}.{ending}").unlink(missing_ok=True)
 
 

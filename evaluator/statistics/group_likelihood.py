@@ -28,6 +28,11 @@ TASK_NODES = 4
 """Nodes for each side of a task's mean."""
 BATCH = 200_000
 """Numbers on the grid that are held at once: what a processor's cache holds."""
+REACH = 5.5
+"""Standard deviations from its centre where a normal density on the grid ends: 4e-8 lies beyond."""
+Window = tuple[slice, slice]
+"""Rows and columns of the grid."""
+WHOLE: Window = (slice(None), slice(None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,19 +185,44 @@ class Likelihood:
             found = found + scale * count * np.log(np.maximum(chance, 1e-300))
         return np.asarray(found)
 
+    def window(self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread) -> Window:
+        """Return the part of the grid in which any of some normal densities lies.
+
+        Args:
+            mean: Of each.
+            spread: Of each.
+        """
+        first, second, _ = spread.entries((self.step / 2) ** 2)
+        found = []
+        for side, variance in enumerate((first, second)):
+            reach = REACH * np.sqrt(variance)
+            ends = (mean[:, side] - reach).min(), (mean[:, side] + reach).max()
+            low, high = np.searchsorted(self.grid, ends)
+            found.append(slice(min(low, len(self.grid) - 1), max(high, 1)))
+        return found[0], found[1]
+
     def weights(
-        self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread
+        self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread, window: Window = WHOLE
     ) -> Float32[np.ndarray, "nodes cells"]:
-        """Return the normal density of a pair of log-odds on the grid, up to a factor for each."""
+        """Return the normal density of a pair of log-odds on the grid, up to a factor for each.
+
+        Args:
+            mean: Of each node.
+            spread: Of each node.
+            window: Part of the grid that is asked for.
+        """
         first, second, shared = spread.entries((self.step / 2) ** 2)
         det = first * second - shared**2
-        x, y = (self.grid[None, :] - mean[:, [side]] for side in (0, 1))
+        x, y = (self.grid[part][None, :] - mean[:, [side]] for side, part in enumerate(window))
         size = np.log(self.steps)
-        one = size - 0.5 * (second / det)[:, None] * x**2
-        two = size - 0.5 * (first / det)[:, None] * y**2
-        ones, skew = np.ones_like(x), (shared / det)[:, None] * x
-        rows = np.stack([one, skew, ones], axis=2).astype(np.float32)
-        columns = np.stack([ones, y, two], axis=1).astype(np.float32)
+        rows = np.empty((*x.shape, 3), dtype=np.float32)
+        rows[:, :, 0] = size[window[0]] - 0.5 * (second / det)[:, None] * x**2
+        rows[:, :, 1] = (shared / det)[:, None] * x
+        rows[:, :, 2] = 1.0
+        columns = np.empty((len(y), 3, y.shape[1]), dtype=np.float32)
+        columns[:, 0] = 1.0
+        columns[:, 1] = y
+        columns[:, 2] = size[window[1]] - 0.5 * (first / det)[:, None] * y**2
         found = (rows @ columns).reshape(len(mean), -1)  # one pass over memory
         np.exp(found, out=found)
         return np.asarray(found)
@@ -238,14 +268,20 @@ class Likelihood:
         )
         table, ones = self.table[members], np.ones((1, self.table.shape[1]), dtype=np.float32)
         sides = [side.astype(np.float32) for side in self.rate_of_cells] if with_rates else []
-        columns = np.concatenate([table, *(table * side for side in sides), ones]).T
-        found = np.empty((len(flat), columns.shape[1] - 1))
-        size = max(1, BATCH // self.table.shape[1])
-        for at in range(0, len(flat), size):
-            part = slice(at, at + size)
+        columns = np.concatenate([table, *(table * side for side in sides), ones])
+        columns = columns.reshape(-1, *self.shape)
+        found = np.empty((len(flat), len(columns) - 1))
+        # Alike spreads reach over the same part of the grid; that of all others is left out.
+        order = np.argsort(np.maximum(spread.first, spread.second), kind="stable")
+        at, cells = 0, self.table.shape[1]
+        while at < len(flat):
+            part = order[at : at + max(1, BATCH // cells)]
             some = Spread(**{name: values[part] for name, values in vars(spread).items()})
-            shares = self.weights(flat[part], some) @ columns
+            window = self.window(flat[part], some)
+            there = columns[:, *window].reshape(len(columns), -1)
+            shares = self.weights(flat[part], some, window) @ there.T
             found[part] = shares[:, :-1] / np.maximum(shares[:, -1:], 1e-30)
+            at, cells = at + len(part), there.shape[1]
         chance = np.maximum(found[:, : len(members)], 1e-35)
         logs = np.log(chance).sum(axis=1).reshape(count, each)
         rates = found[:, len(members) :].reshape(len(flat), len(sides), len(members))

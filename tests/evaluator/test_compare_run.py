@@ -115,6 +115,14 @@ def test_only_the_plan_that_was_sent_counts(maker: Any) -> None:
     assert (row.num_plans, row.num_plans_sent) == (2, 1)
 
 
+def test_a_trial_whose_plans_were_not_sent_executed_nothing(maker: Any) -> None:
+    maker.trial("t1", recorded="failure", sent=False)
+    maker.trial("t2", recorded="failure")
+    comparison = compare_run(maker.run)
+    assert row_of(comparison, "t1").nothing_executed
+    assert not row_of(comparison, "t2").nothing_executed
+
+
 def test_a_verdict_after_the_motion_started_is_not_before_motion(maker: Any) -> None:
     maker.trial("t1", gate=True, late_gate=False)
     maker.trial("t2", late_gate=False)

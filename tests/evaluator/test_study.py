@@ -74,9 +74,18 @@ def test_each_task_has_its_gain_with_tangos_interval_also_where_it_holds_zero() 
     assert zero.value == 0.0
 
 
-def test_what_was_not_executed_is_a_failure_and_per_protocol_it_is_left_out() -> None:
+@pytest.mark.parametrize(
+    "label",
+    [
+        {"recorded": None, "why_unknown": "nothing executed, no verdict"},
+        {"recorded": False, "nothing_executed": True},  # as the stand-in cell labels it
+    ],
+)
+def test_what_was_not_executed_is_a_failure_and_per_protocol_it_is_left_out(
+    label: dict[str, object],
+) -> None:
     rows = [
-        replace(each, recorded=None, plan_id=None, why_unknown="nothing executed, no verdict")
+        replace(each, plan_id=None, **label)  # type: ignore[arg-type]
         if each.study_arm == "with" and each.start_id == "stack/0"
         else each
         for each in FIRST

@@ -208,8 +208,7 @@ def compare_folders(options: ImageOptions) -> Comparison:
         views=report.views,
         provenance={
             "software": software(),
-            "reference": str(options.reference),
-            "methods": {name: str(folder) for name, folder in options.methods().items()},
+            **options.origin(),
             "weights": [net.weights for net in nets],
         },
     )
@@ -251,7 +250,7 @@ def compare_renders(
         )
         raise EvaluatorError(message)
     split = agreed_setting([file.derived.settings for file in found], "holdout") or options.split
-    names = _other_names(recorded.load)
+    names = other_names(recorded.load)
     given = {name: _renamed(mask, names) for name, mask in _given_masks(options).items()}
     reference = Reference(
         images=recorded, masks={**masks, **given}, asked=frozenset(given), split=split
@@ -319,8 +318,12 @@ def _given_masks(options: ImageOptions) -> dict[str, ImageSet]:
     return {slug(folder.resolve().name): masks}
 
 
-def _other_names(views: Iterable[str]) -> dict[str, str]:
-    """Return what else a view of the run may be called, where only one view is called so."""
+def other_names(views: Iterable[str]) -> dict[str, str]:
+    """Return what else a view of the run may be called, where only one view is called so.
+
+    Args:
+        views: As results name them: ``camera/stamp_ns``.
+    """
     found: dict[str, list[str]] = {}
     for view in views:
         camera, stamp = view.rsplit("/", 1)

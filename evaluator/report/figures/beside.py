@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridge.process_pool import Failed, Function, Worker, WorkerLostError
+from evaluator.memory import without_collecting
 from evaluator.report.figures.drawing import Drawing, Rendered
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def _rendered(drawing: Drawing, found: dict[str, Forms]) -> Rendered:
     return Rendered(drawing=drawing, svg=svg, pdf=pdf, inline=inline)
 
 
+@without_collecting()
 def _load(_: None) -> None:
     from evaluator.report.figures import selection  # noqa: F401, PLC0415  # loads the numbers
     from evaluator.report.figures.render import warm_up  # noqa: PLC0415  # and matplotlib
@@ -90,6 +92,7 @@ def _load(_: None) -> None:
     warm_up()
 
 
+@without_collecting()
 def _draw(shown: "Drawable") -> dict[str, Forms]:
     from evaluator.report.figures.render import render  # noqa: PLC0415
     from evaluator.report.figures.selection import drawings_of  # noqa: PLC0415

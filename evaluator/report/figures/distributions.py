@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from evaluator.compare.plot_data import CurveBand, Shares
-from evaluator.measurements import BAND_WIDTH
+from evaluator.motion_measurements import BAND_WIDTH
 from evaluator.report.figures.drawing import (
     LEGEND_LINE_IN,
     LIGHT,

@@ -289,9 +289,9 @@ def test_the_command_writes_a_report_of_images_alone(folders: Path) -> None:
 
 
 def test_views_of_a_run_may_be_called_as_export_tum_calls_them() -> None:
-    from evaluator.compare.images.renders import _other_names
+    from evaluator.compare.images.renders import other_names
 
-    names = _other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
+    names = other_names(["wrist/1500000000", "side/1500000000", "side/2000000001"])
     assert names["wrist_1500000000"] == "wrist/1500000000"
     assert names["side/rgb/1.500000000"] == "side/1500000000"
     assert names["rgb/2.000000001"] == "side/2000000001"

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from evaluator.compare import compare_csv
 from evaluator.report.methods import methods
 from evaluator.report.tables import LONG_ROWS, as_latex, caption_of, latex
+from evaluator.report.write import write_report
 from evaluator.result import Table
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "paper_table_rates.csv"
@@ -126,12 +127,32 @@ def test_tex_sets_the_tables(tmp_path: Path) -> None:
     packages = r"\usepackage{booktabs,graphicx,longtable,threeparttable}"
     body = "\n".join(as_latex(item) for item in tables) + f"\n{paragraph}"
     text = f"\\documentclass{{article}}{packages}\\begin{{document}}{body}\\end{{document}}\n"
-    (tmp_path / "all.tex").write_text(text)
+    typeset(text, tmp_path)
+
+
+def typeset(text: str, folder: Path) -> str:
+    """Set a document and return what TeX says."""
+    assert TEX is not None
+    (folder / "all.tex").write_text(text)
     options = [] if "tectonic" in TEX else ["-interaction=nonstopmode", "-halt-on-error"]
     done = subprocess.run(
-        [TEX, *options, "all.tex"], cwd=tmp_path, capture_output=True, text=True, check=False
+        [TEX, *options, "all.tex"], cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-2000:]
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(TEX is None, reason="no TeX (Debian: texlive-latex-recommended)")
+def test_nothing_reaches_over_a_column_of_a_paper(tmp_path: Path) -> None:
+    write_report(compare_csv(PAPER), tmp_path)
+    written = sorted(tmp_path.glob("tables/*.tex")) + sorted(tmp_path.glob("figures/*.tex"))
+    body = "".join(rf"\input{{{path.relative_to(tmp_path)}}}" for path in written)
+    assert r"\input{figures/scatter.tex}" in body
+    packages = r"\usepackage{booktabs,graphicx,longtable,threeparttable}"
+    text = f"\\documentclass[twocolumn]{{article}}{packages}\\begin{{document}}{body}"
+    said = typeset(f"{text}\\end{{document}}\n", tmp_path)
+    assert "Overfull" not in said, said
 
 
 def test_a_wide_table_spans_both_columns_and_notes_belong_to_the_table() -> None:
