@@ -16,7 +16,7 @@ from bridge.wire.config import DEFAULT_ENDPOINT
 if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
     from bridge.episode.metadata import Outcome
-    from bridge.episode.recover import RecoveryReport
+    from bridge.episode.recovery_report import RecoveryReport
     from bridge.episode.run_folder import RunFolder
 
 OUTPUT = Output()
@@ -259,6 +259,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
         output: How to talk.
     """
     from bridge.episode import recover as recovery
+    from bridge.episode.recovery_report import RecoveryReport
     from bridge.errors import GstError, UsageError
 
     files: list[Path] = []
@@ -273,7 +274,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
         except GstError as error:
             if len(files) == 1:
                 raise
-            reports.append(recovery.RecoveryReport(path=path, output=None, reason=str(error)))
+            reports.append(RecoveryReport(path=path, output=None, reason=str(error)))
     joined = recovery.join_failovers([path for path in paths if path.is_dir()])
     lines = [_describe(report) for report in reports]
     lines += [f"{path.name}: joined with the parts before it, now {path}" for path in joined]

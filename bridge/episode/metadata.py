@@ -17,6 +17,8 @@ SCHEMA_VERSION = 1
 RETRY = "retry"
 """A new start after an execution that failed: labelled, shown apart, in no rate of trials."""
 KINDS = ("scan", "trial", RETRY, "probe", "imported")
+NOTHING_EXECUTED = "nothing executed"
+"""How the label of a trial begins in which no plan was sent to the robot."""
 WITHOUT, WITH = "without_replanning", "with_replanning"
 """The two conditions of a trial that evaluation compares."""
 

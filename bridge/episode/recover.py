@@ -19,17 +19,19 @@ from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
 from bridge.episode.mcap.walk import DAMAGE
+from bridge.episode.recovery_report import (
+    RECORD_NAME,
+    RecoveryReport,
+    RecoveryTally,
+    to_metadata,
+)
 from bridge.episode.run_folder import RunFolder, first_part_name
 from bridge.episode.salvage import (
-    RECORD_NAME,
     CopyTarget,
     InPlaceTarget,
     NeedsCopyError,
-    RecoveryTally,
     scan_with_journal,
-    to_metadata,
 )
-from bridge.episode.salvage import RecoveryReport as RecoveryReport
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 PART, SUFFIX, TEMPORARY, UNREADABLE = ".part", ".mcap", ".recovering", ".unreadable"

@@ -4,15 +4,13 @@ Chunks are copied byte for byte. Messages outside chunks are put into chunks, be
 use the index see nothing else. Message indexes, summary and footer are made anew.
 """
 
-import json
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from mcap.records import Channel, Metadata, Schema
 
-from bridge.episode import provenance
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
     Contents,
@@ -37,187 +35,7 @@ from bridge.episode.mcap.scan import (
     scan,
 )
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome, build, from_strings
-
-RECORD_NAME = "recovered"
-MAX_REASONS = 8
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecoveryReport:
-    """What recovery did with one file."""
-
-    path: Path
-    output: Path | None
-    """The finished episode; None when nothing could be read."""
-    messages: int = 0
-    topics: dict[str, int] = field(default_factory=dict)
-    """Messages by topic."""
-    bytes_kept: int = 0
-    bytes_lost: int = 0
-    """Bytes of the file that hold no whole record; what never reached the disk is not known."""
-    reason: str = ""
-    finished: bool = False
-    """It was complete already."""
-    attachments: int = 0
-    metadata: int = 0
-    last_log_time_ns: dict[str, int] = field(default_factory=dict)
-    """By topic: nothing after it was found."""
-    original: Path | None = None
-    """Where a part that is damaged inside was kept, for someone who can read more of it."""
-
-
-@dataclass(kw_only=True)
-class RecoveryTally:
-    """Counts while a file is being read."""
-
-    messages: dict[int, int] = field(default_factory=dict)
-    """By channel id."""
-    last_ns: dict[int, int] = field(default_factory=dict)
-    topics: dict[int, str] = field(default_factory=dict)
-    attachments: int = 0
-    metadata: int = 0
-    bytes_kept: int = 0
-    bytes_lost: int = 0
-    losses: list[str] = field(default_factory=list)
-    has_data: bool = False
-    """Found a header or anything behind one."""
-    reached_end: int | None = None
-    """Where the writer ended the data, if it did."""
-    earlier: dict[str, object] = field(default_factory=dict)
-    """What a recovery before this one wrote into the file."""
-    damaged_inside: bool = False
-
-    def take(self, found: Found) -> None:
-        """Count one thing found in the file."""
-        match found:
-            case Damage():
-                self.bytes_lost += found.length
-                self.damaged_inside |= not found.at_end
-                self.losses.append(found.what)
-                return
-            case DataEnd():
-                self.reached_end = found.offset
-                return
-            case IndexSpan():
-                return
-            case CutChunk():
-                self._take_cut(found)
-            case Chunk():
-                self._count(found.contents)
-                self.bytes_kept += found.length
-            case TopMessage():
-                self._add(found.channel_id, 1, found.log_time_ns)
-                self.bytes_kept += found.length
-            case AttachmentSpan():
-                self.attachments += 1
-                self.bytes_kept += found.length
-            case Plain():
-                self._take_plain(found)
-        self.has_data = True
-
-    def _take_plain(self, found: Plain) -> None:
-        self.bytes_kept += found.length
-        if found.opcode == mcap.CHANNEL:
-            self._define([found.raw])
-        elif found.opcode == mcap.METADATA:
-            self.metadata += 1
-            if isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
-                self.earlier = from_strings(found.record.metadata)
-
-    def _take_cut(self, found: CutChunk) -> None:
-        lost = found.unpacked_size - found.contents.size
-        kept = found.contents.num_messages
-        self._count(found.contents)
-        self.bytes_kept += found.contents.size
-        self.bytes_lost += lost
-        self.losses.append(
-            f"at byte {found.offset} the file ends inside a chunk; "
-            f"{kept} whole messages of it were kept, without a CRC to prove them"
-        )
-
-    def _count(self, contents: Contents) -> None:
-        self._define(contents.definitions)
-        for channel_id, entries in contents.index.items():
-            self._add(channel_id, len(entries) // 2, max(entries[::2]))
-
-    def _add(self, channel_id: int, count: int, last_ns: int) -> None:
-        self.messages[channel_id] = self.messages.get(channel_id, 0) + count
-        self.last_ns[channel_id] = max(self.last_ns.get(channel_id, 0), last_ns)
-
-    def _define(self, definitions: list[bytes]) -> None:
-        for raw in definitions:
-            channel = read_plain(raw)
-            if isinstance(channel, Channel):
-                self.topics.setdefault(channel.id, channel.topic)
-
-    def name(self, definitions: list[bytes]) -> None:
-        """Learn the names of channels whose definition was lost and found elsewhere."""
-        self._define(definitions)
-
-    def topic_of(self, channel_id: int) -> str:
-        """Name of a channel, also of one whose definition was lost."""
-        return self.topics.get(channel_id, unknown_topic(channel_id))
-
-    @property
-    def reason(self) -> str:
-        """Why the file had to be recovered, and what was lost, in one line."""
-        before = self.earlier.get("reason")
-        parts = [str(before)] if before else []
-        if self.reached_end is None:
-            parts.append("its writer did not finish it")
-        elif not self.losses and not before:
-            parts.append("its closing part was missing or wrong")
-        parts += self.losses[:MAX_REASONS]
-        if len(self.losses) > MAX_REASONS:
-            parts.append(f"and {len(self.losses) - MAX_REASONS} more places")
-        return "; ".join(parts)
-
-    def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
-        """Say what was done with a file.
-
-        Args:
-            path: The file that was read.
-            output: The finished episode; None when there is none.
-            finished: The file was whole before; its reason is then that of an earlier recovery.
-        """
-        counts: dict[str, int] = {}
-        last: dict[str, int] = {}
-        for channel_id, count in self.messages.items():
-            topic = self.topic_of(channel_id)
-            counts[topic] = counts.get(topic, 0) + count
-            last[topic] = max(last.get(topic, 0), self.last_ns[channel_id])
-        before = self.earlier.get("bytes_lost")
-        return RecoveryReport(
-            path=path,
-            output=output,
-            messages=sum(counts.values()),
-            topics=dict(sorted(counts.items())),
-            bytes_kept=self.bytes_kept,
-            bytes_lost=self.bytes_lost + (before if isinstance(before, int) else 0),
-            reason=str(self.earlier.get("reason", "")) if finished else self.reason,
-            finished=finished,
-            attachments=self.attachments,
-            metadata=self.metadata,
-            last_log_time_ns=dict(sorted(last.items())),
-        )
-
-
-def to_metadata(report: RecoveryReport) -> dict[str, str]:
-    """Return the ``recovered`` metadata record of an episode; every value is JSON."""
-    values = {
-        "reason": report.reason,
-        "bytes_lost": report.bytes_lost,
-        "messages": report.messages,
-        "last_log_time_ns": report.last_log_time_ns,
-        "tool": provenance.software(),
-    }
-    return {name: json.dumps(value) for name, value in values.items()}
-
-
-def unknown_topic(channel_id: int) -> str:
-    """Name a channel whose definition was lost."""
-    return f"/recovered/channel_{channel_id}"
-
+from bridge.episode.recovery_report import unknown_topic
 
 CHUNK_BYTES = 1 << 20
 UNKNOWN_LIBRARY = "unknown; recovered by robot-gst"

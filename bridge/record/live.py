@@ -27,8 +27,8 @@ from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.contract import find_contract
 from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
+from bridge.episode.recovery_report import RecoveryReport
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.salvage import RecoveryReport
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.clocks import ClockAsker

@@ -156,6 +156,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
     The bytes of a chunk (``Chunk.raw``) are gone when the next thing is asked for.
     """
     position, scratch = len(mcap.MAGIC), Scratch()
+    before: Found | None = None
     if file.read(0, position) != mcap.MAGIC:
         damage = _step_over(file, 0, "it does not begin like an MCAP file")
         yield damage
@@ -163,6 +164,8 @@ def scan(file: RecordFile) -> Iterator[Found]:
     while position < file.size:
         try:
             found = _read_record(file, position, scratch)
+            if isinstance(found, TopMessage) and isinstance(before, (Chunk, IndexSpan, Damage)):
+                _refuse_renamed_index(file, found)
         except BrokenRecordError as error:
             found = _read_damaged(file, position, str(error))
         if found is None:
@@ -170,7 +173,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         yield found
         if isinstance(found, DataEnd):
             return
-        position = found.end
+        before, position = found, found.end
 
 
 def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | None:
@@ -195,7 +198,7 @@ def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | Non
     if opcode == mcap.MESSAGE:
         return _read_message(offset, length, front)
     if opcode == mcap.MESSAGE_INDEX:
-        return IndexSpan(offset=offset, length=length)
+        return _read_index(offset, length, front)
     if opcode == mcap.ATTACHMENT:
         return _read_attachment(file, offset, length)
     if opcode == mcap.DATA_END:
@@ -232,6 +235,39 @@ def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
         raise BrokenRecordError(message)
     _, _, channel_id, _, log_time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(front)
     return TopMessage(offset=offset, length=length, channel_id=channel_id, log_time_ns=log_time_ns)
+
+
+_INDEX_FRONT = struct.Struct("<BQHI")
+"""Opcode, length, channel, bytes of the entries that follow."""
+_INDEX_ENTRY_BYTES = 16
+
+
+def _read_index(offset: int, length: int, front: bytes) -> IndexSpan:
+    """A message whose opcode was altered must not pass for an index: it would be lost unsaid."""
+    size = _index_bytes(front)
+    if size % _INDEX_ENTRY_BYTES or _INDEX_FRONT.size + size > length:
+        message = "a message index is damaged: its lengths contradict each other"
+        raise BrokenRecordError(message)
+    return IndexSpan(offset=offset, length=length)
+
+
+def _refuse_renamed_index(file: RecordFile, found: TopMessage) -> None:
+    """An index whose opcode was altered must not pass for a message that nobody sent.
+
+    Raises:
+        BrokenRecordError: When what stands behind a chunk is built like its index to the byte.
+    """
+    size = _index_bytes(file.read(found.offset, _FRONT_BYTES))
+    if size and size % _INDEX_ENTRY_BYTES == 0 and _INDEX_FRONT.size + size == found.length:
+        message = "a message index calls itself a message"
+        raise BrokenRecordError(message)
+
+
+def _index_bytes(front: bytes) -> int:
+    if len(front) < _INDEX_FRONT.size:
+        message = "the file ends inside a message index"
+        raise BrokenRecordError(message)
+    return int(_INDEX_FRONT.unpack_from(front)[3])
 
 
 def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from bridge.episode.metadata import WITH, WITHOUT, EpisodeInfo
+from bridge.episode.metadata import NOTHING_EXECUTED, WITH, WITHOUT, EpisodeInfo
 from bridge.episode.topics import GATE, PLAN, cell_topic
 from bridge.errors import BridgeError, UsageError
 from bridge.geometry import se3
@@ -193,7 +193,7 @@ class Decider:
             refusals.append(Refusal(plan=plan, verdict=verdict))
             parent = plan
             why = f"the gate refused {len(refusals)} plans, the last because {reason}"
-        return Decision(plan=None, void=False, remark=f"nothing executed, {why}")
+        return Decision(plan=None, void=False, remark=f"{NOTHING_EXECUTED}, {why}")
 
     def _request(self, info: EpisodeInfo, start_seed: int, sight: GateSight | None) -> PlanRequest:
         cell = self._cell
@@ -229,7 +229,7 @@ class Decider:
         return None, ""
 
     def _nothing(self, why: str, *, void: bool) -> Decision:
-        remark = f"nothing executed, {why}"
+        remark = f"{NOTHING_EXECUTED}, {why}"
         self._note(remark)
         return Decision(plan=None, void=void, remark=remark)
 
@@ -242,7 +242,7 @@ class Decider:
             remark = f"executed without a verdict ({reason})"
             streams.event("note", now_ns, plan_id=plan.id, text=remark)
             return Decision(plan=plan, void=False, remark=remark)
-        remark = f"nothing executed, no verdict ({reason})"
+        remark = f"{NOTHING_EXECUTED}, no verdict ({reason})"
         streams.event("note", now_ns, plan_id=plan.id, text=remark)
         return Decision(plan=None, void=True, remark=remark)
 

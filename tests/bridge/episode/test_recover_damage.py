@@ -14,6 +14,7 @@ from mcap_samples import read_all, some_messages, write_official, write_ours
 from bridge.episode import schema
 from bridge.episode.check import check_episode
 from bridge.episode.mcap.damaged import MAX_CHUNK_BYTES
+from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.recover import RecoveryError, recover
 from bridge.episode.writer import EpisodeWriter, WriterConfig
@@ -168,6 +169,39 @@ def test_what_recover_writes_passes_the_check_whatever_the_damage(
         for left in tmp_path.glob(f"m{seed}.*"):
             left.unlink()
     assert not faults
+
+
+def test_an_index_that_calls_itself_a_message_adds_none(tmp_path: Path) -> None:
+    """One flipped bit of an opcode; nothing outside chunks has a CRC."""
+    whole = write_official(tmp_path / "w.mcap", MESSAGES)
+    with whole.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    places = [at for item in summary.chunk_indexes for at in item.message_index_offsets.values()]
+    data = bytearray(whole.read_bytes())
+    for at in places:
+        assert data[at] == MESSAGE_INDEX
+        data[at] = MESSAGE
+    part = tmp_path / "d.mcap.part"
+    part.write_bytes(data)
+    report = recover(part)
+    assert report.output is not None
+    assert set(read_all(report.output)) == set(MESSAGES)
+    assert "calls itself a message" in report.reason
+
+
+def test_a_message_that_calls_itself_an_index_is_not_lost_unsaid(tmp_path: Path) -> None:
+    whole = write_official(tmp_path / "w.mcap", MESSAGES, chunked=False)
+    data = bytearray(whole.read_bytes())
+    at = data.index(MESSAGES[20].data) - MESSAGE_HEAD.size
+    assert data[at] == MESSAGE
+    data[at] = MESSAGE_INDEX
+    part = tmp_path / "d.mcap.part"
+    part.write_bytes(data)
+    report = recover(part)
+    assert report.output is not None
+    assert set(MESSAGES) - set(read_all(report.output)) == {MESSAGES[20]}
+    assert report.bytes_lost >= len(MESSAGES[20].data)
 
 
 def test_a_chunk_head_that_lies_about_its_times_is_put_right(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import robot_gst
-from bridge.record.episode_recording import EpisodeFiles
+from bridge.record.episode_files import EpisodeFiles
 
 
 def main() -> None:
