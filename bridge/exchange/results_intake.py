@@ -27,6 +27,7 @@ from bridge.exchange.table_text import (
     TableOptions,
     TableText,
     open_table,
+    plain_name,
     read_rows,
     rows_of,
 )
@@ -111,6 +112,11 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     if "statistic" in header:
         return Taken(path=path, kind=PUBLISHED, summary=f"{path.name}: rates with printed figures")
     if "side" in header and not set(FIGURES) & set(header):
+        named = [name for name in table.left if plain_name(name) == "outcome"]
+        if named and "recorded" not in header:  # it says itself that it is the outcome
+            mapped = ",".join(filter(None, (options.map, f"outcome={named[0]}")))
+            options = replace(options, map=mapped)
+            table = open_table(path, known, options, near=False)
         trials = read_trials_by_side(path, options)
         understood = table.understood("trials of either side, without pairs", len(trials))
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))

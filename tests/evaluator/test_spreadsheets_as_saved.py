@@ -267,6 +267,9 @@ def test_a_table_of_single_rollouts_on_either_side_is_an_unpaired_study(
     assert (groups["A"].recorded.k, groups["A"].recorded.n) == (14, 20)
     assert (groups["A"].sim.k, groups["A"].sim.n) == (160, 200)
     assert (groups["B"].recorded.k, groups["B"].sim.k) == (8, 90)
+    named = write_table("\n".join(["Task,Policy,Side,Outcome", *lines[1:]]) + "\n")
+    assert "'Outcome' read as recorded" in take(named).summary
+    assert compare_csv(named).groups == comparison.groups
 
 
 def test_a_rollout_on_no_known_side_is_refused(write_table: Callable[[str], Path]) -> None:
