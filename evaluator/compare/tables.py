@@ -30,6 +30,9 @@ SIM_NOTE = (
 )
 
 
+UNPAIRED_NOTE = "Each side counts its own trials; none was made on both."
+
+
 METHOD_NAMES = {
     "wilson": "Wilson",
     "clopper-pearson": "Clopper-Pearson",
@@ -50,15 +53,19 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     return text
 
 
-def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NOTE) -> Table:
+def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "") -> Table:
     """Success without and with replanning, in the twin and recorded.
 
     Args:
         groups: Success rates per task, condition and policy.
         word: What the recorded side is called: stand-in, real or recorded.
-        sim_note: What the twin's rate is, the first sentence of the note.
+        source_note: Where rates come from that are no rates of our trials.
     """
-    shown = [side for group in groups for side in (group.sim, group.recorded)]
+    paired = any(group.trial_table is not None for group in groups)
+    one_sided = any(group.sim.n for group in groups) and not paired
+    parts = [source_note or (UNPAIRED_NOTE if one_sided else SIM_NOTE), _brackets(_sides(groups))]
+    if paired:
+        parts.append("The difference is over trials where both sides are known.")
     rows = tuple(
         (
             group.task,
@@ -81,9 +88,12 @@ def success_table(groups: Sequence[RateGroup], word: str, sim_note: str = SIM_NO
             *(*RATE_COLUMNS, f"sim - {word} (pp)", "why undefined"),
         ),
         rows=rows,
-        note=f"{sim_note} {_brackets(shown)} The difference is over trials where both sides are "
-        "known.",
+        note=" ".join(parts),
     )
+
+
+def _sides(groups: Sequence[RateGroup]) -> list[Measurement]:
+    return [side for group in groups for side in (group.sim, group.recorded)]
 
 
 def _gap(group: RateGroup) -> float | None:
