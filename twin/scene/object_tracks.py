@@ -2,8 +2,9 @@
 
 A trial is localised while nothing is executed. In between nobody looks, but the joints and the
 fingers say what happened: an object between the fingers when they stop closing goes with the tool
-until they open. What localisation and joints disagree about is spread evenly over the carry, so
-that nothing jumps where it is put down. An object that is found far from where it was let go fell,
+until they open. Closing, they push a box until it fits between the pads, as far apart as recorded.
+What localisation and joints disagree about is spread evenly over the carry, so that nothing jumps
+where it is put down. An object that is found far from where it was let go fell,
 and one that was never held was moved by something else: both change place when that is known.
 """
 
@@ -32,14 +33,21 @@ MOVED_M = 0.005
 """Less than this is the scatter of localisation."""
 EMPTY_M = 0.002
 """Fingers that close to less have nothing between them."""
+PAD_M = 0.0015
+"""So much more or less than the recorded opening a box between the pads may measure."""
+_TURNS_RAD = np.radians(sorted(np.arange(-45.0, 45.5, 0.5), key=abs))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
     """A stretch of time in which the fingers were closed around something."""
 
+    closing_ns: int
+    """From here on they came nearer to each other than half way."""
     start_ns: int
     end_ns: int
+    width_m: float
+    """Between the pads when they stopped."""
     T_base_tcp_start: Float[np.ndarray, "4 4"]
     T_base_tcp_end: Float[np.ndarray, "4 4"]
 
@@ -53,25 +61,36 @@ class _Rest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Carry:
-    """From here on it moves with the tool, its place in the hand changing evenly."""
+class _Change:
+    """From here on its pose changes evenly, in the base frame or in that of the tool."""
 
     start_ns: int
     end_ns: int
-    T_tcp_start: Float[np.ndarray, "4 4"]
-    T_tcp_end: Float[np.ndarray, "4 4"]
+    T_start: Float[np.ndarray, "4 4"]
+    T_end: Float[np.ndarray, "4 4"]
 
-    def T_tcp_object(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
-        """Where it is in the hand."""
+    def pose(self, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
+        """Where it is then."""
         share = (stamp_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
-        return _between(self.T_tcp_start, self.T_tcp_end, float(np.clip(share, 0.0, 1.0)))
+        return _between(self.T_start, self.T_end, float(np.clip(share, 0.0, 1.0)))
+
+
+class _Push(_Change):
+    """The closing fingers push it; poses ``T_base_object``."""
+
+
+class _Carry(_Change):
+    """It moves with the tool; poses ``T_tcp_object``."""
+
+
+_Span = _Rest | _Push | _Carry
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectTracks:
     """Poses of objects over source time, in the frame in which cameras see them."""
 
-    spans: Mapping[str, Sequence[_Rest | _Carry]] = field(default_factory=dict)
+    spans: Mapping[str, Sequence[_Span]] = field(default_factory=dict)
     """By object, in the order of time; the first also holds before it."""
     paths: Mapping[str, PoseTrajectory] = field(default_factory=dict)
     """Objects whose poses are known at every instant, as in a replay."""
@@ -97,7 +116,9 @@ class ObjectTracks:
             begun = [span for span in spans if span.start_ns <= stamp_ns]
             span = begun[-1] if begun else spans[0]
             if isinstance(span, _Carry) and T_base_tcp is not None:
-                found[name] = T_base_tcp @ span.T_tcp_object(stamp_ns)
+                found[name] = T_base_tcp @ span.pose(stamp_ns)
+            elif isinstance(span, _Push):
+                found[name] = span.pose(stamp_ns)
             else:
                 rests = [item for item in begun or spans if isinstance(item, _Rest)]
                 found[name] = rests[-1].T_base_object
@@ -169,7 +190,7 @@ def carried_tracks(
             the end of an execution.
     """
     robot = None if track is None else load_robot(track.urdf)
-    spans: dict[str, list[_Rest | _Carry]] = {}
+    spans: dict[str, list[_Span]] = {}
     notes, absent = [], set()
     for name, model in task.objects.items():
         seen = _seen(name, localised)
@@ -217,7 +238,16 @@ def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns:
             continue
         t0, t1 = int(stamps[held[0]]), int(stamps[held[-1]])
         T0, T1 = (robot.T_base_tcp(track.at(t).joints_rad) for t in (t0, t1))
-        grips.append(Grip(start_ns=t0, end_ns=t1, T_base_tcp_start=T0, T_base_tcp_end=T1))
+        grips.append(
+            Grip(
+                closing_ns=int(stamps[first]),
+                start_ns=t0,
+                end_ns=t1,
+                width_m=float(width_m[held[0]]),
+                T_base_tcp_start=T0,
+                T_base_tcp_end=T1,
+            )
+        )
     return grips
 
 
@@ -236,17 +266,19 @@ def _seen(
 
 def _moved(
     model: ObjectModel,
-    before: Sequence[_Rest | _Carry],
+    before: Sequence[_Span],
     grips: Sequence[Grip],
     after: Float[np.ndarray, "4 4"] | None,
     end_ns: int,
-) -> tuple[list[_Rest | _Carry], str]:
+) -> tuple[list[_Span], str]:
     """What one execution did to an object, and what had to be assumed."""
     (T,) = [item.T_base_object for item in before[-1:] if isinstance(item, _Rest)]
-    added: list[_Rest | _Carry] = []
+    added: list[_Span] = []
     own = _held(model, T, grips)
     for index, grip in enumerate(own):
-        in_hand = se3.invert(grip.T_base_tcp_start) @ T
+        in_hand = _between_pads(model, se3.invert(grip.T_base_tcp_start) @ T, grip.width_m)
+        taken = grip.T_base_tcp_start @ in_hand
+        added.append(_Push(start_ns=grip.closing_ns, end_ns=grip.start_ns, T_start=T, T_end=taken))
         put_in_hand, T = in_hand, grip.T_base_tcp_end @ in_hand
         if after is not None and index == len(own) - 1:
             found = _turned_alike(after, T, model)
@@ -256,8 +288,8 @@ def _moved(
             _Carry(
                 start_ns=grip.start_ns,
                 end_ns=grip.end_ns,
-                T_tcp_start=in_hand,
-                T_tcp_end=put_in_hand,
+                T_start=in_hand,
+                T_end=put_in_hand,
             ),
             _Rest(start_ns=grip.end_ns, T_base_object=T),
         ]
@@ -292,6 +324,27 @@ def _held(
             own.append(grip)
             T = grip.T_base_tcp_end @ in_hand
     return own
+
+
+def _between_pads(
+    model: ObjectModel, T_tcp_object: Float[np.ndarray, "4 4"], width_m: float
+) -> Float[np.ndarray, "4 4"]:
+    """Push a box as closing fingers do: between the pads, turned until it fits their distance.
+
+    The pads stand across the tool's y axis, equally far from it. A box that fits at no turn was
+    tilted in a way that nobody saw: it is put midway as it lay. The sides of any other shape are
+    not known as well: it stays where it was.
+    """
+    if model.shape != "box":
+        return T_tcp_object
+    T = T_tcp_object.copy()
+    T[1, 3] = 0.0  # a box has its origin at its centre
+    turns = (se3.rotation_from_vector(np.array([0.0, 0.0, turn])) for turn in _TURNS_RAD)
+    for R in (turn @ T_tcp_object[:3, :3] for turn in turns):  # the least one that fits
+        if abs(np.abs(R[1]) @ np.array(model.size_m) - width_m) <= PAD_M:
+            T[:3, :3] = R
+            break
+    return T
 
 
 def _turned_alike(

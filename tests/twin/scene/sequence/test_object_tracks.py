@@ -52,7 +52,8 @@ def tracks(
     return carried_tracks(records, {"plan_1": (S, 9 * S)}, TASK, track)
 
 
-IN_HAND = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.005, -0.004, 0.01]))
+IN_HAND = se3.transform_from(np.array([0.95, 0.0, 0.3, 0.0]), np.array([0.005, 0.0, 0.01]))
+"""Tilted about the line between the pads, so that it fits between them."""
 
 
 def test_what_the_fingers_close_on_goes_with_the_tool_and_stays_where_they_open() -> None:
@@ -110,6 +111,36 @@ def test_a_fall_and_a_push_are_said_and_change_the_place_at_once(
     at = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in (before_s, moved_s)]
     np.testing.assert_allclose(at[0], was, atol=1e-9)
     np.testing.assert_allclose(at[1], after, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "held_m", "left_deg"),
+    [
+        (20.0, 0.04, 0.0),  # taken by its faces
+        (20.0, 0.04 * (np.cos(np.radians(20)) + np.sin(np.radians(20))), 20.0),  # by its edges
+        (-30.0, 0.04 * (np.cos(np.radians(12)) + np.sin(np.radians(12))), -12.0),
+    ],
+)
+def test_closing_fingers_push_a_cube_until_it_fits_between_them(
+    turn_deg: float, held_m: float, left_deg: float
+) -> None:
+    """Laws: nothing jumps, the cube ends midway between the pads and turns by the least."""
+    track = posture_track(held_m)
+    turn = se3.rotation_from_vector(np.array([0.0, 0.0, np.radians(turn_deg)]))
+    lies = np.eye(4)
+    lies[:3, :3], lies[:3, 3] = turn, (0.004, 0.012, 0.003)
+    before = T_tcp(3, track) @ lies
+    found = tracks(before, None, track)
+    times_s = np.arange(2.5, 6.9, 0.005)
+    poses = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in times_s]
+    steps = np.linalg.norm(np.diff([T[:3, 3] for T in poses], axis=0), axis=1)
+    assert steps.max() < 0.005
+    np.testing.assert_allclose(poses[0], before, atol=1e-12)
+    in_hand = se3.invert(T_tcp(5, track)) @ found.at(5 * S, T_tcp(5, track))["cube"]
+    np.testing.assert_allclose(in_hand[:3, 3], [0.004, 0.0, 0.003], atol=1e-9)
+    assert abs(np.abs(in_hand[1, :3]).sum() * 0.04 - held_m) < 0.0016
+    left = np.degrees(np.arctan2(in_hand[1, 0], in_hand[0, 0]))
+    assert left == pytest.approx(left_deg, abs=3.0)
 
 
 def test_an_object_far_from_the_fingers_is_not_carried() -> None:
