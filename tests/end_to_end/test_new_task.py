@@ -24,7 +24,7 @@ SMALL = {
 COMMANDS = ["task", "task", "record", "publish", "ls", "info", "rebuild", "replay", "evaluate"]
 RECORDED, READ = COMMANDS.index("record"), COMMANDS.index("ls")
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unchecked")]
 Recorder = Callable[[Path, str], AbstractContextManager[Any]]
 
 
