@@ -18,9 +18,20 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
+CHECK_ALL_OF, THEN_ONE_OF = 100, 10
+"""Of the calls of a function in a test the first are all checked, after them one in ten. What is
+called a thousand times is called alike; which calls are checked does not depend on other tests."""
 CHECKED = "_checked_by_the_tests"
 CONF = BeartypeConf(violation_type=jaxtyping.TypeCheckError)
 """A ``TypeError``, as the code itself would raise a moment later."""
+
+
+_tests = types.SimpleNamespace(begun=0)
+
+
+def begin_test() -> None:
+    """Count calls from zero again."""
+    _tests.begun += 1
 
 
 def install() -> None:
@@ -58,12 +69,16 @@ def checked(thing: Any) -> Any:
     if not thing.__annotations__:
         return thing
     checking: Callable[..., Any] | None = None
+    number = of_test = 0
 
     @functools.wraps(thing)
     def call(*arguments: Any, **options: Any) -> Any:
-        nonlocal checking
+        nonlocal checking, number, of_test
         __tracebackhide__ = True
-        if jaxtyping.config.jaxtyping_disable:
+        if of_test != _tests.begun:
+            number, of_test = 0, _tests.begun
+        number += 1
+        if (number > CHECK_ALL_OF and number % THEN_ONE_OF) or (jaxtyping.config.jaxtyping_disable):
             return thing(*arguments, **options)
         if checking is None:
             checking = _checking(thing)

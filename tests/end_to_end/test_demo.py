@@ -22,7 +22,7 @@ MORE = {
     "rebuild": ["--max-splats", "15000", "--max-train-frames", "20", "--max-holdout-frames", "3"],
 }
 demo._command = lambda words: command([*words, *MORE.get(words[0], [])])
-demo.DemoConfig.trials, demo.DemoConfig.iterations = 1, 100
+demo.DemoConfig.trials, demo.DemoConfig.iterations = 1, 40
 sys.exit(robot_gst.run(["demo", sys.argv[1], "--quick", "--no-serve"]))
 """
 """The command as it is, with smaller pictures, half the trials and a fraction of the rebuild."""

@@ -3,7 +3,7 @@
 import importlib.util
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +12,7 @@ from typing import Any
 import lean_checks
 import numpy as np
 import pytest
+from coarse_model import coarse_model
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
@@ -22,7 +23,6 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.verdict import Factor, Verdict
 from evaluator.compare import Comparison, compare_run
-from evaluator.statistics.hierarchical import AgreementModel
 
 START_NS = 10_000_000_000
 STEP_NS = 100_000_000
@@ -317,7 +317,7 @@ def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 @pytest.fixture(scope="session")
 def everything(evaluation_run_once: RunFolder) -> Comparison:
     """The evaluation of that run."""
-    with lean_checks.unchecked():
+    with lean_checks.unchecked(), coarse_model():
         return compare_run(evaluation_run_once)
 
 
@@ -333,7 +333,8 @@ def load_golden_script() -> Callable[[str], ModuleType]:
     return golden_script
 
 
-@pytest.fixture
-def few_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Integrate the model of agreement coarsely: for tests of what is said, not of how exactly."""
-    monkeypatch.setattr(AgreementModel, "_enough", lambda _: 512)
+@pytest.fixture(scope="module", autouse=True)
+def few_nodes() -> Iterator[None]:
+    """Be coarse everywhere; tests of the model itself replace this by a fixture of this name."""
+    with coarse_model():
+        yield

@@ -25,9 +25,7 @@ from evaluator.run_reader import inventory
 from evaluator.run_reader.episodes import DerivedFacts, DerivedFile, DerivedIndex
 from evaluator.run_reader.inventory import RunFile
 
-pytestmark = pytest.mark.usefixtures(
-    "unchecked", "few_nodes"
-)  # a first evaluation is checked elsewhere
+pytestmark = pytest.mark.usefixtures("unchecked")  # a first evaluation is checked elsewhere
 
 
 def again(run: RunFolder, **asked: Any) -> Comparison:

@@ -21,8 +21,6 @@ from evaluator.report.wording import measurement_text
 from evaluator.result import load_results
 from evaluator.statistics.sequential import sequence_of
 
-pytestmark = pytest.mark.usefixtures("few_nodes")
-
 HEADER = "trial_id,task,condition,policy,start_id,recorded,sim_planned,verdict,p_success\n"
 
 

@@ -45,6 +45,11 @@ def swapped(counts: Counts) -> list[GroupCounts]:
     return [GroupCounts(recorded=(c, d), sim=(a, b), task=task) for task, a, b, c, d in counts]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_nodes() -> None:
+    """Let the evaluator be as exact as it is for users."""
+
+
 @pytest.fixture(scope="module")
 def eight() -> AgreementModel:
     return AgreementModel(groups_of(EIGHT), num_nodes=NODES)

@@ -17,8 +17,6 @@ from evaluator.errors import AlikeNamesError
 from evaluator.measurements import slug
 from evaluator.result import Results
 
-pytestmark = pytest.mark.usefixtures("few_nodes")
-
 HEADER = "trial_id,task,condition,recorded,sim_planned\n"
 
 

@@ -10,8 +10,6 @@ import pytest
 from evaluator.compare.published import OTHERWISE, SWAPPED, check_published
 from evaluator.compare.rows import RateGroup
 
-pytestmark = pytest.mark.usefixtures("few_nodes")
-
 FOLDER = Path(__file__).resolve().parents[2] / "datasets" / "published"
 TABLES = sorted(FOLDER.glob("*.csv"))
 

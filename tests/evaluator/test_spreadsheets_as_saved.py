@@ -21,8 +21,6 @@ from evaluator.compare import compare_csv
 from evaluator.compare.several import compare_several
 from evaluator.errors import AlikeNamesError
 
-pytestmark = pytest.mark.usefixtures("few_nodes")
-
 PLAIN = "trial_id,task,policy,recorded,sim_planned,p_success\na,cup,A,success,failure,0.85\n"
 MAPPED = TableOptions(map="outcome=Result,task=Scenario")
 

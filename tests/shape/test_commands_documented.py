@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from cyclopts import App
 
 import robot_gst
 from robot_gst import COMMANDS, GROUPS
@@ -32,11 +33,15 @@ def test_every_command_stands_in_the_table_of_commands() -> None:
     assert missing == []
 
 
+@pytest.fixture(scope="module")
+def app() -> App:
+    return robot_gst.build_app()
+
+
 @pytest.mark.parametrize("line", command_lines())
-def test_a_documented_command_is_understood(line: str) -> None:
+def test_a_documented_command_is_understood(line: str, app: App) -> None:
     for command in line.split(" && "):
         tokens = shlex.split(command.rstrip("& "), comments=True)[1:]
-        app = robot_gst.build_app()
         if "--config" in tokens:  # taken by the front door before the command is parsed
             at = tokens.index("--config")
             del tokens[at : at + 2]

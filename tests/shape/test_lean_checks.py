@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jaxtyping import Float, TypeCheckError
-from lean_checks import checked
+from lean_checks import CHECK_ALL_OF, THEN_ONE_OF, begin_test, checked
 
 from bridge.clock import ns_from_s
 from bridge.geometry.se3 import invert, split
@@ -104,3 +104,22 @@ def test_the_rooms_are_checked_like_this() -> None:
     for room in ("bridge.geometry.se3", "twin.errors", "evaluator.result"):
         module = sys.modules.get(room) or importlib.import_module(room)
         assert "jaxtyping" in vars(module), f"the import hook did not see {room}"
+
+
+def test_of_many_calls_in_a_test_the_first_and_every_tenth_are_checked() -> None:
+    begin_test()
+    for _ in range(CHECK_ALL_OF - 1):
+        plain(1)
+    refused(plain, 0)
+    wrong = [number for number in range(40) if not passes(plain, 0)]
+    assert len(wrong) == 40 / THEN_ONE_OF
+    begin_test()
+    refused(plain, 0)
+
+
+def passes(call: Any, *arguments: Any) -> bool:
+    try:
+        call(*arguments)
+    except TypeCheckError:
+        return False
+    return True

@@ -4,7 +4,6 @@ A row lists where the old word must not come back: in names of files and modules
 in text (docstrings, help, messages, documents, pages). Readers of old files are exempt by name.
 """
 
-import ast
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from own_process import ROOT
+from source_facts import source_facts
 from tracked_files import tracked
 
 PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
@@ -178,21 +178,23 @@ def parts_of(identifier: str) -> list[str]:
 
 
 @cache
-def python(name: str) -> tuple[tuple[tuple[int, str], ...], tuple[tuple[int, str], ...]]:
-    """Identifiers that a file defines, and the strings it holds, each with its line."""
-    names: list[tuple[int, str]] = []
-    texts: list[tuple[int, str]] = []
-    for node in ast.walk(ast.parse((ROOT / name).read_text())):
-        match node:
-            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-                names.append((node.lineno, node.name))
-            case ast.arg():
-                names.append((node.lineno, node.arg))
-            case ast.Name(ctx=ast.Store()):
-                names.append((node.lineno, node.id))
-            case ast.Constant(value=str()):
-                texts.append((node.lineno, str(node.value)))
-    return tuple(names), tuple(texts)
+def is_left_behind(identifier: str, word: Word) -> bool:
+    """Whether an identifier is the old word or has it as a part."""
+    if word.whole and re.fullmatch(word.whole, identifier):
+        return True
+    return bool(word.names) and any(re.fullmatch(word.names, part) for part in parts_of(identifier))
+
+
+@cache
+def texts_of(name: str) -> tuple[tuple[int, str], ...]:
+    """Strings of a Python file, or all of a document, with their lines."""
+    path = ROOT / name
+    return source_facts(path).texts if name.endswith(".py") else ((1, path.read_text()),)
+
+
+@cache
+def all_text_of(name: str) -> str:
+    return "\n".join(text for _, text in texts_of(name))
 
 
 def offences(word: Word) -> Iterator[str]:
@@ -201,18 +203,15 @@ def offences(word: Word) -> Iterator[str]:
             if word.files and re.fullmatch(word.files, part):
                 yield f"{name}: the file's name"
         if name.endswith(".py"):
-            identifiers, texts = python(name)
-            for line, identifier in identifiers:
-                if word.whole and re.fullmatch(word.whole, identifier):
+            for line, identifier in source_facts(ROOT / name).defined:
+                if is_left_behind(identifier, word):
                     yield f"{name}:{line}: {identifier}"
-                if word.names and any(re.fullmatch(word.names, p) for p in parts_of(identifier)):
-                    yield f"{name}:{line}: {identifier}"
-        elif name.endswith((".md", ".html", ".js", ".toml")):
-            texts = ((1, (ROOT / name).read_text()),)
-        else:
+        elif not name.endswith((".md", ".html", ".js", ".toml")):
             continue
-        for line, text in texts:
-            for found in re.finditer(word.text, text, re.IGNORECASE) if word.text else ():
+        if not word.text or not re.search(word.text, all_text_of(name), re.IGNORECASE):
+            continue
+        for line, text in texts_of(name):
+            for found in re.finditer(word.text, text, re.IGNORECASE):
                 where = line + text[: found.start()].count("\n")
                 yield f"{name}:{where}: {found.group(0)}"
 

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,15 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from bridge.episode.run_folder import RunFolder
+
+
+@pytest.fixture(scope="module")
+def few_voxels() -> Iterator[None]:
+    """Let what a test rebuilds have coarse distances."""
+    from small_scene import coarse_distances
+
+    with coarse_distances():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,13 +1,18 @@
 """The textured room, rebuilt in a moment: to see what becomes of a scene, not how good it is."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
+import pytest
 import textured_room
 
 from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import FitConfig, InitialiseConfig, RebuildConfig
+from twin.scene.shape import static
 
 QUIET = Output(quiet=True)
 CONFIG = RebuildConfig(
@@ -16,9 +21,19 @@ CONFIG = RebuildConfig(
 )
 
 
+@contextmanager
+def coarse_distances() -> Iterator[None]:
+    """Let scenes have few voxels: their distances are tested beside what makes them."""
+    few = partial(static.StaticConfig, max_voxels=30_000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(static, "StaticConfig", few)
+        yield
+
+
 def rebuild_room(folder: Path) -> RunFolder:
     """Record a scan of the room into a new run in this folder, and rebuild it."""
     run = RunFolder.create(folder / "monday")
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
-    rebuild(run, CONFIG, QUIET)
+    with coarse_distances():
+        rebuild(run, CONFIG, QUIET)
     return run

@@ -38,6 +38,9 @@ from twin.scene.settings import (
 from twin.scene.store.calibration import write_physics
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
+pytestmark = pytest.mark.usefixtures("few_voxels")
+
+
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 

@@ -27,6 +27,9 @@ from twin.scene.settings import (
 )
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene
 
+pytestmark = pytest.mark.usefixtures("few_voxels")
+
+
 QUIET = Output(quiet=True)
 CONFIG = RebuildConfig(
     fit=FitConfig(iterations=120, threads=1),

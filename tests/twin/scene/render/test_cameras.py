@@ -18,6 +18,8 @@ from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import write_calibration
 from twin.scene.store.folder import read_record, write_record
 
+pytestmark = pytest.mark.usefixtures("few_voxels")
+
 
 def change(run: RunFolder, edit: Callable[[dict[str, Any]], object]) -> None:
     record = read_record(run)

@@ -13,6 +13,9 @@ from twin.scene.gaussians import GaussianCloud, as_float32, read_ply
 from twin.scene.other_viewers import for_other_viewers
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
+pytestmark = pytest.mark.usefixtures("few_voxels")
+
+
 CAMERA = Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 
 

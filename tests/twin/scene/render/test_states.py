@@ -38,6 +38,9 @@ from twin.scene.store.folder import (
     write_record,
 )
 
+pytestmark = pytest.mark.usefixtures("few_voxels")
+
+
 T_BLOB = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.1]))
 EYE = {"eye": (0.0, -0.8, 0.6), "target": (0.0, 0.1, 0.0)}
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
