@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import PointCloudSample
@@ -28,14 +28,14 @@ class SoftNodes:
     @property
     def rest_m(self) -> Float[np.ndarray, "num_nodes 3"]:
         """The object unbent."""
-        return self.points_m[0]
+        return np.asarray(self.points_m[0])
 
     def at(self, stamp_ns: float) -> Float[np.ndarray, "num_nodes 3"]:
         """Interpolate between states; before the first and after the last it is that one."""
         place = float(np.interp(stamp_ns, self.stamps_ns, np.arange(len(self.stamps_ns))))
         before, share = int(place), place - int(place)
         after = min(before + 1, len(self.stamps_ns) - 1)
-        return (1 - share) * self.points_m[before] + share * self.points_m[after]
+        return np.asarray((1 - share) * self.points_m[before] + share * self.points_m[after])
 
 
 def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
@@ -60,7 +60,7 @@ def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
         return None
     points_m = np.stack([sample.points_m for sample in samples]).astype(np.float64)
     # Later states of one that burst are left out.
-    whole: Bool[np.ndarray, " num_states"] = np.isfinite(points_m).all(axis=(1, 2))
+    whole = np.asarray(np.isfinite(points_m).all(axis=(1, 2)))
     if not whole[0]:
         return None
     count = len(whole) if whole.all() else int(whole.argmin())

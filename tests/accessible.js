@@ -81,6 +81,7 @@
     const style = getComputedStyle(element);
     const back = behind(element);
     const ink = parts(element instanceof SVGElement ? style.fill : style.color);
+    for (let each = element; each; each = each.parentElement) ink[3] *= Number(getComputedStyle(each).opacity);
     const [a, b] = [luminance(over(ink, back)), luminance(back)];
     const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
     texts += 1;

@@ -11,7 +11,8 @@ from bridge.episode.run_folder import RunFolder
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)]
 
 PAGES = (
-    *("", "?show=disagree&sort=-name", "?q=nothing+is+called+that", "numbers", "twin"),
+    *("", "?show=disagree&sort=-name", "?q=nothing+is+called+that", "?task=elsewhere"),
+    *("?condition=with_replanning", "numbers", "twin"),
     *("queue", "queue?show=flagged", "label", "label?rater=Ann", "reviews"),
     *("failures", "failures?failed=wrong_no", "compare", "compare?by=policy", "live", "methods"),
     *("episode/trial_0001", "episode/trial_0002?t=1", "episode/trial_0004", "nowhere"),
