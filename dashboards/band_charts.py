@@ -1,7 +1,9 @@
 """Imported motions as drawings: recorded band against simulators, over time and in space."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from dashboards.figures import Axis, axis
@@ -13,6 +15,10 @@ AXES = ("x", "y", "z")
 WIDTH, HEIGHT = 370, 190
 LARGEST = 340
 """The longer side of a view of paths [px]."""
+AZIMUTH_RAD, ELEVATION_RAD = math.radians(-60), math.radians(30)
+"""Where paths in space are seen from."""
+FLATTEST = 0.15
+"""The least side of the box around them, of its largest: each axis is to be seen."""
 MOST_TASKS = 12
 STILL_MM = 10.0
 """What moved less along each axis was waiting, as for the evaluator."""
@@ -42,6 +48,8 @@ class BandChart:
     band: str
     """Points of the recorded band's outline; empty without one."""
     lines: tuple[BandLine, ...]
+    labels: tuple[tuple[float, float, str], ...] = ()
+    """Words in the drawing, and where [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +83,7 @@ def band_groups(about: Mapping[str, Any]) -> tuple[BandGroup, ...]:
         charts = [_distance_chart(distances, styles)] if body == "tool" and distances else []
         charts += [_over_time(mine, place, styles) for place in range(3)]
         charts += [_view(mine, (0, 1), "from above", styles), _view(mine, (0, 2), "side", styles)]
+        charts += [_space(mine, styles)]
         groups.append(
             BandGroup(
                 task=task,
@@ -197,6 +206,65 @@ def _view(
             for path in paths
         ),
     )
+
+
+def _space(paths: Sequence[Mapping[str, Any]], styles: Mapping[str, str]) -> BandChart:
+    """Draw paths in space, all axes at one scale, in the box around them.
+
+    Below the recorded path lies its shadow on the floor of that box.
+    """
+    found = [point for path in paths for point in path["mean_mm"]]
+    bounds = [(min(column), max(column)) for column in zip(*found, strict=True)]
+    least = max(1.0, FLATTEST * max(b - a for a, b in bounds))
+    box = [(a, max(b, a + least)) for a, b in bounds]
+    low = tuple(a for a, _ in box)
+    corners = [_seen(corner) for corner in product(*box)]
+    (left, right), (bottom, top) = ((min(c), max(c)) for c in zip(*corners, strict=True))
+    scale = min((WIDTH - 40) / max(right - left, 1.0), LARGEST / max(top - bottom, 1.0))
+    height = round((top - bottom) * scale) + 60
+    x = axis(left, right, 20, 20 + (right - left) * scale)
+    y = axis(bottom, top, height - 40, height - 40 - (top - bottom) * scale)
+
+    def drawn(points: Sequence[Sequence[float]]) -> str:
+        flat = [_seen(point) for point in points]
+        return _points([u for u, _ in flat], [v for _, v in flat], x, y)
+
+    lines, labels = [], []
+    for place in range(3):
+        end = [*low]
+        end[place] = box[place][1]
+        lines.append(BandLine(name=f"axis {AXES[place]}", style="axis", points=drawn([low, end])))
+        u, v = _seen(end)
+        labels.append((x.px(u), y.px(v), AXES[place]))
+    for path in paths:
+        if path["side"] == RECORDED:
+            floor = [(px, py, low[2]) for px, py, _ in path["mean_mm"]]
+            lines.append(BandLine(name="on the floor", style="shadow", points=drawn(floor)))
+    lines += [
+        BandLine(name=path["side"], style=styles[path["side"]], points=drawn(path["mean_mm"]))
+        for path in paths
+    ]
+    spans = (f"{n} {round(a)} to {round(b)}" for n, (a, b) in zip(AXES, bounds, strict=True))
+    return BandChart(
+        title="Path in space [mm]",
+        words=f"mean paths in space, {', '.join(path['side'] for path in paths)}",
+        width=WIDTH,
+        height=height,
+        x=Axis(low=x.low, high=x.high, px_low=x.px_low, px_high=x.px_high),
+        y=Axis(low=y.low, high=y.high, px_low=y.px_low, px_high=y.px_high),
+        x_name=", ".join(spans).replace("-", "−"),
+        band="",
+        lines=tuple(lines),
+        labels=tuple(labels),
+    )
+
+
+def _seen(p_mm: Sequence[float]) -> tuple[float, float]:
+    """Project a point along parallel rays: to the right, and up."""
+    x, y, z = p_mm
+    c, s = math.cos(AZIMUTH_RAD), math.sin(AZIMUTH_RAD)
+    up = math.cos(ELEVATION_RAD) * z - math.sin(ELEVATION_RAD) * (c * x + s * y)
+    return c * y - s * x, up
 
 
 def _points(across: Sequence[float], up: Sequence[float], x: Axis, y: Axis) -> str:

@@ -329,6 +329,8 @@ def _bar(span: Span, x: Axis) -> Bar:
 
 
 SIZE = 360
+BESIDE_PX, PER_ROW = 7.0, 5
+"""Points that coincide are drawn side by side, towards the middle, so many in a row."""
 MARKERS = ("circle", "square", "diamond", "triangle")
 
 
@@ -394,8 +396,8 @@ def scatter(groups: Sequence[RateGroup]) -> Scatter | None:
         points.append(
             Point(
                 group=group,
-                x=x + 7.0 * count,  # points that coincide are drawn side by side
-                y=y,
+                x=x + (BESIDE_PX if 2 * x < SIZE else -BESIDE_PX) * (count % PER_ROW),
+                y=y + (BESIDE_PX if 2 * y < SIZE else -BESIDE_PX) * (count // PER_ROW),
                 marker=markers[group.series],
                 x_low=None if across is None else axis_x.px(across.low),
                 x_high=None if across is None else axis_x.px(across.high),

@@ -120,15 +120,16 @@ class RateTable:
 
 
 def headline_cards(judgement: Judgement) -> tuple[Card, ...]:
-    """Choose the headline numbers; one that is not in the results is marked missing."""
-    return tuple(_card(title, pattern, below, judgement) for title, pattern, below in CARDS)
+    """Choose the headline numbers; without results all are marked missing, and say why."""
+    cards = [_card(title, pattern, below, judgement) for title, pattern, below in CARDS]
+    found = tuple(card for card in cards if card.state != "missing")
+    return found if judgement.has_results else tuple(cards)
 
 
 def _card(title: str, pattern: str, below: Sequence[str], judgement: Judgement) -> Card:
     found = _find(pattern, judgement.measurements)
     if found is None:
-        why = "not in results.json" if judgement.has_results else NO_RESULTS
-        return Card(title=title, value="missing", detail=why, state="missing")
+        return Card(title=title, value="missing", detail=NO_RESULTS, state="missing")
     more = [_find(other, judgement.measurements) for other in below]
     return Card(
         title=title,
@@ -178,6 +179,8 @@ def _names_of(group: str) -> tuple[str, str, str]:
 def rate_table(measurements: Sequence[Measurement], selection: Selection) -> RateTable | None:
     """Arrange rates by group and side; None when there are none.
 
+    A side without a rate in any group is left out; the page lists what is undefined, and why.
+
     Args:
         measurements: Everything that was measured.
         selection: Its groups come first where there are too many for one table.
@@ -185,7 +188,14 @@ def rate_table(measurements: Sequence[Measurement], selection: Selection) -> Rat
     rates = _rates(measurements)
     if not rates:
         return None
-    present = list(dict.fromkeys(side for sides in rates.values() for side in sides))
+    present = list(
+        dict.fromkeys(
+            side
+            for sides in rates.values()
+            for side, rate in sides.items()
+            if rate.value is not None or side in ("recorded", SIM_SIDE)
+        )
+    )
     known = [side for side in SIDE_WORDS if side in present]
     sides = [*known, *(side for side in present if side not in known)]
     rows = []

@@ -91,6 +91,8 @@ class QueuePage:
     """How many trials each choice of ``SHOW`` holds."""
     page: int
     num_pages: int
+    only_from_table: bool
+    """Whether all trials of the run come from a table: there is nothing to look at."""
     problems: tuple[str, ...]
 
 
@@ -162,6 +164,7 @@ def build_queue(
         counts={name: len(rows) for name, rows in chosen.items()},
         page=page,
         num_pages=num_pages,
+        only_from_table=not chosen[""] and bool(judgement.rows),
         problems=tuple(problems),
     )
 

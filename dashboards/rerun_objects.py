@@ -2,8 +2,8 @@
 
 Recorded ones (``/localised/<id>``) have their own colours and are there from the first instant on,
 as on the page of a trial; replayed ones are tinted in their trajectory's colour and stand at their
-start until the replay begins. Where the twin came nearest to what it may not touch is a line
-between the two points.
+start until the replay begins, soft ones bent as it bent them. Where the twin came nearest to what
+it may not touch is a line between the two points.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -27,7 +27,9 @@ from dashboards.recording import PageClock, Recording
 from dashboards.rerun_file import RerunFile
 
 if TYPE_CHECKING:  # loads the twin
+    from dashboards.soft_nodes import SoftNodes
     from dashboards.trial_scene import TrialScene
+    from twin.scene.gaussians import GaussianCloud
 
 BACKGROUND = "background.ply"
 SCENE = "scene"
@@ -35,6 +37,12 @@ MAX_SPLATS = 300_000
 """More than this is slow in the web viewer (measured); the largest and most opaque are kept."""
 MAX_OBJECT_SPLATS = 20_000
 """Of one object, once for each replay that moves it."""
+MAX_SOFT_SPLATS = 5_000
+"""Of a soft object: each is written again for every instant at which it is bent in another way."""
+MAX_BENT = 400_000
+"""Positions and turns of one soft object in one replay, 28 bytes each."""
+BENT_HZ, BENT_M = 20.0, 0.3e-3
+"""How often a soft object is bent at most, and how far one of its Gaussians moves in between."""
 SH_DC = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 TINT = 0.55
@@ -114,16 +122,17 @@ def _opacity(table: Float[np.ndarray, "num_splats 14"]) -> Float[np.ndarray, " n
 
 
 def _splats(
-    table: Float[np.ndarray, "num_splats 14"], tint: Color | None = None
+    table: Float[np.ndarray, "num_splats 14"], tint: Color | None = None, *, placed: bool = True
 ) -> rr.GaussianSplats3D:
+    """What Rerun draws of Gaussians; positions and turns only where they are ``placed``."""
     rgb = table[:, 3:6] * SH_DC + 0.5
     if tint is not None:
         rgb = (1 - TINT) * rgb + TINT * np.array(tint) / 255
     rgba = np.concatenate([rgb, _opacity(table)[:, None]], axis=1)
-    return rr.GaussianSplats3D(
-        centers=table[:, 0:3],
+    return rr.GaussianSplats3D.from_fields(
+        centers=table[:, 0:3] if placed else None,
         scales=np.exp(table[:, 7:10]),
-        quaternions=np.roll(table[:, 10:14], -1, axis=1),
+        quaternions=np.roll(table[:, 10:14], -1, axis=1) if placed else None,
         colors=(np.clip(rgba, 0, 1) * 255 + 0.5).astype(np.uint8),
         spherical_harmonics_degree=0,
     )
@@ -169,8 +178,8 @@ def log_object(
 class ShownObjects:
     """What the rebuilt scene and the localisation know of a recording's objects."""
 
-    clouds: Mapping[str, Float[np.ndarray, "num_splats 14"]] = field(default_factory=dict)
-    """Gaussians of each object in its own frame, as ``read_splats`` gives them."""
+    clouds: "Mapping[str, GaussianCloud]" = field(default_factory=dict)
+    """Gaussians of each object in its own frame."""
     recorded: Mapping[str, PoseTrajectory] = field(default_factory=dict)
     """Where they were, from the first instant on; empty for a replay that is shown alone."""
     T_base_root: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -237,18 +246,23 @@ def _recorded_tracks(scene: "TrialScene", clock: PageClock) -> dict[str, PoseTra
     return tracks
 
 
-def _clouds(scene: "TrialScene") -> dict[str, Float[np.ndarray, "num_splats 14"]]:
-    """The objects' Gaussians in the columns of ``read_splats``, the largest and most opaque."""
-    found = {}
-    for name, item in {} if scene.parts is None else scene.parts.objects.items():
-        cloud = item.cloud
-        logits = cloud.opacities_logit[:, None]
-        harmonic = (cloud.colors - 0.5) / SH_DC
-        parts = (cloud.means_m, harmonic, logits, cloud.scales_log, cloud.quats_wxyz)
-        table = np.concatenate(parts, axis=1)
-        if len(table):
-            found[name] = table[_kept(table, MAX_OBJECT_SPLATS)]
-    return found
+def _clouds(scene: "TrialScene") -> "dict[str, GaussianCloud]":
+    """The objects' Gaussians, the largest and most opaque."""
+    items = {} if scene.parts is None else scene.parts.objects
+    clouds = {name: item.cloud for name, item in items.items() if len(item.cloud)}
+    return {name: _reduced(cloud, MAX_OBJECT_SPLATS) for name, cloud in clouds.items()}
+
+
+def _reduced(cloud: "GaussianCloud", most: int) -> "GaussianCloud":
+    return cloud.take(_kept(_table(cloud), most))
+
+
+def _table(cloud: "GaussianCloud") -> Float[np.ndarray, "num_splats 14"]:
+    """Gaussians in the columns of ``read_splats``."""
+    harmonic = (cloud.colors - 0.5) / SH_DC
+    logits = cloud.opacities_logit[:, None]
+    parts = (cloud.means_m, harmonic, logits, cloud.scales_log, cloud.quats_wxyz)
+    return np.concatenate(parts, axis=1)
 
 
 def log_recorded(file: RerunFile, shown: ShownObjects, task: Task | None) -> None:
@@ -263,13 +277,44 @@ def log_recorded(file: RerunFile, shown: ShownObjects, task: Task | None) -> Non
         entity = f"localised/{name}"
         log_object(file, entity, _moved(track, shown.T_base_root), task)
         if name in shown.clouds:
-            file.always(f"{entity}/gaussians", _splats(shown.clouds[name]))
+            file.always(f"{entity}/gaussians", _splats(_table(shown.clouds[name])))
+
+
+def soft_nodes(
+    file: RerunFile, replay: Recording, task: Task | None, shown: ShownObjects
+) -> "dict[str, SoftNodes]":
+    """Read how a replay bends the soft objects that are shown, on its own clock.
+
+    Args:
+        file: Notes which one is not bent.
+        replay: The replay; a recording bends none.
+        task: Knows which objects are soft.
+        shown: What objects look like.
+    """
+    names = [] if task is None else [name for name in task.soft_objects if name in shown.clouds]
+    if replay.derived is None or not names:
+        return {}
+    from dashboards.soft_nodes import not_bent, read_soft_nodes  # noqa: PLC0415  # loads the twin
+
+    found = {}
+    for name in names:
+        try:
+            nodes = read_soft_nodes(replay, name)
+        except GstError as error:
+            file.note(str(error))
+            nodes = None
+        if nodes is None:
+            file.note(not_bent(name, replay.derived.trajectory))
+        else:
+            found[name] = nodes
+    return found
 
 
 def log_replayed(
     file: RerunFile,
     prefix: str,
     tracks: Mapping[str, PoseTrajectory],
+    soft: "Mapping[str, SoftNodes]",
     shown: ShownObjects,
     task: Task | None,
     *,
@@ -281,6 +326,7 @@ def log_replayed(
         file: The Rerun file being written.
         prefix: Of the replay's entities.
         tracks: ``T_base_object`` as the robot finds it, over the recorded source time.
+        soft: How soft ones are bent, over the same.
         shown: Gaussians, and where cameras would see what the robot finds.
         task: Knows the shapes of objects; None draws axes instead.
         color: Of its trajectory.
@@ -290,8 +336,50 @@ def log_replayed(
         Ts = np.stack([shown.as_seen(T) for T in track.transforms()])
         q, p = se3.split(shown.T_base_root @ Ts)
         log_object(file, entity, PoseTrajectory(track.stamps_ns, p, q), task, color=color)
-        if name in shown.clouds:
-            file.always(f"{entity}/gaussians", _splats(shown.clouds[name], color))
+        if name not in shown.clouds:
+            continue
+        cloud = shown.clouds[name]
+        if name in soft:
+            cloud = _reduced(cloud, MAX_SOFT_SPLATS)
+            _log_bent(file, f"{entity}/gaussians", cloud, soft[name], int(track.stamps_ns[0]))
+        splats = _splats(_table(cloud), color, placed=name not in soft)
+        file.always(f"{entity}/gaussians", splats)
+
+
+def _log_bent(
+    file: RerunFile, entity: str, cloud: "GaussianCloud", nodes: "SoftNodes", first_ns: int
+) -> None:
+    """Log where the Gaussians of a soft object are in its frame, whenever that changes.
+
+    Args:
+        file: The Rerun file being written.
+        entity: Of the Gaussians.
+        cloud: Unbent.
+        nodes: What they follow, as the rasteriser has them follow.
+        first_ns: From then on they are shown.
+    """
+    from twin.scene.skinning import bind, pose_cloud  # noqa: PLC0415  # loads the twin
+
+    binding = bind(cloud.means_m, nodes.rest_m)
+    kept: list[tuple[int, GaussianCloud]] = []
+    for stamp_ns in _bent_at(nodes.stamps_ns, len(cloud)).tolist():
+        bent = pose_cloud(cloud, binding, nodes.at(stamp_ns))
+        if not kept or np.abs(bent.means_m - kept[-1][1].means_m).max() > BENT_M:
+            kept.append((stamp_ns, bent))
+    stamps_ns = np.array([min(first_ns, kept[0][0]), *(stamp_ns for stamp_ns, _ in kept[1:])])
+    columns = rr.GaussianSplats3D.columns(
+        centers=np.concatenate([bent.means_m for _, bent in kept]),
+        quaternions=np.roll(np.concatenate([bent.quats_wxyz for _, bent in kept]), -1, axis=1),
+    )
+    file.rows(entity, stamps_ns, columns.partition([len(cloud)] * len(kept)))
+
+
+def _bent_at(stamps_ns: Int[np.ndarray, " num_states"], num_splats: int) -> np.ndarray:
+    """Instants at which an object may be bent anew, evenly spaced."""
+    first_ns, last_ns = int(stamps_ns[0]), int(stamps_ns[-1])
+    often = int((last_ns - first_ns) * 1e-9 * BENT_HZ) + 2
+    count = max(2, min(often, MAX_BENT // num_splats))
+    return np.linspace(first_ns, last_ns, count).astype(np.int64)
 
 
 def begun_at(track: PoseTrajectory, first_ns: int) -> PoseTrajectory:

@@ -38,6 +38,7 @@ from dashboards.rerun_objects import (
     log_recorded,
     log_replayed,
     log_splats,
+    soft_nodes,
 )
 from dashboards.rerun_plan import (
     ARM,
@@ -132,7 +133,11 @@ def log_side(
         tracks = {name: begun_at(track, first_ns) for name, track in tracks.items()}
     else:
         shown = replace(shown, clouds={})
-    log_replayed(file, side.prefix, tracks, shown, task, color=side.color)
+    soft = {
+        name: replace(nodes, stamps_ns=side.place_ns(nodes.stamps_ns))
+        for name, nodes in soft_nodes(file, side.recording, task, shown).items()
+    }
+    log_replayed(file, side.prefix, tracks, soft, shown, task, color=side.color)
     start_ns = side.recording.first_stamp_ns()
     if side.has_nearest and start_ns is not None:
         placed_ns = int(side.place_ns(np.array([start_ns]))[0])

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bridge.episode import streams
-from bridge.episode.cdr.messages import PointCloudSample
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -24,6 +23,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
 from dashboards.recording import PageClock, Problems, Recording
+from dashboards.soft_nodes import SoftNodes, not_bent, read_soft_nodes
 from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
@@ -31,7 +31,7 @@ from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.render import poses_in_scene
-from twin.scene.skinning import NUM_NEIGHBOURS, NUM_NODES, node_rotations
+from twin.scene.skinning import NUM_NEIGHBOURS, node_rotations
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
 
@@ -42,8 +42,6 @@ MAX_SAMPLES = 600
 RECORDED = "recorded"
 MAX_NODE_POSES = 40_000
 """Of one soft object in one replay, 28 bytes each: with many nodes they are sampled less often."""
-MAX_NODES = 1500
-"""A finer lattice is not drawn bent: the page tells no more parts than that from each other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,10 +257,9 @@ def _replayed_side(
     bends = {}
     for name in () if gathering.task is None else gathering.task.soft_objects:
         track = replay.objects.get(name)
-        nodes = None if track is None else _nodes(gathering, replay, name)
+        nodes = _nodes(gathering, replay, name)
         if track is None or nodes is None:
-            text = f"{name}: as replayed ({trajectory}) drawn without being bent"
-            gathering.problems.texts.append(text)
+            gathering.problems.texts.append(not_bent(name, trajectory))
             continue
         bends[name] = _bend(nodes, track, own_ns, correction)
     return Side(
@@ -274,47 +271,26 @@ def _replayed_side(
     )
 
 
-Nodes = tuple[Int[np.ndarray, " num_states"], Float[np.ndarray, "num_states num_nodes 3"]]
-"""When, on the replay's clock, and where."""
-
-
-def _nodes(gathering: _Gathering, replay: Recording, name: str) -> Nodes | None:
-    """Read the nodes of a soft object; None where the replay holds none that can be drawn."""
-    episode = gathering.problems.attempt(lambda: Episode.open(replay.path), None)
-    topic = None if episode is None else streams.object_pose_topics(episode).get(name)
-    if episode is None or topic is None:
-        return None
-    messages = episode.messages([f"{topic.removesuffix('pose')}nodes"])
-    found: list[PointCloudSample] = []
-    samples = gathering.problems.attempt(
-        lambda: [PointCloudSample.from_cdr(message.data) for message in messages], found
-    )
-    sizes = {len(sample.points_m) for sample in samples}
-    if len(sizes) != 1 or not NUM_NODES + 1 < max(sizes) <= MAX_NODES:
-        return None
-    points_m = np.stack([sample.points_m for sample in samples])
-    whole = np.isfinite(points_m).all(axis=(1, 2))  # later states of one that burst are left out
-    if not whole[0]:
-        return None
-    count = len(whole) if whole.all() else int(whole.argmin())
-    return np.array([sample.stamp_ns for sample in samples[:count]]), points_m[:count]
+def _nodes(gathering: _Gathering, replay: Recording, name: str) -> SoftNodes | None:
+    return gathering.problems.attempt(lambda: read_soft_nodes(replay, name), None)
 
 
 def _bend(
-    nodes: Nodes, track: PoseTrajectory, own_ns: Int[np.ndarray, " num_samples"], found: Correction
+    nodes: SoftNodes,
+    track: PoseTrajectory,
+    own_ns: Int[np.ndarray, " num_samples"],
+    found: Correction,
 ) -> Bend:
     """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
 
     Args:
-        nodes: As ``_nodes`` returns them.
+        nodes: Of the object.
         track: Poses of the object as the robot finds it.
         own_ns: The page's samples on the replay's clock, evenly spaced.
         found: Takes what is replayed to where cameras see it.
     """
-    stamps_ns, points_m = nodes
-    num_nodes = points_m.shape[1]
-    T_rest = track.at(stamps_ns[:1]).transforms()[0]
-    rest_m = se3.apply(se3.invert(T_rest), points_m[0])
+    rest_m = nodes.rest_m
+    num_nodes = len(rest_m)
     _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
     count = int(np.clip(MAX_NODE_POSES // num_nodes, 2, len(own_ns)))
     times_ns = np.linspace(own_ns[0], own_ns[-1], count)
@@ -322,11 +298,7 @@ def _bend(
     for row, (time_ns, T) in enumerate(
         zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
     ):
-        at = float(np.interp(time_ns, stamps_ns, np.arange(len(stamps_ns))))
-        before, share = int(at), at - int(at)
-        after = min(before + 1, len(stamps_ns) - 1)
-        now_m = (1 - share) * points_m[before] + share * points_m[after]
-        seen_m = found.nodes_as_seen(now_m, T)
+        seen_m = se3.apply(found.as_seen(T), nodes.at(time_ns))
         R = node_rotations(rest_m, seen_m, around[:, 1:])
         Ts[row, :, :3, :3] = R
         Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)

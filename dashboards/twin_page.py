@@ -46,6 +46,7 @@ class TwinPage:
     """All others."""
     problems: tuple[str, ...]
     next_command: str
+    """Empty where there is no recording to rebuild from."""
     stand_in: bool | None
     has_methods: bool
     """Whether renders of other methods were compared."""
@@ -75,7 +76,7 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         first=tuple(m for m in numbers if m.id in FIRST),
         measurements=tuple(m for m in numbers if m.id not in FIRST),
         problems=tuple(problems),
-        next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}",
+        next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}" if run.episodes() else "",
         stand_in=judgement.stand_in,
         has_methods=judgement.has_methods,
     )

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from bridge.episode.catalogue_store import printable
 from bridge.episode.provenance import software
-from bridge.episode.run_folder import RunFolder
+from bridge.episode.run_folder import PART, RunFolder
 from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
@@ -26,8 +26,6 @@ VERSION = 4
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
-PART = ".part"
-"""Ends the name of a file that is still being written: its size says nothing yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,7 +307,7 @@ def state_of(run: RunFolder) -> RunState:
     marks, newest_ns = list[str](), 0
     for folder in (run.episodes_dir, run.derived_dir, run.notes_dir):
         for name, size, written_ns in _files_of(folder):
-            is_part = name.endswith(PART)
+            is_part = name.endswith(PART)  # still being written: its size says nothing yet
             marks.append(f"{folder.name}/{name} {'' if is_part else f'{size} {written_ns}'}")
             newest_ns = max(newest_ns, 0 if is_part else written_ns)
     marks.sort()

@@ -30,6 +30,9 @@ FLAGS = (
 )
 """It draws on the processor, asks nobody for anything, and may be run as root."""
 
+ACCESSIBLE = Path(__file__).with_name("accessible.js")
+"""What keeps somebody from reading a page: an expression for ``Browser.ask``."""
+
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Instead of --disable-gpu, without which there is no WebGL on a machine without a GPU."""
 
@@ -134,6 +137,20 @@ class Browser:
         told = KEYS.get(key, {"text": key} if len(key) == 1 else {})
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **told)
+        if loads:
+            self.await_load(before)
+
+    def click(self, selector: str, *, loads: bool = False) -> None:
+        """Click an element as a person would, scrolled to; ``loads``: as in ``press``."""
+        before = self.num_loaded
+        x, y = self.ask(
+            "((element) => { element.scrollIntoView({ block: 'center', behavior: 'instant' });"
+            " const box = element.getClientRects()[0];"
+            " return [box.x + box.width / 2, box.y + box.height / 2]; })"
+            f"(document.querySelector({json.dumps(selector)}))"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
         if loads:
             self.await_load(before)
 

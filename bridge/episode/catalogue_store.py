@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from bridge.episode.run_folder import RunFolder, grouped_parts, part_paths
+from bridge.episode.run_folder import RunFolder, file_names, part_paths
 from bridge.errors import UsageError, refuse_outside
 
 UNLABELLED = "nobody labelled it"
@@ -83,8 +83,8 @@ class Trace:
 def scan(run: RunFolder) -> dict[str, Trace]:
     """Look at every file once; by printable name of the first part, in name order."""
     now_ns = time.time_ns()
-    names = _names(run.episodes_dir, ".mcap")
-    labels = {*_names(run.notes_dir, LABEL_SUFFIX), *_names(run.notes_dir, FLAG_SUFFIX)}
+    suffixes = (LABEL_SUFFIX, FLAG_SUFFIX)
+    labels = {name for suffix in suffixes for name in file_names(run.notes_dir, suffix)}
     return {
         printable(name): trace(
             run,
@@ -93,15 +93,8 @@ def scan(run: RunFolder) -> dict[str, Trace]:
             now_ns,
             [run.episodes_dir / part for part in parts],
         )
-        for name, parts in grouped_parts(names).items()
+        for name, parts in run.episode_parts().items()
     }
-
-
-def _names(folder: Path, suffix: str) -> list[str]:
-    try:
-        return [name for name in os.listdir(folder) if name.endswith(suffix)]  # noqa: PTH208
-    except OSError:  # not there, or not ours to read
-        return []
 
 
 def trace(

@@ -25,7 +25,7 @@ from bridge.episode.recovery_report import (
     RecoveryTally,
     to_metadata,
 )
-from bridge.episode.run_folder import RunFolder, first_part_name
+from bridge.episode.run_folder import PART, SUFFIX, RunFolder, first_part_name
 from bridge.episode.salvage import (
     CopyTarget,
     InPlaceTarget,
@@ -34,7 +34,7 @@ from bridge.episode.salvage import (
 )
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 
-PART, SUFFIX, TEMPORARY, UNREADABLE = ".part", ".mcap", ".recovering", ".unreadable"
+TEMPORARY, UNREADABLE = ".recovering", ".unreadable"
 SPARE_BYTES = 16 << 20
 """Left free beside a copy."""
 

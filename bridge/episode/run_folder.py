@@ -1,14 +1,18 @@
 """The run folder: one run is one cell."""
 
+import os
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from bridge.errors import PathNotFoundError, UsageError
 
 REFUSED_PLAN, PLAN_REPLAY = ".refused.json", ".replay.mcap"
 """What files in ``plans/`` end in: plans that the twin did not accept, and its replays of plans."""
+SUFFIX, PART = ".mcap", ".part"
+"""What an episode's file ends in, and what stands behind that while it is being written."""
 EPISODE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,120}")
 _LATER_PART = re.compile(rf"({EPISODE_ID.pattern})\.([1-9][0-9]{{0,5}})\.mcap")
 
@@ -61,9 +65,18 @@ def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
     return {group[0]: group for group in sorted(groups)}
 
 
-def first_parts(names: Collection[str]) -> list[str]:
-    """Return the names that begin an episode, sorted."""
-    return list(grouped_parts(names))
+def file_names(folder: Path, ending: str = SUFFIX) -> list[str]:
+    """Return the sorted names of a folder's files; of one that cannot be listed, none.
+
+    Args:
+        folder: Any folder of a run.
+        ending: What the names end in.
+    """
+    try:
+        found = os.listdir(folder)  # noqa: PTH208  # a fifth of the time, for many files
+    except OSError:  # not there, or not ours to read
+        return []
+    return sorted(name for name in found if name.endswith(ending))
 
 
 def _later_parts(path: Path) -> list[tuple[int, Path]]:
@@ -160,8 +173,16 @@ class RunFolder:
 
     def episodes(self) -> list[Path]:
         """Recorded episodes, in name order; of a split one, its first part."""
-        names = [path.name for path in self.episodes_dir.glob("*.mcap")]
-        return [self.episodes_dir / name for name in first_parts(names)]
+        return [self.episodes_dir / name for name in self.episode_parts()]
+
+    def episode_parts(self) -> dict[str, list[str]]:
+        """File names of each recorded episode, by the first of them, in name order."""
+        return grouped_parts(file_names(self.episodes_dir))
+
+    def unfinished(self) -> list[Path]:
+        """Files in ``episodes/`` and ``derived/`` that are being written, or were left behind."""
+        folders = (self.episodes_dir, self.derived_dir)
+        return [folder / name for folder in folders for name in file_names(folder, SUFFIX + PART)]
 
     def refuse_empty(self) -> None:
         """Raise where there is nothing to work on.
@@ -169,7 +190,7 @@ class RunFolder:
         Raises:
             UsageError: When the folder holds no episode.
         """
-        if not any(self.episodes_dir.glob("*.mcap")):
+        if not file_names(self.episodes_dir):
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)
 
@@ -179,4 +200,5 @@ class RunFolder:
 
     def derived(self, pattern: str = "*") -> list[Path]:
         """Derived episode files, in name order."""
-        return sorted(self.derived_dir.glob(f"{pattern}.mcap"))
+        names = file_names(self.derived_dir)
+        return [self.derived_dir / name for name in names if fnmatchcase(name, pattern + SUFFIX)]

@@ -1,6 +1,5 @@
 """Write the index that the review pages read: trials, files, numbers, and what they mean."""
 
-import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder, first_parts
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, PathNotFoundError
 from bridge.whole_file import write_whole
 from evaluator.cache import FOLDER, SummaryCache
@@ -27,7 +26,6 @@ from evaluator.result import Measurement, Results, Table, load_results
 from evaluator.review_index import (
     FACETS,
     NO_RESULTS,
-    PART,
     IndexedFile,
     IndexedTrial,
     index_path,
@@ -43,7 +41,6 @@ DIGITS = 9
 """Two versions of the program may sum up in another order."""
 RECORDED = "recorded"
 """The side of a band that is no engine."""
-ENDING = ".mcap"
 SHOWN_EXCLUSIONS = 200
 """Of those left out; ``results.json`` has all."""
 SHOWN_ROWS = 24
@@ -283,27 +280,17 @@ def _files(
     """Name what is no trial; what the comparison has read well is not opened again."""
     derived = {} if comparison is None else comparison.provenance.get("derived", {})
     read = {name.rpartition("/")[2] for name in derived}
-    in_episodes, in_derived = _names(run.episodes_dir), _names(run.derived_dir)
-    for name in first_parts([name for name in in_episodes if name.endswith(ENDING)]):
-        if name not in trials:
-            yield _file(run, run.episodes_dir / name)
-    for name in in_derived:
-        if name.endswith(ENDING) and name not in read:
-            found = _file(run, run.derived_dir / name)
+    for path in run.episodes():
+        if path.name not in trials:
+            yield _file(run, path)
+    for path in run.derived():
+        if path.name not in read:
+            found = _file(run, path)
             if found.error:
                 yield found
-    for folder, names in ((run.episodes_dir, in_episodes), (run.derived_dir, in_derived)):
-        for name in names:
-            if name.endswith(f"{ENDING}{PART}"):
-                reason = "not finished: still being recorded, or its recorder was stopped"
-                yield IndexedFile(name=f"{folder.name}/{name}", error=reason)
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        return sorted(os.listdir(folder))  # noqa: PTH208  # a fifth of the time, for many files
-    except OSError:  # not there, or not ours to read
-        return []
+    for path in run.unfinished():
+        reason = "not finished: still being recorded, or its recorder was stopped"
+        yield IndexedFile(name=str(path.relative_to(run.path)), error=reason)
 
 
 def _file(run: RunFolder, path: Path) -> IndexedFile:

@@ -15,7 +15,7 @@ from pathlib import Path
 from bridge.episode.catalogue_store import stamp_of
 from bridge.episode.provenance import hash_files
 from bridge.episode.reader import Episode
-from bridge.episode.run_folder import RunFolder, grouped_parts
+from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
@@ -112,8 +112,8 @@ def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inven
 def _look(run: RunFolder) -> Iterator[_Seen]:
     now_ns = time.time_ns()
     recorded, derived = run.episodes_dir, run.derived_dir
-    groups = [(recorded, parts) for parts in grouped_parts(_names(recorded)).values()]
-    groups += [(derived, [name]) for name in _names(derived)]
+    groups = [(recorded, parts) for parts in run.episode_parts().values()]
+    groups += [(derived, [path.name]) for path in run.derived()]
     for folder, names in groups:
         yield _Seen(
             folder=folder,
@@ -122,13 +122,6 @@ def _look(run: RunFolder) -> Iterator[_Seen]:
             is_derived=folder is derived,
             stamp=stamp_of([os.path.join(folder, name) for name in names], now_ns),  # noqa: PTH118
         )
-
-
-def _names(folder: Path) -> list[str]:
-    try:
-        return sorted(name for name in os.listdir(folder) if name.endswith(".mcap"))  # noqa: PTH208
-    except OSError:  # not there, or not ours to read
-        return []
 
 
 def _hash(

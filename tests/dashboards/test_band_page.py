@@ -86,7 +86,7 @@ def test_the_page_draws_every_side_in_its_own_look(imported: RunFolder, syntheti
     for legend in ("recorded (3)", "good (2)", "flat (1)"):
         assert legend in seen
     looks = set(re.findall(r'<polyline class="line ([\w-]+)"', text))
-    assert looks == {"recorded", "engine-0", "engine-1"}
+    assert looks == {"recorded", "engine-0", "engine-1", "axis", "shadow"}
     assert text.count('class="reach"') == 1 + 2 * 3  # distance, and x, y, z of tool and cup
     about = judge(imported).about
     tool, cup = band_groups(about)
@@ -95,6 +95,7 @@ def test_the_page_draws_every_side_in_its_own_look(imported: RunFolder, syntheti
         *(f"{axis} of the base frame [mm]" for axis in "xyz"),
         "Path, from above: y over x [mm]",
         "Path, side: z over x [mm]",
+        "Path in space [mm]",
     ]
     x = cup.charts[0]
     drawn = {line.name: [p.split(",") for p in line.points.split(" ")] for line in x.lines}
@@ -106,10 +107,29 @@ def test_the_page_draws_every_side_in_its_own_look(imported: RunFolder, syntheti
 
 def test_a_view_has_one_scale_for_both_axes(imported: RunFolder) -> None:
     for group in band_groups(judge(imported).about):
-        for chart in group.charts[-2:]:
+        for chart in group.charts[-3:]:
             across = abs(chart.x.px_high - chart.x.px_low) / (chart.x.high - chart.x.low)
             up = abs(chart.y.px_high - chart.y.px_low) / (chart.y.high - chart.y.low)
             assert across == pytest.approx(up)
+
+
+def test_in_space_what_moves_along_x_runs_along_that_axis(imported: RunFolder) -> None:
+    _, cup = band_groups(judge(imported).about)
+    chart = cup.charts[-1]
+    lines = {
+        line.name: [tuple(map(float, p.split(","))) for p in line.points.split(" ")]
+        for line in chart.lines
+    }
+
+    def direction(name: str) -> np.ndarray:
+        along = np.subtract(lines[name][-1], lines[name][0])
+        return along / np.linalg.norm(along)
+
+    np.testing.assert_allclose(direction("recorded"), direction("axis x"), atol=0.01)
+    np.testing.assert_allclose(direction("axis z"), [0, -1], atol=0.01)
+    assert np.ptp(lines["flat"], axis=0) == pytest.approx([0, 0])
+    assert [text for _, _, text in chart.labels] == ["x", "y", "z"]
+    assert re.match(r"x 50\d to (69\d|700), y ", chart.x_name)
 
 
 def test_hostile_tasks_and_engines_are_text(synthetic: ModuleType, tmp_path: Path) -> None:

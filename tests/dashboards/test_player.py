@@ -23,6 +23,7 @@ from dashboards.episode_page import EpisodePage, build_page
 ID = "trial_0002"
 DROPPED_S = 1 + 2.8
 """Page time at which the twin drops the cube: the plan starts after one second."""
+CAUSE = "the cube left the gripper during carry"
 
 
 @pytest.fixture
@@ -238,6 +239,39 @@ def test_keys_move_all_pictures_and_they_never_differ_in_time(
         tab.ask("window.scrollTo(0, 1500)")
         box = tab.ask("document.getElementById('clock').getBoundingClientRect().top")
         assert 0 < box < 900
+        assert not tab.complaints
+
+
+TO_A_DISAGREEMENT = (".facet a[href*='show=disagree']", ".trials tbody th a")
+"""What is clicked one after the other, from the first page on."""
+IN_VIEW = """
+((element) => {
+  const { top, bottom, width } = element.getBoundingClientRect();
+  return width > 0 && top >= 0 && bottom <= innerHeight;
+})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
+@pytest.mark.parametrize("skipped", [0, 1])
+def test_instant_and_cause_of_a_disagreement_are_at_most_three_clicks_from_the_first_page(
+    skipped: int, run: RunFolder, tmp_path: Path
+) -> None:
+    clicks = TO_A_DISAGREEMENT[skipped:]  # the worst comes first without a filter too
+    assert len(clicks) <= 3
+    with dashboard(run) as (_, url), chromium(tmp_path) as tab:
+        tab.show(url, width=1440, dark=False)
+        for selector in clicks:
+            tab.click(selector, loads=True)
+        assert tab.ask("document.querySelector('h1').innerText").split()[0] == ID
+        tab.ask_when("frames.every((f) => !f.loading && f.shown === f.wanted)")
+        clock = float(tab.ask("document.getElementById('clock').value"))
+        assert clock == pytest.approx(DROPPED_S)
+        assert tab.ask("document.querySelector('.watch p.small').innerText") == CAUSE
+        for seen in ("#divergence", ".watch p.small", ".watch .frame", ".watch .frame-time"):
+            assert tab.ask(f"{IN_VIEW}(document.querySelector('{seen}'))"), seen
+        assert tab.ask("document.querySelector('.watch .frame').naturalWidth") > 0
         assert not tab.complaints
 
 

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
@@ -14,7 +15,7 @@ import rerun.chunk as rc
 from PIL import Image
 from rerun_cell import write_localised
 from test_rerun_view import read_back
-from test_space import ID, cloud, write_space_run
+from test_space import ID, bent_nodes, cloud, soften, write_space_run
 
 from bridge.episode import schema, streams
 from bridge.episode.provenance import hash_file
@@ -23,12 +24,13 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.robots.default import ROBOT
 from bridge.task.verdict import Factor
-from dashboards import rerun_viewer
+from dashboards import rerun_objects, rerun_viewer
 from dashboards.rerun_view import export_rrd
 from twin.robot.model import load_robot
 from twin.robot.posture import posture_track
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.movable_scene import read_movable_scene
+from twin.scene.skinning import bind, pose_cloud
 from twin.scene.store.folder import read_scene
 
 Content = dict[str, dict[str, list[object]]]
@@ -149,6 +151,61 @@ def test_both_show_the_scenes_gaussians_the_replayed_ones_tinted(
     np.testing.assert_allclose(replayed[:, :3], 0.45 * own + 0.55 * blue, atol=1)
     boxes = content["/replayed/planned/dynamic/objects/cube"]["Boxes3D:colors"]
     assert next(row for row in boxes if row)[0] == 0x1D64D8FF
+
+
+def test_a_replayed_soft_object_is_bent_as_the_rasteriser_bends_it(
+    tmp_path: Path, synthetic: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write_space_run(tmp_path, synthetic)
+    axis = np.linspace(-0.055, 0.055, 7)
+    rest_m = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    soften(run, rest_m)
+    monkeypatch.setattr(rerun_objects, "MAX_SOFT_SPLATS", 60)
+    shown = export_rrd(run.episodes()[0], tmp_path / "soft.rrd", run)
+    assert not [note for note in shown.notes if "bent" in note]
+    bent = read_back(shown.path)["/replayed/planned/dynamic/objects/cube/gaussians"]
+    rows = {
+        stamp: (np.array(centers), np.array(turns))
+        for stamp, centers, turns in zip(
+            bent["source_time"],
+            bent["GaussianSplats3D:centers"],
+            bent["GaussianSplats3D:quaternions"],
+            strict=True,
+        )
+        if stamp is not None
+    }
+    assert min(rows) == synthetic.START_NS, "from the first instant on, unbent"
+    whole = read_movable_scene(run, read_scene(run)).objects["cube"].cloud
+    first_m, _ = rows[min(rows)]
+    ids = [int(np.abs(whole.means_m - p).sum(axis=1).argmin()) for p in first_m]
+    assert len(set(ids)) == 60
+    own = whole.take(np.array(ids))
+    np.testing.assert_allclose(first_m, own.means_m, atol=1e-5)
+    binding = bind(own.means_m, rest_m)
+    for wanted_s in (1.0, 2.0, 3.0):
+        stamp = min(rows, key=lambda ns: abs(ns - synthetic.EXECUTION_NS - wanted_s * SECOND_NS))
+        t_s = (stamp - synthetic.EXECUTION_NS) / SECOND_NS
+        assert abs(t_s - wanted_s) < 0.1
+        expected = pose_cloud(own, binding, bent_nodes(np.eye(4), rest_m, t_s))
+        found_m, turns = rows[stamp]
+        np.testing.assert_allclose(found_m, expected.means_m, atol=1e-3)
+        unit = expected.quats_wxyz / np.linalg.norm(expected.quats_wxyz, axis=1, keepdims=True)
+        turns = np.roll(turns / np.linalg.norm(turns, axis=1, keepdims=True), 1, axis=1)
+        assert np.abs((unit * turns).sum(axis=1)).min() > 0.999
+    assert np.abs(found_m - own.means_m).max() > 0.02, "it is bent by centimetres"
+    steps_m = [np.abs(b[0] - a[0]).max() for a, b in pairwise(rows[at] for at in sorted(rows))]
+    assert min(steps_m) > rerun_objects.BENT_M, "written again only where it moved"
+
+
+def test_an_object_whose_nodes_are_missing_is_drawn_unbent_and_that_is_noted(
+    tmp_path: Path, synthetic: ModuleType
+) -> None:
+    run = write_space_run(tmp_path, synthetic)
+    soften(run, np.zeros((4, 3)))  # too few to bend anything
+    shown = export_rrd(run.episodes()[0], tmp_path / "soft.rrd", run)
+    assert "cube: as replayed (planned) drawn without being bent" in shown.notes
+    splats = read_back(shown.path)["/replayed/planned/dynamic/objects/cube/gaussians"]
+    assert splats.get("source_time", [None]) == [None], "at all times"
 
 
 def test_the_nearest_points_appear_at_their_instant(

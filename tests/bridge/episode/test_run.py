@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from bridge.episode.run_folder import (
     RunFolder,
     first_part,
-    first_parts,
     grouped_parts,
     part_name,
     part_paths,
@@ -54,14 +53,30 @@ def test_a_name_that_only_looks_like_a_part_stands_for_itself(tmp_path: Path, na
 
 
 def test_files_of_takes_still_open_are_no_episodes(tmp_path: Path) -> None:
-    assert listed(run_with(tmp_path, "t1.mcap.part", "t1.2.mcap.part", "notes.txt")) == []
+    run = run_with(tmp_path, "t1.mcap.part", "t1.2.mcap.part", "notes.txt")
+    assert listed(run) == []
+    assert [path.name for path in run.unfinished()] == ["t1.2.mcap.part", "t1.mcap.part"]
+
+
+def test_derived_files_are_found_by_a_pattern_and_unfinished_ones_are_told_apart(
+    tmp_path: Path,
+) -> None:
+    run = run_with(tmp_path)
+    assert run.derived() == []
+    run.derived_dir.mkdir()
+    names = ["t1.localised.mcap", "t1.replay.planned.mcap", "t2.replay.planned.mcap"]
+    for name in (*reversed(names), "t3.replay.planned.mcap.part", "notes.txt"):
+        (run.derived_dir / name).write_bytes(b"")
+    assert [path.name for path in run.derived()] == names
+    assert [path.name for path in run.derived("*.replay.*")] == names[1:]
+    assert run.derived("t1.*") == [run.derived_dir / name for name in names[:2]]
+    assert run.unfinished() == [run.derived_dir / "t3.replay.planned.mcap.part"]
 
 
 @given(st.sets(st.integers(1, 12)))
 def test_every_file_belongs_to_exactly_one_episode(indices: set[int]) -> None:
     names = [part_name("a", index) for index in sorted(indices)]
-    assert first_parts(names[::-1]) == names[:1]
-    assert list(grouped_parts(names[::-1]).values()) == [names][: len(indices)]
+    assert list(grouped_parts(names[::-1]).items()) == [(name, names) for name in names[:1]]
 
 
 def test_parts_of_a_file_that_is_not_there_are_the_file_alone(tmp_path: Path) -> None:
