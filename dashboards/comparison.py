@@ -70,6 +70,13 @@ class Judgement:
         return () if self.index is None else self.index.trials(Selection())
 
     @property
+    def only_motions(self) -> bool:
+        """Whether the run holds imported motions and not one trial."""
+        if self.index is None or not self.about.get("paths"):
+            return False
+        return self.index.count(Selection()) == 0
+
+    @property
     def measurements(self) -> tuple[Measurement, ...]:
         """The numbers of ``results.json``; none before ``robot-gst evaluate``."""
         return () if self.index is None else self.index.measurements

@@ -64,6 +64,7 @@ class FailuresPage:
     of: int
     """Failures in the run."""
     num_trials: int
+    only_motions: bool
     facets: tuple[Facet, ...]
     failed: tuple[tuple[str, str, int], ...]
     """Value, words and number of each choice of who failed."""
@@ -91,6 +92,7 @@ def build_failures(
             count=0,
             of=0,
             num_trials=0,
+            only_motions=False,
             facets=(),
             failed=(),
             page=1,
@@ -111,6 +113,7 @@ def build_failures(
         count=count,
         of=_count(index, FailureSelection()),
         num_trials=index.count(Selection()),
+        only_motions=judgement.only_motions,
         facets=(*_groups(index, selection), *_parts(index, selection)),
         failed=tuple(
             (value, words, _count(index, FailureSelection(**selection.query(failed=value))))

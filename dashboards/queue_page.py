@@ -92,6 +92,7 @@ class QueuePage:
     page: int
     num_pages: int
     only_from_table: bool
+    only_motions: bool
     """Whether all trials of the run come from a table: there is nothing to look at."""
     problems: tuple[str, ...]
 
@@ -165,6 +166,7 @@ def build_queue(
         page=page,
         num_pages=num_pages,
         only_from_table=not chosen[""] and bool(judgement.rows),
+        only_motions=judgement.only_motions,
         problems=tuple(problems),
     )
 

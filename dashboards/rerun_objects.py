@@ -294,7 +294,8 @@ def soft_nodes(
     names = [] if task is None else [name for name in task.soft_objects if name in shown.clouds]
     if replay.derived is None or not names:
         return {}
-    from dashboards.soft_nodes import not_bent, read_soft_nodes  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from dashboards.soft_nodes import not_bent, read_soft_nodes  # noqa: PLC0415
 
     found = {}
     for name in names:
@@ -358,7 +359,8 @@ def _log_bent(
         nodes: What they follow, as the rasteriser has them follow.
         first_ns: From then on they are shown.
     """
-    from twin.scene.skinning import bind, pose_cloud  # noqa: PLC0415  # loads the twin
+    with LOADING:
+        from twin.scene.skinning import bind, pose_cloud  # noqa: PLC0415
 
     binding = bind(cloud.means_m, nodes.rest_m)
     kept: list[tuple[int, GaussianCloud]] = []

@@ -177,6 +177,8 @@ def gather_scene(
     known = postures if robot is not None else None
     tracks = problems.attempt(lambda: _localised(gathering, known), ObjectTracks())
     problems.texts.extend(tracks.notes)
+    if parts is not None:
+        problems.texts.extend(tracks.strangers(parts.objects))
     sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():
         side = _replayed_side(gathering, trajectory, replay, robot)

@@ -76,7 +76,9 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
         first=tuple(m for m in numbers if m.id in FIRST),
         measurements=tuple(m for m in numbers if m.id not in FIRST),
         problems=tuple(problems),
-        next_command=f"robot-gst rebuild {shlex.quote(str(run.path))}" if run.episodes() else "",
+        next_command=""
+        if judgement.only_motions or not run.episodes()
+        else f"robot-gst rebuild {shlex.quote(str(run.path))}",
         stand_in=judgement.stand_in,
         has_methods=judgement.has_methods,
     )

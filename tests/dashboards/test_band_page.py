@@ -145,3 +145,13 @@ def test_hostile_tasks_and_engines_are_text(synthetic: ModuleType, tmp_path: Pat
 def test_a_run_of_trials_keeps_no_paths(shared_run: RunFolder) -> None:
     assert "paths" not in judge(shared_run).about
     assert band_groups(judge(shared_run).about) == ()
+
+
+@pytest.mark.parametrize("page", ["/queue", "/failures", "/twin"])
+def test_pages_of_trials_do_not_ask_motions_for_trials(
+    synthetic: ModuleType, imported: RunFolder, page: str
+) -> None:
+    text = words(synthetic.browser_of(imported).get(page).text)
+    assert ("This run holds imported motions and no trial" in text) == (page != "/twin")
+    for asked in ("No trials yet", "holds no trial yet", "robot-gst rebuild", "robot-gst record"):
+        assert asked not in text

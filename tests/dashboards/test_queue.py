@@ -50,7 +50,8 @@ def test_a_wrong_yes_comes_before_a_wrong_no_and_far_before_near(shared_run: Run
         for name, (recorded, twin, far) in answers.items()
     ]
     of_a_table = replace(rows[0], episode="no recording", file="")
-    found: Any = SimpleNamespace(rows=tuple(sorted([of_a_table, *rows], key=severity)))
+    trials = tuple(sorted([of_a_table, *rows], key=severity))
+    found: Any = SimpleNamespace(rows=trials, only_motions=False)
     assert [each.episode for each in recorded_trials(found)] == [
         *("wrong_yes", "wrong_no", "nobody", "far", "near")
     ]

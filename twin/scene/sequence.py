@@ -313,22 +313,9 @@ def render_sequence(
         "robot": episode.robot,
         "frames": len(stamps),
         "frames_without_pose": len(episode.unposed),
-        "notes": [*episode.tracks.notes, *_strangers(episode.tracks, parts)],
+        "notes": [*episode.tracks.notes, *episode.tracks.strangers(parts.objects)],
         **({} if comparison is None else {"agreement": comparison.agreement.record()}),
     }
-
-
-def _strangers(tracks: ObjectTracks, parts: MovableScene) -> list[str]:
-    """What the scan had and the episode does not know, and the other way round."""
-    known = {*tracks.spans, *tracks.paths}
-    if not known:
-        return []
-    scanned = [name for name in parts.objects if name not in known]
-    new = [name for name in sorted(known) if name not in parts.objects]
-    return [
-        *(f"{name} is not of the episode's task: drawn where it was scanned" for name in scanned),
-        *(f"{name} was not scanned: the scene cannot draw it" for name in new),
-    ]
 
 
 def _check(config: RenderConfig) -> None:
