@@ -65,6 +65,7 @@ class FailuresPage:
     """Failures in the run."""
     num_trials: int
     only_motions: bool
+    """Whether the run holds imported motions and not one trial."""
     facets: tuple[Facet, ...]
     failed: tuple[tuple[str, str, int], ...]
     """Value, words and number of each choice of who failed."""

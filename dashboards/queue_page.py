@@ -92,8 +92,9 @@ class QueuePage:
     page: int
     num_pages: int
     only_from_table: bool
-    only_motions: bool
     """Whether all trials of the run come from a table: there is nothing to look at."""
+    only_motions: bool
+    """Whether the run holds imported motions and not one trial."""
     problems: tuple[str, ...]
 
 
