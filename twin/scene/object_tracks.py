@@ -26,7 +26,7 @@ from twin.scene.shape.known import yaw_period_rad
 BETWEEN_M = 0.03
 """An object this near to the tool, beside half its largest side, is between the fingers."""
 PLATEAU_M = 0.003
-"""Fingers that are this near to the least opening of a grasp hold what is between them."""
+"""Fingers that are this near to the least opening of a grasp grasp what is between them."""
 FELL_M = 0.05
 """An object found this far from where it was let go did not stay there."""
 MOVED_M = 0.005
@@ -91,7 +91,7 @@ class ObjectTracks:
     """Poses of objects over source time, in the frame in which cameras see them."""
 
     spans: Mapping[str, Sequence[_Span]] = field(default_factory=dict)
-    """By object, in the order of time; the first also holds before it."""
+    """By object, in the order of time; the first also grasps before it."""
     paths: Mapping[str, PoseTrajectory] = field(default_factory=dict)
     """Objects whose poses are known at every instant, as in a replay."""
     absent: frozenset[str] = frozenset()
@@ -200,7 +200,7 @@ def carried_tracks(
 
     Args:
         localised: The gst localisation v1 records of one episode, each with its ``phase`` and the
-            ``plan_id`` after whose execution it holds.
+            ``plan_id`` after whose execution it grasps.
         executions_ns: When each plan was executed, by its id.
         task: The objects.
         track: Joints and fingers; None where nobody recorded them: objects then change place at
@@ -290,57 +290,91 @@ def _moved(
 ) -> tuple[list[_Span], str]:
     """What one execution did to an object, and what had to be assumed."""
     (T,) = [item.T_base_object for item in before[-1:] if isinstance(item, _Rest)]
-    added: list[_Span] = []
-    own = _held(model, T, grips)
-    for index, grip in enumerate(own):
-        in_hand = _between_pads(model, se3.invert(grip.T_base_tcp_start) @ T, grip.width_m)
-        taken = grip.T_base_tcp_start @ in_hand
-        added.append(_Push(start_ns=grip.closing_ns, end_ns=grip.start_ns, T_start=T, T_end=taken))
-        put_in_hand, T = in_hand, grip.T_base_tcp_end @ in_hand
-        if after is not None and index == len(own) - 1:
-            found = _turned_alike(after, T, model)
-            if np.linalg.norm(found[:3, 3] - T[:3, 3]) < FELL_M:
-                put_in_hand, T = se3.invert(grip.T_base_tcp_end) @ found, found
-        added += [
-            _Carry(
-                start_ns=grip.start_ns,
-                end_ns=grip.end_ns,
-                T_start=in_hand,
-                T_end=put_in_hand,
-            ),
-            _Rest(start_ns=grip.end_ns, T_base_object=T),
-        ]
+    grasps = _grasps(model, T, grips)
+    added = [span for grasp in grasps[:-1] for span in _carried(grasp, grasp.T_base_put)]
+    if grasps:
+        T = _put(model, grasps[-1], after)
+        added += _carried(grasps[-1], T)
     if after is None:
         note = (
             "was not found after an execution: left where the hand put it"
-            if own
-            else ("was not found after an execution: left where it was")
+            if grasps
+            else "was not found after an execution: left where it was"
         )
         return added, note
     away_m = float(np.linalg.norm(after[:3, 3] - T[:3, 3]))
     if away_m <= MOVED_M:
         return added, ""
-    fell_ns = own[-1].end_ns if own else end_ns
+    fell_ns = grasps[-1].grip.end_ns if grasps else end_ns
     note = (
         f"lay {away_m * 100:.0f} cm from where it was let go: drawn there from then on"
-        if own
+        if grasps
         else f"was moved by {away_m * 100:.0f} cm without being held: drawn there afterwards"
     )
     return [*added, _Rest(start_ns=fell_ns, T_base_object=after)], note
 
 
-def _held(
+@dataclass(frozen=True, kw_only=True)
+class _Grasp:
+    """A grip that had the object between the fingers."""
+
+    grip: Grip
+    T_base_lay: Float[np.ndarray, "4 4"]
+    """Pose of the object before the fingers closed."""
+    T_tcp_object: Float[np.ndarray, "4 4"]
+    """Its pose in the hand when they had closed."""
+
+    @property
+    def T_base_put(self) -> Float[np.ndarray, "4 4"]:
+        """Pose of the object when they opened, if it did not slip."""
+        return np.asarray(self.grip.T_base_tcp_end @ self.T_tcp_object)
+
+
+def _grasps(
     model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"], grips: Sequence[Grip]
-) -> list[Grip]:
-    """Those grips that had this object between the fingers."""
+) -> list[_Grasp]:
+    """Those grips that had this object between the fingers, each from where the last one put it."""
     reach_m = BETWEEN_M + max(model.size_m) / 2
-    T, own = T_base_object, []
+    T, grasps = T_base_object, []
     for grip in grips:
-        in_hand = se3.invert(grip.T_base_tcp_start) @ T
-        if np.linalg.norm(in_hand[:3, 3]) < reach_m:
-            own.append(grip)
-            T = grip.T_base_tcp_end @ in_hand
-    return own
+        T_tcp_lay = se3.invert(grip.T_base_tcp_start) @ T
+        if np.linalg.norm(T_tcp_lay[:3, 3]) >= reach_m:
+            continue
+        in_hand = _between_pads(model, T_tcp_lay, grip.width_m)
+        grasps.append(_Grasp(grip=grip, T_base_lay=T, T_tcp_object=in_hand))
+        T = grasps[-1].T_base_put
+    return grasps
+
+
+def _put(
+    model: ObjectModel, grasp: _Grasp, after: Float[np.ndarray, "4 4"] | None
+) -> Float[np.ndarray, "4 4"]:
+    """Pose ``T_base_object`` when the fingers opened: as found later, if it is near enough."""
+    if after is None:
+        return grasp.T_base_put
+    found = _turned_alike(after, grasp.T_base_put, model)
+    is_there = np.linalg.norm(found[:3, 3] - grasp.T_base_put[:3, 3]) < FELL_M
+    return found if is_there else grasp.T_base_put
+
+
+def _carried(grasp: _Grasp, T_base_put: Float[np.ndarray, "4 4"]) -> list[_Span]:
+    """Pushed by the closing fingers, carried, and put down."""
+    grip = grasp.grip
+    return [
+        _Push(
+            start_ns=grip.closing_ns,
+            end_ns=grip.start_ns,
+            T_start=grasp.T_base_lay,
+            T_end=grip.T_base_tcp_start @ grasp.T_tcp_object,
+        ),
+        _Carry(
+            start_ns=grip.start_ns,
+            end_ns=grip.end_ns,
+            T_start=grasp.T_tcp_object,
+            T_end=se3.invert(grip.T_base_tcp_end) @ T_base_put,
+        ),
+        _Rest(start_ns=grip.end_ns, T_base_object=T_base_put),
+    ]
 
 
 def _between_pads(

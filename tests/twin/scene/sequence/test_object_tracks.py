@@ -1,6 +1,7 @@
 """Objects over a trial: standing until the fingers close on them, then with the tool."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -111,6 +112,31 @@ def test_a_fall_and_a_push_are_said_and_change_the_place_at_once(
     at = [found.at(round(t * S), T_tcp(t, track))["cube"] for t in (before_s, moved_s)]
     np.testing.assert_allclose(at[0], was, atol=1e-9)
     np.testing.assert_allclose(at[1], after, atol=1e-9)
+
+
+def test_a_second_grip_looks_for_a_cube_where_the_first_one_pushed_it() -> None:
+    """The first closes on its edge and pushes it midway; from where it lay the second missed it."""
+    once = posture_track()
+    t_s = once.arm.stamps_ns / S
+    times_s = [0, 2.9, 3.0, 4.0, 4.1, 5.9, 6.0, 8.0, 8.1, 10]
+    width_m = np.interp(
+        t_s, times_s, [0.085, 0.085, 0.04, 0.04, 0.085, 0.085, 0.04, 0.04, 0.085, 0.085]
+    )
+    turned = np.clip(t_s - 4.5, 0.0, 1.0)[:, None] * np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0])
+    track = PostureTrack(
+        urdf=URDF,
+        arm=replace(once.arm, position=HOME + turned),
+        widths=JointTrack(
+            names=("gripper_width",), stamps_ns=once.arm.stamps_ns, position=width_m[:, None]
+        ),
+    )
+    second = (se3.invert(T_tcp(3, track)) @ T_tcp(6, track))[:3, 3]
+    lies = np.eye(4)
+    lies[1, 3] = -0.045 * np.sign(second[1])
+    assert np.linalg.norm(second) < 0.05 < np.linalg.norm(second - lies[:3, 3])
+    found = tracks(T_tcp(3, track) @ lies, None, track)
+    in_hand = se3.invert(T_tcp(7, track)) @ found.at(7 * S, T_tcp(7, track))["cube"]
+    np.testing.assert_allclose(in_hand[1, 3], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
