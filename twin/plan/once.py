@@ -34,9 +34,9 @@ from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.config import ReplayConfig
-from twin.replay.job import cell_of, planned_grips, recorded_start
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import calibrated, for_task
+from twin.replay.run_job import cell_of, planned_grips, recorded_start
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces

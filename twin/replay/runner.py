@@ -18,8 +18,10 @@ from bridge.task.task_file import Task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.imported import MotionReplay, motion_replays, run_motion_replay
-from twin.replay.job import ReplayJob, row_of_existing, row_of_failure, run_job
+from twin.replay.job import ReplayJob
+from twin.replay.job_row import row_of_existing, row_of_failure
 from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes
+from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts
 from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.scene.store.calibration import read_calibration

@@ -16,8 +16,10 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from twin.replay.config import ChangeConfig, ReplayRunConfig
-from twin.replay.job import ReplayJob, row_of_existing, run_job
+from twin.replay.job import ReplayJob
+from twin.replay.job_row import row_of_existing
 from twin.replay.rebuilt_scene import shape_hashes
+from twin.replay.run_job import run_job
 from twin.replay.runner import Preparation, jobs_of
 from twin.scene.store.folder import scene_hash_of
 

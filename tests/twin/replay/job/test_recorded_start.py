@@ -12,7 +12,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
 from bridge.robots.default import ARM_JOINTS
-from twin.replay.job import recorded_start
+from twin.replay.run_job import recorded_start
 
 S = 1_000_000_000
 

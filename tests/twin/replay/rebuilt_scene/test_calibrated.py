@@ -19,7 +19,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayConfig
-from twin.replay.job import ReplayJob, run_job
+from twin.replay.job import ReplayJob
 from twin.replay.monte_carlo import draw_variation, sample_rng
 from twin.replay.rebuilt_scene import (
     Correction,
@@ -28,6 +28,7 @@ from twin.replay.rebuilt_scene import (
     for_task,
     read_rebuilt_scene,
 )
+from twin.replay.run_job import run_job
 from twin.replay.scene import StartState
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf

@@ -22,7 +22,9 @@ from bridge.task.record import parse_record
 from bridge.task.task_file import load_task
 from twin.replay import runner, workers
 from twin.replay.config import ReplayConfig
-from twin.replay.job import ReplayJob, row_of_existing, run_job
+from twin.replay.job import ReplayJob
+from twin.replay.job_row import row_of_existing
+from twin.replay.run_job import run_job
 from twin.replay.runner import there_already
 from twin.replay.scene import StartState
 from twin.replay.summary import count_verdicts, describe_run
@@ -186,7 +188,7 @@ import pickle, sys
 from pathlib import Path
 from twin.replay.job import ReplayJob
 from twin.replay.workers import RayRunner
-from twin.replay.job import run_job
+from twin.replay.run_job import run_job
 jobs = pickle.loads(Path(sys.argv[1]).read_bytes())
 with RayRunner("local", 1) as runner:
     rows = [answer for _, answer in runner.run(run_job, jobs, ReplayJob.cost)]

@@ -21,12 +21,13 @@ from bridge.process_pool import ProcessPool, Serial
 from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
 from bridge.terminal import Output
 from twin import cli
-from twin.replay import job as job_module
+from twin.replay import run_job as run_job_module
 from twin.replay import runner as runner_module
 from twin.replay import workers
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.divergence import diverge
-from twin.replay.job import ReplayJob, divergence_of, row_of_failure
+from twin.replay.job import ReplayJob
+from twin.replay.job_row import divergence_of, row_of_failure
 from twin.replay.result import ReplayResult
 from twin.replay.runner import Execution, execution_of
 from twin.replay.scene import StartState, StartStates
@@ -236,9 +237,11 @@ def test_engines_that_must_agree_make_a_row_null_and_say_why(
     def executed(*args: Any, plan: Any) -> ReplayResult:
         return replay(args[-1], plan)
 
-    monkeypatch.setattr(job_module, "replay_plan", planned)
-    monkeypatch.setattr(job_module, "replay_joints", executed)
-    monkeypatch.setattr(job_module, "compare", lambda *_: diverge("round-1", [], QUICK.divergence))
+    monkeypatch.setattr(run_job_module, "replay_plan", planned)
+    monkeypatch.setattr(run_job_module, "replay_joints", executed)
+    monkeypatch.setattr(
+        run_job_module, "compare", lambda *_: diverge("round-1", [], QUICK.divergence)
+    )
     for must_agree, accepted in ((False, True), (True, None)):
         replayed = replace(QUICK, engine="both", engines_must_agree=must_agree)
         summary = replay_run(run, ReplayRunConfig(replay=replayed), QUIET)
@@ -384,7 +387,7 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
     for event in events:
         event["plan_id"] = "round-1"
     monkeypatch.setattr(runner_module.streams, "events", lambda _: events)
-    monkeypatch.setattr(job_module, "_replay", lambda job: (VERDICT, None))
+    monkeypatch.setattr(run_job_module, "_replay", lambda job: (VERDICT, None))
     summary = replay_run(run, ReplayRunConfig(replay=QUICK), QUIET)
     said = {(r["plan"], r["trajectory"], r["mode"]): r for r in summary["rows"]}
     assert len(said) == 4

@@ -14,7 +14,8 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.task_file import load_task
 from twin.replay.config import ChangeConfig, ReplayConfig
-from twin.replay.job import ReplayJob, run_job
+from twin.replay.job import ReplayJob
+from twin.replay.run_job import run_job
 from twin.replay.scene import StartState
 from twin.replay.what_if import WhatIf, changed, replay_changed
 

@@ -1,0 +1,330 @@
+"""Do one replay: open its episode, replay in each engine, compare, write, report a row."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bridge.episode import schema, streams
+from bridge.episode.cdr.messages import CompressedColor
+from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, Derived
+from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
+from bridge.errors import EpisodeError, GstError
+from bridge.robots.robot import read_robot, robot_of
+from bridge.task.plan import Plan
+from bridge.task.verdict import SAME_ENGINE, Verdict, is_same_engine
+from twin.physics.config import Engine
+from twin.replay.agreement import in_each_engine
+from twin.replay.comparison import compare, recorded_findings
+from twin.replay.config import ReplayConfig
+from twin.replay.execution import (
+    check_covers,
+    check_length,
+    cut_track,
+    path_of_execution,
+    stages_as_executed,
+)
+from twin.replay.job import ReplayJob
+from twin.replay.job_row import judged, row_of_failure
+from twin.replay.monte_carlo import replay_samples, with_probability
+from twin.replay.output import ReplayOrigin, write_replay
+from twin.replay.rebuilt_scene import Correction, RebuiltScene, read_rebuilt_scene
+from twin.replay.result import ReplayResult
+from twin.replay.scene import ReplayScene
+from twin.replay.trace import (
+    Recording,
+)
+from twin.replay.verdict import replay_joints, replay_plan
+from twin.robot.posture import check_clock, width_track
+
+START_KNOWN_NS = 1_000_000_000
+"""Joint states this near to a plan's start say where the arm was."""
+
+
+def run_job(job: ReplayJob) -> dict[str, Any]:
+    """Replay and write; a failure the user can act on becomes a row, not an exception."""
+    if job.problem and job.trajectory == "executed":
+        return row_of_failure(job, job.problem)
+    try:
+        return judged(job, *_replay(job)[0])
+    except GstError as error:
+        return row_of_failure(job, str(error))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """What one job works on."""
+
+    job: ReplayJob
+    episode: Episode
+    plan: Plan
+    """As it was sent."""
+    plan_as_executed: Plan
+    """With the stages at the times at which they were executed."""
+    events: list[dict[str, Any]]
+    scene: ReplayScene
+    correction: Correction
+    """Applied to the scene already, still to be to what was localised afterwards, and to be taken
+    back for pictures."""
+
+    @property
+    def executed(self) -> bool:
+        return self.job.trajectory == "executed" and self.job.end_ns is not None
+
+    def is_same_engine(self, result: ReplayResult) -> bool:
+        """Whether the verdict is that of the engine that moved the cell itself."""
+        engine, stand_in = result.verdict.engine, self.episode.info.stand_in
+        return self.job.config.mode == "dynamic" and is_same_engine(engine, stand_in=stand_in)
+
+    @property
+    def end_ns(self) -> int:
+        """When the trajectory ended and settling began."""
+        return self.job.length_ns() if self.executed else self.plan.tau[-1].t_ns
+
+
+def _replay(job: ReplayJob) -> list[tuple[Verdict, dict[str, Any] | None]]:
+    """Replay in each engine and write an episode for each: verdicts, and where they diverge."""
+    source = _open(job)
+
+    results: list[ReplayResult] = []
+
+    def judge(config: ReplayConfig) -> Verdict:
+        results.append(_with_samples(source, config, _run(source, source.scene, config)))
+        return results[-1].verdict
+
+    verdicts = in_each_engine(source.scene.task, job.config, judge)
+    return [
+        _write(source, engine, replace(result, verdict=verdict))
+        for engine, result, verdict in zip(job.engines(), results, verdicts, strict=True)
+    ]
+
+
+def _write(
+    source: _Source, engine: Engine, result: ReplayResult
+) -> tuple[Verdict, dict[str, Any] | None]:
+    job, divergence = source.job, None
+    if source.executed and job.config.mode == "kinematic":
+        found = recorded_findings(_recording(source), job.config)
+        result = replace(result, verdict=replace(result.verdict, findings=found))
+    elif source.executed:
+        compared = compare(job, engine, result, _recording(source), source.end_ns)
+        divergence = compared.to_record()
+    if source.is_same_engine(result):
+        result = replace(result, verdict=_marked(result.verdict))
+    images = _images(source, result) if job.render else ()
+    path = job.path(engine)
+    path.unlink(missing_ok=True)
+    write_replay(path, result, source.plan, _origin(source, engine, result, divergence, images))
+    return result.verdict, divergence
+
+
+def _marked(verdict: Verdict) -> Verdict:
+    """Say that the cell was moved by the same engine."""
+    return replace(
+        verdict,
+        warnings=(*verdict.warnings, SAME_ENGINE),
+        reason=verdict.reason or SAME_ENGINE,
+    )
+
+
+def _open(job: ReplayJob) -> _Source:
+    episode = Episode.open(job.episode_path)
+    urdf = streams.robot_description(episode)
+    if job.robot:
+        urdf = read_robot(job.robot).description()
+    if urdf is None:
+        raise EpisodeError(
+            path=job.episode_path,
+            found="no robot description",
+            hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
+        )
+    plan = streams.plans(episode)[job.plan_index][1]
+    task = job.task
+    rebuilt = (
+        RebuiltScene()
+        if job.run_path is None
+        else read_rebuilt_scene(RunFolder(job.run_path), task)
+    )
+    scene = replace(rebuilt, scene_hash=job.scene_hash).scene(
+        task,
+        urdf,
+        job.start.Ts_base_object,
+        reasons=job.start.reasons,
+        covariances=job.start.covariances,
+    )
+    executed = job.trajectory == "executed" and job.end_ns is not None
+    if job.trajectory == "planned":
+        joints = robot_of(urdf).joints
+        scene = replace(scene, start_rad=recorded_start(episode, job.start_ns, joints))
+    events = streams.events(episode) if executed else []
+    plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
+    return _Source(
+        job=job,
+        episode=episode,
+        plan=plan,
+        plan_as_executed=plan_as_executed,
+        events=events,
+        scene=scene,
+        correction=rebuilt.correction,
+    )
+
+
+def recorded_start(
+    episode: Episode, stamp_ns: int, joints: Sequence[str]
+) -> Float[np.ndarray, " num_joints"] | None:
+    """Where the arm was recorded to be when a plan began [rad]; None where nobody recorded it."""
+    try:
+        track = streams.joint_track(episode, JOINT_STATES)
+    except GstError:
+        return None
+    near = np.abs(track.stamps_ns - stamp_ns) <= START_KNOWN_NS
+    if not near.any() or not set(joints) <= set(track.names):
+        return None
+    order = [track.names.index(name) for name in joints]
+    found: Float[np.ndarray, " num_joints"] = track.at(np.array([stamp_ns]))[0, order]
+    return found if np.isfinite(found).all() else None
+
+
+def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayResult:
+    if not source.executed:
+        return replay_plan(source.plan_as_executed, scene, config)
+    arm, widths = _tracks(source)
+    return replay_joints(arm, widths, scene, config, plan=source.plan_as_executed)
+
+
+def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
+    """Recorded joints and widths, cut to the execution."""
+    job, episode = source.job, source.episode
+    end_ns = job.start_ns + job.length_ns()
+    check_clock(episode, (JOINT_STATES, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
+    check_length(job.length_ns(), source.plan)
+    arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
+    check_covers(arm, "joints", end_ns, source.plan)
+    widths = cut_track(width_track(episode, robot_of(source.scene.urdf)), job.start_ns, end_ns)
+    check_covers(widths, "gripper widths", end_ns, source.plan)
+    return arm, widths
+
+
+def _recording(source: _Source) -> Recording:
+    job = source.job
+    arm, widths = _tracks(source)
+    kinematic = replace(job.config, mode="kinematic")
+    seen_ns = job.end.seen_ns
+    return Recording(
+        plan=source.plan_as_executed,
+        path=path_of_execution(
+            arm, widths, source.plan_as_executed, kinematic, robot_of(source.scene.urdf)
+        ),
+        scene=source.scene,
+        end=source.correction.state(job.end),
+        end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,
+    )
+
+
+def _with_samples(source: _Source, config: ReplayConfig, result: ReplayResult) -> ReplayResult:
+    """Ask varied replays too; plans of one episode are tried against the same variations."""
+    if not config.samples or source.scene.missing():
+        return result
+    samples = replay_samples(
+        lambda there, varied: _run(source, there, varied).verdict,
+        source.scene,
+        config,
+        plan_id=source.plan.id,
+        identity=source.job.episode_sha256,
+    )
+    return replace(result, verdict=with_probability(result.verdict, samples), samples=samples)
+
+
+def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, CompressedColor], ...]:
+    from twin.replay.images import render_replay  # noqa: PLC0415  # only where it is asked for
+
+    if source.job.run_path is None:
+        return ()
+    return tuple(
+        render_replay(
+            RunFolder(source.job.run_path),
+            source.episode,
+            result,
+            source.scene,
+            start_ns=source.job.start_ns,
+            executed=source.job.end_ns is not None,
+            planned=source.job.trajectory == "planned",
+            correction=source.correction,
+        )
+    )
+
+
+def _origin(
+    source: _Source,
+    engine: Engine,
+    result: ReplayResult,
+    divergence: dict[str, Any] | None,
+    images: tuple[tuple[str, CompressedColor], ...],
+) -> ReplayOrigin:
+    job, episode, plan = source.job, source.episode, source.plan
+    marks = {
+        SAME_ENGINE_KEY: source.is_same_engine(result),
+        SECOND_ENGINE_KEY: engine != job.engines()[0],
+    }
+    derived = Derived(
+        kind="replay",
+        source_episode=episode.info.id,
+        source_sha256=job.episode_sha256,
+        plan_id=plan.id,
+        trajectory=job.trajectory,
+        mode=job.config.mode,
+        scene_hash=job.scene_hash,
+        engine=result.verdict.engine,
+        seed=job.config.seed,
+        calibration_id=source.scene.calibration_id,
+        settings={
+            **job.settings(),
+            "shape_sources": dict(source.scene.shape_sources),
+            **{name: True for name, holds in marks.items() if holds},
+        },
+    )
+    return ReplayOrigin(
+        info=episode.info,
+        derived=derived,
+        cell=cell_of(episode),
+        start_ns=job.start_ns,
+        urdf=source.scene.urdf,
+        stages=source.plan_as_executed.stages,
+        gripper=_recorded_grips(plan, source.events, job.start_ns)
+        if source.executed
+        else planned_grips(plan),
+        end_ns=source.end_ns,
+        divergence=divergence,
+        images=images,
+    )
+
+
+def planned_grips(plan: Plan) -> tuple[tuple[int, str], ...]:
+    """When the plan changes its mind about the gripper; it starts open."""
+    before = [0, *(waypoint.g for waypoint in plan.tau)]
+    return tuple(
+        (waypoint.t_ns, "close" if waypoint.g else "open")
+        for waypoint, g in zip(plan.tau, before, strict=False)
+        if waypoint.g != g
+    )
+
+
+def _recorded_grips(
+    plan: Plan, events: list[dict[str, Any]], start_ns: int
+) -> tuple[tuple[int, str], ...]:
+    return tuple(
+        (int(event["stamp_ns"]) - start_ns, str(event.get("text") or ""))
+        for event in events
+        if event["type"] == "gripper" and event.get("plan_id") == plan.id
+    )
+
+
+def cell_of(episode: Episode) -> str:
+    """The first part of the plan's topic: the cell everything was recorded in."""
+    for topic in episode.topics_of_type(schema.PLAN):
+        return topic.split("/")[1]
+    return episode.info.cell or "cell"
