@@ -21,6 +21,7 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from dashboards.trial_scene import RECORDED, Side, TrialScene
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
+from twin.scene.harmonics import NUM_FIRST
 from twin.scene.movable_scene import MovableScene
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import sized_camera
@@ -44,11 +45,12 @@ SPLAT = np.dtype(
         ("scales_m", "<f2", 3),
         ("none", "<u2"),
         ("q_wxyz", "<i2", 4),
-        ("harmonics", "i1", 9),
+        ("harmonics", "i1", 3 * NUM_FIRST),
         ("left", "u1", 3),
     ]
 )
-"""Rotation in 1/32767, harmonics of degree 1 in 1/127 of the header's ``harmonics``."""
+"""Rotation in 1/32767, harmonics of degree 1 in 1/127 of the header's ``harmonics``. Higher degrees
+are left out: of all colours of degree 1 what stays is the nearest to them over all directions."""
 EYE_M, TARGET_M = np.array([1.5, -1.1, 0.9]), np.array([0.4, 0.0, 0.1])
 """Where to look from and to in a trial without cameras, and without a tool."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -255,9 +257,10 @@ def _splat_table(
     clouds: Mapping[str, GaussianCloud],
 ) -> tuple[np.ndarray, dict[str, list[int]], float]:
     """All Gaussians, where those of each part begin and how many they are, and the harmonics'."""
-    largest = [np.abs(c.harmonics).max() for c in clouds.values() if c.harmonics.size]
+    first = {name: cloud.harmonics[:, :NUM_FIRST] for name, cloud in clouds.items()}
+    largest = [np.abs(rows).max() for rows in first.values() if rows.size]
     factor = float(max(largest, default=1.0)) or 1.0
-    ranges, rows, first = {}, [np.zeros(0, dtype=SPLAT)], 0
+    ranges, rows, begin = {}, [np.zeros(0, dtype=SPLAT)], 0
     for name, cloud in clouds.items():
         table = np.zeros(len(cloud), dtype=SPLAT)
         q = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
@@ -267,11 +270,11 @@ def _splat_table(
         table["scales_m"] = np.exp(cloud.scales_log)
         table["q_wxyz"] = np.rint(q * 32767)
         if cloud.num_harmonics:
-            flat = cloud.harmonics.reshape(len(cloud), 9)
+            flat = first[name].reshape(len(cloud), 3 * NUM_FIRST)
             table["harmonics"] = np.rint(flat / factor * 127)
         rows.append(table)
-        ranges[name] = [first, len(cloud)]
-        first += len(cloud)
+        ranges[name] = [begin, len(cloud)]
+        begin += len(cloud)
     return np.concatenate(rows), ranges, factor
 
 

@@ -3,15 +3,17 @@
 Every pixel meets every Gaussian; no tiles, no early stop. Written from the same equations.
 """
 
+from math import factorial, pi
+
 import numpy as np
 import torch
+from numpy.polynomial.legendre import Legendre
 
 from bridge.geometry.camera import Camera
 
 MIP_VARIANCE_PX2 = 0.1
 MAX_ALPHA = 0.999
 MIN_MIP_RATIO = 2.5e-5
-SH_FIRST = (3 / (4 * np.pi)) ** 0.5
 NEAR_M = 0.02
 
 
@@ -88,13 +90,31 @@ def weights(
     return (alpha * light)[torch.argsort(order)], depth
 
 
+def _harmonic(
+    degree: int, order: int, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor
+) -> torch.Tensor:
+    """Real spherical harmonic by its definition: a derivative of Legendre's P by (-x - iy)^m."""
+    m = abs(order)
+    across = torch.ones_like(x), torch.zeros_like(x)
+    for _ in range(m):
+        across = across[1] * y - across[0] * x, -across[0] * y - across[1] * x
+    P = Legendre.basis(degree).deriv(m).convert(kind=np.polynomial.Polynomial)
+    along = sum(float(c) * z**power for power, c in enumerate(P.coef))
+    norm = (2 * degree + 1) / (4 * pi) * factorial(degree - m) / factorial(degree + m)
+    factor = (norm if m == 0 else 2 * norm) ** 0.5
+    return factor * along * across[0 if order >= 0 else 1]
+
+
 def seen_colors(
     means: torch.Tensor, colors: torch.Tensor, harmonics: torch.Tensor, T_camera_base: torch.Tensor
 ) -> torch.Tensor:
-    """Colours along the rays from the camera centre -R^T t; harmonics (num, 3, 3) of degree 1."""
+    """Colours along the rays from the camera centre -R^T t; harmonics (num, 3, 8 or 15, 3)."""
     ray = means + T_camera_base[:3, 3] @ T_camera_base[:3, :3]
     x, y, z = (ray / ray.norm(dim=1, keepdim=True)).unbind(1)
-    basis = SH_FIRST * torch.stack([-y, z, -x], dim=1)
+    degrees = range(1, round((harmonics.shape[1] + 1) ** 0.5))
+    basis = torch.stack(
+        [_harmonic(n, m, x, y, z) for n in degrees for m in range(-n, n + 1)], dim=1
+    )
     return colors + torch.einsum("nk,nkc->nc", basis, harmonics)
 
 

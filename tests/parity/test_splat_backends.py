@@ -67,7 +67,7 @@ def pose() -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("num_harmonics", [0, 3])
+@pytest.mark.parametrize("num_harmonics", [0, 3, 8, 15])
 def test_both_draw_the_same_planes(cuda: CudaRasteriser, num_harmonics: int) -> None:
     cloud = cloud_of(1, num_harmonics=num_harmonics)
     theirs = cuda.draw_planes(cloud, CAMERA, pose())
@@ -100,8 +100,11 @@ def test_a_gaussian_at_a_known_pixel_is_drawn_there(cuda: CudaRasteriser) -> Non
     np.testing.assert_allclose(planes[4, 11, 30], planes[4, 13, 30], rtol=1e-3)  # centred
 
 
-def test_gradients_agree_in_every_array_and_in_the_pose(cuda: CudaRasteriser) -> None:
-    cloud = cloud_of(2)
+@pytest.mark.parametrize("num_harmonics", [3, 15])
+def test_gradients_agree_in_every_array_and_in_the_pose(
+    cuda: CudaRasteriser, num_harmonics: int
+) -> None:
+    cloud = cloud_of(2, num_harmonics=num_harmonics)
     cpu = Rasteriser()
     planes = cpu.draw_planes(cloud, CAMERA, pose())
     upstream = np.random.default_rng(3).normal(size=planes.shape).astype(np.float32)

@@ -13,15 +13,10 @@ from bridge.errors import PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
 from twin.errors import TwinError, UnreadableFileError
+from twin.scene.harmonics import HIGHEST, NUM_FIRST, NUM_HARMONICS, turned_harmonics
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); PLY files store (c - 0.5) / SH_DC."""
-
-SH_FIRST = 0.4886025119029199
-"""Factor of the three real spherical harmonics of degree 1, sqrt(3 / (4 pi))."""
-
-NUM_FIRST = 3
-"""Spherical harmonics of degree 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +39,7 @@ class GaussianCloud:
         default_factory=lambda: np.zeros((0, 0, 3), dtype=np.float32)
     )
     """How colour changes with the direction it is seen along: coefficients of the real spherical
-    harmonics of degree 1, none or three of them (``harmonic_basis``) for each colour."""
+    harmonics up to degree 3 (``harmonics.py``): 0, 3, 8 or 15 for each colour."""
     completed: Bool[np.ndarray, " num_splats"] = field(
         default_factory=lambda: np.zeros(0, dtype=bool)
     )
@@ -55,12 +50,12 @@ class GaussianCloud:
         """A cloud made without harmonics has rows of none, and one without marks was measured.
 
         Raises:
-            TwinError: When there are neither none nor all three of degree 1.
+            TwinError: When the harmonics are not all of those up to some degree.
         """
-        if self.harmonics.shape[1] not in (0, NUM_FIRST):
+        if self.harmonics.shape[1] not in NUM_HARMONICS:
             message = (
-                f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give none or the "
-                f"{NUM_FIRST} of degree 1."
+                f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give all up to a "
+                f"degree, {', '.join(map(str, NUM_HARMONICS[:-1]))} or {NUM_HARMONICS[-1]}."
             )
             raise TwinError(message)
         if len(self.harmonics) == 0 and len(self.means_m) > 0:
@@ -75,7 +70,7 @@ class GaussianCloud:
 
     @property
     def num_harmonics(self) -> int:
-        """Coefficients of each colour beside the constant: 0 or 3."""
+        """Coefficients of each colour beside the constant: 0, 3, 8 or 15."""
         return int(self.harmonics.shape[1])
 
     def take(self, index: np.ndarray) -> "GaussianCloud":
@@ -128,37 +123,6 @@ def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> Gaus
     harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
     harmonics[:, :kept] = cloud.harmonics[:, :kept]
     return replace(cloud, harmonics=harmonics)
-
-
-def harmonic_basis(
-    directions: Float[np.ndarray, "*shape 3"],
-) -> Float[np.ndarray, "*shape 3"]:
-    """Values of the three real spherical harmonics of degree 1 along unit directions.
-
-    In the order and with the signs of 3D Gaussian splatting files: sqrt(3 / (4 pi)) (-y, z, -x).
-    """
-    x, y, z = np.moveaxis(directions, -1, 0)
-    return np.asarray(np.stack([-y, z, -x], axis=-1) * directions.dtype.type(SH_FIRST))
-
-
-def turned_harmonics(
-    harmonics: Float32[np.ndarray, "num_splats num_harmonics 3"],
-    R_new_old: Float[np.ndarray, "*splats 3 3"],
-) -> Float32[np.ndarray, "num_splats num_harmonics 3"]:
-    """The harmonics of Gaussians that were turned with all that shines on them.
-
-    One rotation for all of them, or one for each. Degree 1 is a vector for each colour,
-    sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and turns like one.
-
-    Args:
-        harmonics: Of degree 1, or none.
-        R_new_old: The turn.
-    """
-    if harmonics.shape[1] == 0:
-        return harmonics
-    v = np.stack([-harmonics[:, 2], -harmonics[:, 0], harmonics[:, 1]], axis=1)
-    x, y, z = np.moveaxis(R_new_old @ v, 1, 0)
-    return as_float32(np.stack([-y, z, -x], axis=1))
 
 
 def morton_order(
@@ -216,11 +180,10 @@ COLUMNS = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
-REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_FIRST))
-"""Harmonics of degree 1: all of red, then green, then blue. Written only where there are any."""
+REST_COLUMNS = tuple(f"f_rest_{index}" for index in range(3 * NUM_HARMONICS[HIGHEST]))
+"""Harmonics, lowest degree first: all of red, then green, then blue. Only as many as there are."""
 COMPLETED_COLUMN = "completed"
 """1 where nobody measured what a Gaussian stands for; written only where there are any."""
-REST_COUNTS = (9, 24, 45)
 MAX_SPLATS = 50_000_000
 
 
@@ -234,9 +197,9 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud; the file appears under its name only when it is complete.
 
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
-    spherical harmonic with those of degree 1 as ``f_rest_0..8`` where the cloud has them.
-    Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1, where some
-    are; other viewers pass it over.
+    spherical harmonic with the higher ones as ``f_rest_0..8``, ``..23`` or ``..44`` where the cloud
+    has them. Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1,
+    where some are; other viewers pass it over.
 
     Args:
         path: Of the PLY file; one that is there is replaced.
@@ -262,7 +225,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 
 
 def read_ply(path: Path) -> GaussianCloud:
-    """Read a splat PLY. Harmonics above degree 1 and unknown columns are ignored.
+    """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored.
 
     Raises:
         PathNotFoundError: When the file is not there.
@@ -310,15 +273,15 @@ def _columns_of(cloud: GaussianCloud) -> tuple[str, ...]:
 
 
 def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:
-    """Degree 1 of files with degree 1, 2 or 3 (9, 24 or 45 columns); none from others."""
+    """Of files with all harmonics up to a degree (9, 24, 45, ... columns); none from others."""
     total = sum(name.startswith("f_rest_") for name in names)
-    wanted = [
-        [f"f_rest_{color * (total // 3) + index}" for color in range(3)]
-        for index in range(NUM_FIRST)
-    ]
-    if total not in REST_COUNTS or any(name not in names for row in wanted for name in row):
+    degree = round((total / 3 + 1) ** 0.5) - 1
+    rest = [f"f_rest_{index}" for index in range(total)]
+    if total != 3 * ((degree + 1) ** 2 - 1) or any(name not in names for name in rest):
         return np.zeros((len(table), 0, 3), dtype=np.float32)
-    return as_float32(table[:, [[names.index(name) for name in row] for row in wanted]])
+    by_color = table[:, [names.index(name) for name in rest]].reshape(len(table), 3, total // 3)
+    kept = by_color[:, :, : NUM_HARMONICS[min(degree, HIGHEST)]]
+    return as_float32(np.swapaxes(kept, 1, 2))
 
 
 def _header(path: Path, lines: list[str]) -> tuple[list[str], int]:

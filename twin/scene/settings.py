@@ -170,10 +170,13 @@ class FitConfig:
     appearance_steps: int = 4
     """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
     than six follow the noise."""
-    harmonics: Literal[0, 1] = 1
-    """Degree of the spherical harmonics of colour; 0: one colour from everywhere."""
-    gain: bool = True
-    """Solve a brightness per frame and channel (exposure, white balance); their mean is 1."""
+    harmonics: Literal[0, 1, 2, 3] = 1
+    """Degree of the spherical harmonics of colour; 0: one colour from everywhere. Degrees 2 and 3
+    come with the colours that are solved in closed form, for Gaussians that at least 9 and 16 views
+    show."""
+    exposure: Literal["gain", "affine", "none"] = "gain"
+    """What is solved for each frame. gain: a brightness per channel (exposure, white balance);
+    affine: a 3 x 3 matrix and an offset; on average neither changes anything."""
     densify: bool = True
     """Split Gaussians where the error is large, drop those that show nothing."""
     refine_poses: bool = False
@@ -191,6 +194,12 @@ class FitConfig:
             message = (
                 f"--appearance-steps {self.appearance_steps} lies outside 0 to "
                 f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
+            )
+            raise UsageError(message)
+        if self.harmonics > 1 and not self.appearance_steps:
+            message = (
+                f"--harmonics {self.harmonics} needs colours that are solved in closed form: give "
+                "--appearance-steps 1 or more."
             )
             raise UsageError(message)
         if not 0 <= self.slab < math.inf:

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.errors import TwinError
-from twin.scene.gaussians import GaussianCloud, as_float32, turned_harmonics
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.harmonics import turned_harmonics
 
 NUM_NODES = 8
 """Nodes that move one Gaussian."""

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Float32
 
-from twin.scene.gaussians import GaussianCloud, as_float32, harmonic_basis
+from twin.scene.gaussians import GaussianCloud, as_float32
+from twin.scene.harmonics import harmonic_basis
 
 
 def effective_colors(
@@ -12,7 +13,7 @@ def effective_colors(
     """Colour of each Gaussian as seen from a point of the cloud's frame, not clipped."""
     if cloud.num_harmonics == 0:
         return cloud.colors
-    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m))
+    basis = harmonic_basis(view_directions(cloud.means_m, camera_centre_m), cloud.num_harmonics)
     return as_float32(cloud.colors + np.einsum("nk,nkc->nc", basis, cloud.harmonics))
 
 

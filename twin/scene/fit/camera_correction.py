@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from bridge.geometry import se3
-from twin.scene.fit.appearance import gain_between
+from twin.scene.fit.exposure import gain_between
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser

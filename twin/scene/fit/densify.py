@@ -71,7 +71,7 @@ def score(
 
     Args:
         cloud: The scene as it is fitted so far.
-        observations: Recorded images with poses and gains.
+        observations: Recorded images with poses and exposures.
         rasteriser: Draws the cloud.
         allowance: Time until which views are drawn.
     """
@@ -85,8 +85,7 @@ def score(
             break
         camera, mask = item.target.camera, item.target.static_mask
         planes = rasteriser.draw_planes(cloud, camera, item.T_base_camera)
-        gain = item.gain.astype(np.float32)[:, None, None]
-        wrong = np.abs(gain * planes[:3] - item.target.image()).mean(axis=0) * mask
+        wrong = np.abs(item.exposed(planes[:3]) - item.target.image()).mean(axis=0) * mask
         lifted = rasteriser.lift(np.stack([wrong, mask.astype(np.float32)]))
         error += lifted[:, 0]
         pixels += lifted[:, 1]

@@ -1,6 +1,6 @@
 """Fit Gaussians to images: half size first, then full size, for a time or a number of images.
 
-Adam moves everything. Between its steps gains and colours are solved in closed form
+Adam moves everything. Between its steps exposures and colours are solved in closed form
 (``appearance``) and Gaussians are split where the error is large (``densify``). Each of these looks
 at many images at once, so none may take more than its share of the budget.
 
@@ -26,12 +26,20 @@ from jaxtyping import Float, Float32, Int64
 from bridge.geometry import se3
 from bridge.terminal import Advance
 from bridge.whole_file import write_whole
-from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance, solve_gains
+from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
 from twin.scene.fit.camera_correction import CameraCorrections, correction_gradient
 from twin.scene.fit.densify import densify, score
+from twin.scene.fit.exposure import solve_exposures
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.gaussians import NUM_FIRST, GaussianCloud, arrays, as_float32, with_harmonics
-from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, psnr_db
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
+from twin.scene.harmonics import NUM_FIRST, NUM_HARMONICS, degree_of
+from twin.scene.raster.rasteriser import (
+    SAME_EXPOSURE,
+    FitSession,
+    RasterConfig,
+    Rasteriser,
+    psnr_db,
+)
 from twin.scene.settings import FitConfig
 
 
@@ -80,7 +88,7 @@ class SurfacePrior:
 
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 2
+STATE_VERSION = 3
 SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")
 SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
@@ -94,7 +102,7 @@ class FitState:
     """The cloud, the moments of Adam and the number of images seen."""
     size_m: float
     """Median size of the first Gaussians; positions move in units of it."""
-    gains: Float[np.ndarray, "num_views 3"]
+    exposures: Float[np.ndarray, "num_views 3 4"]
     cameras: CameraCorrections
     surface: SurfacePrior
     """Where the Gaussians began."""
@@ -126,12 +134,12 @@ def first_state(session: FitSession, num_views: int) -> FitState:
 
     Args:
         session: Holds the cloud that is to be fitted.
-        num_views: Training images, each with a gain and a camera correction.
+        num_views: Training images, each with an exposure and a camera correction.
     """
     return FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
-        gains=np.ones((num_views, 3)),
+        exposures=np.tile(SAME_EXPOSURE, (num_views, 1, 1)),
         cameras=CameraCorrections.none(num_views),
         surface=SurfacePrior.of(session.cloud),
     )
@@ -151,7 +159,7 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
         "size_m": np.array(state.size_m),
         "steps": np.array(state.session.steps),
         "errors": np.array(state.errors, dtype=np.float64),
-        "gains": state.gains,
+        "exposures": state.exposures,
     }
     content |= {name: np.array(getattr(state, name)) for name in SCALARS}
     content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
@@ -201,7 +209,7 @@ def _state_from(
     return FitState(
         session=session,
         size_m=float(content["size_m"]),
-        gains=content["gains"],
+        exposures=content["exposures"],
         cameras=CameraCorrections(**part("cameras.")),
         surface=SurfacePrior(**part("surface.")),
         seconds=float(content["seconds"]),
@@ -213,11 +221,11 @@ def _state_from(
 SOLVE_AT = (0.9,)
 """Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
 Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
-GAINS_AT = (0.1, 0.3, 0.6)
-"""Shares of the budget at which gains are solved, besides with the colours."""
+EXPOSURES_AT = (0.1, 0.3, 0.6)
+"""Shares of the budget at which exposures are solved, besides with the colours."""
 SPLIT_AT = (0.1, 0.2, 0.3)
 """Shares of the budget at which Gaussians are split and dropped."""
-SOLVE_SHARE, GAINS_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
+SOLVE_SHARE, EXPOSURES_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
 """At most this much of the budget for each of them."""
 
 
@@ -272,8 +280,11 @@ class Events:
         config, events = self._config, []
         if config.densify:
             events += [Event(at=at, share=SPLIT_SHARE, act=self._densify) for at in SPLIT_AT]
-        if config.gain:
-            events += [Event(at=at, share=GAINS_SHARE, act=self._solve_gains) for at in GAINS_AT]
+        if config.exposure != "none":
+            events += [
+                Event(at=at, share=EXPOSURES_SHARE, act=self._solve_exposures)
+                for at in EXPOSURES_AT
+            ]
         if config.appearance_steps:
             events += [Event(at=at, share=SOLVE_SHARE, act=self._solve_colours) for at in SOLVE_AT]
         return sorted(events, key=lambda event: event.at)
@@ -299,28 +310,38 @@ class Events:
             ImageObservation(
                 target=view.half if coarse else view.full,
                 T_base_camera=state.cameras.pose(index, view.T_base_color),
-                gain=state.gains[index],
+                exposure=state.exposures[index],
             )
             for index, view in enumerate(self._views)
         ]
 
-    def _solve_gains(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        observations = self._observations(state, coarse)
-        state.gains = solve_gains(state.session.cloud, observations, self._rasteriser, allowance)
+    def _solve_exposures(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
+        if self._config.exposure != "none":
+            state.exposures = solve_exposures(
+                state.session.cloud,
+                self._observations(state, coarse),
+                self._rasteriser,
+                self._config.exposure,
+                allowance,
+            )
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        if self._config.gain:
-            self._solve_gains(state, coarse, allowance)
+        self._solve_exposures(state, coarse, allowance)
+        cloud = state.session.cloud
+        degree = max(self._config.harmonics, degree_of(cloud.num_harmonics))
         solved = solve_appearance(
-            state.session.cloud,
+            with_harmonics(cloud, NUM_HARMONICS[degree]),
             self._observations(state, coarse),
             self._rasteriser,
             steps=self._config.appearance_steps,
             allowance=allowance,
         )
         state.colour_steps += solved.steps
-        state.session.cloud.colors[:] = solved.cloud.colors
-        state.session.cloud.harmonics[:] = solved.cloud.harmonics
+        if solved.steps and solved.cloud.num_harmonics > cloud.num_harmonics:
+            state.session.rearrange(solved.cloud, np.arange(len(cloud)))
+            return
+        cloud.colors[:] = solved.cloud.colors
+        cloud.harmonics[:] = solved.cloud.harmonics[:, : cloud.num_harmonics]
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -383,8 +404,9 @@ class FitResult:
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
-    gains: Float[np.ndarray, "num_views 3"]
-    """Brightness of each training image over that of the scene, per channel; their mean is 1."""
+    exposures: Float[np.ndarray, "num_views 3 4"]
+    """How the colours (red, green, blue, 1) of the scene came out in each training image; on
+    average they did not change."""
     Ts_base_color: Float[np.ndarray, "num_views 4 4"]
     """Where the training views were in the end; as given unless poses were refined."""
     num_split: int
@@ -428,7 +450,7 @@ def fit(
     learner = _Learner(views, config)
     events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
     state = None if checkpoint is None else load_state(checkpoint, learner.session)
-    if state is None or len(state.gains) != len(views):
+    if state is None or len(state.exposures) != len(views):
         harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
         state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
         state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
@@ -449,7 +471,7 @@ def fit(
         seconds=state.seconds,
         cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
-        gains=state.gains,
+        exposures=state.exposures,
         Ts_base_color=np.stack([learner.pose(state, index) for index in range(len(views))]),
         num_split=state.num_split,
         num_pruned=state.num_pruned,
@@ -520,8 +542,10 @@ class _Learner:
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}
         rates["means_m"] *= state.size_m
+        if state.session.cloud.num_harmonics > NUM_FIRST:
+            rates["harmonics"] = 0.0  # Adam knows no ridge: it would fit noise to the few views
         report = state.session.step(
-            view.half if coarse else view.full, pose, rates, state.gains[index]
+            view.half if coarse else view.full, pose, rates, state.exposures[index]
         )
         if state.session.steps % HOLD_EVERY == 0:
             self.hold(state)

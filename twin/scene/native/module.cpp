@@ -25,11 +25,12 @@ class PyRasteriser {
     NewArray<float> draw(const Table3& means, const Table4& quats, const Table3& scales_log,
                          const Column& opacities, const Table3& colors, const Pose& T_camera_world,
                          const Intrinsics& intrinsics, float alpha_cut, float transmittance_stop,
-                         const std::optional<Table33>& harmonics) {
+                         const std::optional<Harmonics>& harmonics) {
         const std::size_t n = means.shape(0);
         if (quats.shape(0) != n || scales_log.shape(0) != n || opacities.shape(0) != n ||
             colors.shape(0) != n || (harmonics && harmonics->shape(0) != n))
             throw nb::value_error("all tables need one row per Gaussian");
+        num_harmonics_ = harmonics ? checked_harmonics(harmonics->shape(1)) : 0;
         const Camera camera = make_camera(T_camera_world, intrinsics);
         const Settings settings = make_settings(alpha_cut, transmittance_stop);
         means_ = means, quats_ = quats, scales_log_ = scales_log;
@@ -46,11 +47,11 @@ class PyRasteriser {
     nb::tuple pull(const Planes& planes, const Planes& plane_gradients) {
         check_size(planes.shape(1), planes.shape(2));
         check_size(plane_gradients.shape(1), plane_gradients.shape(2));
-        const std::size_t n = rasteriser_.count(), num_harmonics = harmonics_ ? kHarmonics : 0;
+        const std::size_t n = rasteriser_.count();
         auto means = new_array<float>({n, 3}), quats = new_array<float>({n, 4});
         auto scales = new_array<float>({n, 3}), opacities = new_array<float>({n});
         auto colors = new_array<float>({n, 3});
-        auto harmonics = new_array<float>({n, num_harmonics, 3});
+        auto harmonics = new_array<float>({n, static_cast<std::size_t>(num_harmonics_), 3});
         auto pose = new_array<double>({3, 4});
         const Splats in = splats();
         const SplatGradients out{means.data(),     quats.data(),  scales.data(),
@@ -134,8 +135,10 @@ class PyRasteriser {
     }
 
     Splats splats() const {
-        return {means_.data(),     quats_.data(),  scales_log_.data(),
-                opacities_.data(), colors_.data(), harmonics_ ? harmonics_->data() : nullptr};
+        return {means_.data(),     quats_.data(),
+                scales_log_.data(), opacities_.data(),
+                colors_.data(),    harmonics_ ? harmonics_->data() : nullptr,
+                num_harmonics_};
     }
 
     const Kernels& kernels_;
@@ -144,7 +147,8 @@ class PyRasteriser {
     Table3 means_, scales_log_, colors_;
     Table4 quats_;
     Column opacities_;
-    std::optional<Table33> harmonics_;
+    std::optional<Harmonics> harmonics_;
+    int num_harmonics_ = 0;
 };
 
 class PySimilarity {

@@ -17,11 +17,11 @@ namespace {
 using Bytes = Buffer<std::uint8_t, nb::shape<3, -1, -1>>;
 using Depth = Buffer<float, nb::shape<-1, -1>>;
 using Mask = Buffer<bool, nb::shape<-1, -1>>;
-using Gain = std::tuple<float, float, float>;
+using Exposure = Buffer<float, nb::shape<3, 4>>;
 using Loss = std::tuple<bool, float, float>;  // structural, share of L1, weight of depth
 using Rates = std::tuple<float, float, float, float, float, float>;
 
-constexpr std::size_t kColumns[Tables::kCount] = {3, 4, 3, 1, 3, 3 * kHarmonics};
+constexpr std::size_t kColumns[Tables::kCount - 1] = {3, 4, 3, 1, 3};
 
 // How many Gaussians the first of the tables holds.
 std::size_t rows_of(const nb::tuple& arrays) {
@@ -31,14 +31,25 @@ std::size_t rows_of(const nb::tuple& arrays) {
     return means.shape(0);
 }
 
+// How many harmonics each colour of the last table has; 0 where it is None.
+int num_harmonics_of(const nb::tuple& arrays) {
+    const nb::handle last = arrays[Tables::kCount - 1];
+    if (last.is_none()) return 0;
+    const Values values = nb::cast<Values>(last, false);
+    if (values.ndim() != 3) throw nb::value_error("harmonics are a table of three dimensions");
+    return checked_harmonics(values.shape(1));
+}
+
 // Means, quaternions, log scales, opacities, colours and, or None, harmonics.
-Tables tables_of(const nb::tuple& arrays, std::size_t count) {
+Tables tables_of(const nb::tuple& arrays, std::size_t count, int num_harmonics) {
     if (arrays.size() != Tables::kCount) throw nb::value_error("a cloud has six tables");
     Tables tables{};
     for (int i = 0; i < Tables::kCount; ++i) {
-        if (arrays[i].is_none() && i == Tables::kCount - 1) continue;
+        const bool last = i == Tables::kCount - 1;
+        if (last && arrays[i].is_none()) continue;
         const Values values = nb::cast<Values>(arrays[i], false);
-        if (values.size() != count * kColumns[i])
+        const std::size_t columns = last ? 3 * num_harmonics : kColumns[i];
+        if (values.size() != count * columns)
             throw nb::value_error("all tables need one row per Gaussian");
         tables.table[i] = values.data();
     }
@@ -53,8 +64,8 @@ class PyFitSession {
     nb::tuple step(const nb::tuple& values, const nb::tuple& first, const nb::tuple& second,
                    const Pose& T_camera_world, const Intrinsics& intrinsics, float alpha_cut,
                    float transmittance_stop, const Bytes& planes_u8, const Depth& depth_m,
-                   const Mask& static_mask, const Gain& gain, const Loss& loss, const Rates& rates,
-                   int step) {
+                   const Mask& static_mask, const Exposure& exposure, const Loss& loss,
+                   const Rates& rates, int step) {
         const Camera camera = make_camera(T_camera_world, intrinsics);
         const Settings settings = make_settings(alpha_cut, transmittance_stop);
         const std::size_t rows = camera.height, columns = camera.width;
@@ -63,9 +74,11 @@ class PyFitSession {
             static_mask.shape(0) != rows || static_mask.shape(1) != columns || step < 1)
             throw nb::value_error("a step needs images of the camera's size, and counts from 1");
         const std::size_t count = rows_of(values);
-        Learning learning{tables_of(values, count),
-                          tables_of(first, count),
-                          tables_of(second, count),
+        num_harmonics_ = num_harmonics_of(values);
+        Learning learning{tables_of(values, count, num_harmonics_),
+                          tables_of(first, count, num_harmonics_),
+                          tables_of(second, count, num_harmonics_),
+                          num_harmonics_,
                           {},
                           0.9f,
                           0.999f,
@@ -75,10 +88,9 @@ class PyFitSession {
                  learning.rates[4], learning.rates[5]) = rates;
         FitTarget target{planes_u8.data(), depth_m.data(),
                          reinterpret_cast<const std::uint8_t*>(static_mask.data()), {}};
-        std::tie(target.gain[0], target.gain[1], target.gain[2]) = gain;
+        std::copy_n(exposure.data(), 12, target.exposure);
         const LossWeights weights{std::get<0>(loss), std::get<1>(loss), std::get<2>(loss)};
         count_ = count;
-        has_harmonics_ = learning.values.table[Tables::kCount - 1] != nullptr;
         StepResult result;
         {
             nb::gil_scoped_release unlocked;
@@ -99,7 +111,7 @@ class PyFitSession {
 
     // The six gradients of the last step; harmonics may have no rows.
     nb::tuple gradients() const {
-        const std::size_t harmonics = has_harmonics_ ? kHarmonics : 0;
+        const std::size_t harmonics = num_harmonics_;
         return nb::make_tuple(copy(0, {count_, 3}), copy(1, {count_, 4}), copy(2, {count_, 3}),
                               copy(3, {count_}), copy(4, {count_, 3}),
                               copy(5, {count_, harmonics, 3}));
@@ -133,7 +145,7 @@ class PyFitSession {
 
     FitSession session_;
     std::size_t count_ = 0;
-    bool has_harmonics_ = false;
+    int num_harmonics_ = 0;
 };
 
 }  // namespace
@@ -144,7 +156,7 @@ void add_session(nb::module_& module) {
         .def("step", &PyFitSession::step, "values"_a, "first"_a, "second"_a,
              "T_camera_world"_a.noconvert(), "intrinsics"_a, "alpha_cut"_a,
              "transmittance_stop"_a, "planes_u8"_a.noconvert(), "depth_m"_a.noconvert(),
-             "static_mask"_a.noconvert(), "gain"_a, "loss"_a, "rates"_a, "step"_a)
+             "static_mask"_a.noconvert(), "exposure"_a.noconvert(), "loss"_a, "rates"_a, "step"_a)
         .def("planes", &PyFitSession::planes)
         .def("gradients", &PyFitSession::gradients)
         .def("visible", &PyFitSession::visible);

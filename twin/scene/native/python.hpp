@@ -22,7 +22,7 @@ template <class Scalar, class Shape>
 using Buffer = nb::ndarray<const Scalar, Shape, nb::c_contig, nb::device::cpu>;
 using Table3 = Buffer<float, nb::shape<-1, 3>>;
 using Table4 = Buffer<float, nb::shape<-1, 4>>;
-using Table33 = Buffer<float, nb::shape<-1, 3, 3>>;
+using Harmonics = Buffer<float, nb::shape<-1, -1, 3>>;
 using Column = Buffer<float, nb::shape<-1>>;
 using Planes = Buffer<float, nb::shape<5, -1, -1>>;
 using AnyPlanes = Buffer<float, nb::shape<-1, -1, -1>>;
@@ -66,6 +66,12 @@ inline Camera make_camera(const Pose& T_camera_world, const Intrinsics& intrinsi
         camera.centre[k] = -(camera.R[k] * camera.t[0] + camera.R[3 + k] * camera.t[1] +
                              camera.R[6 + k] * camera.t[2]);
     return camera;
+}
+
+inline int checked_harmonics(std::size_t count) {
+    if (count != kFirstHarmonics && count != kSecondHarmonics && count != kThirdHarmonics)
+        throw nb::value_error("a colour has 3, 8 or 15 harmonics, or None");
+    return static_cast<int>(count);
 }
 
 inline Settings make_settings(float alpha_cut, float transmittance_stop) {

@@ -11,7 +11,7 @@ namespace splat {
 
 namespace {
 
-constexpr int kColumns[Tables::kCount] = {3, 4, 3, 1, 3, 3 * kHarmonics};
+constexpr int kColumns[Tables::kCount - 1] = {3, 4, 3, 1, 3};
 constexpr std::int64_t kLearnBlock = 1 << 13;
 
 struct LearnBlock {
@@ -19,6 +19,17 @@ struct LearnBlock {
     std::int64_t at;
     int size;
 };
+
+int columns_of(int table, const Learning& learning) {
+    return table == Tables::kCount - 1 ? 3 * learning.num_harmonics : kColumns[table];
+}
+
+// Whether the exposure is more than a factor for each channel.
+bool mixes(const FitTarget& target) {
+    for (int i = 0; i < 12; ++i)
+        if (i % 5 != 0 && target.exposure[i] != 0) return true;
+    return false;
+}
 
 double seconds_since(std::chrono::steady_clock::time_point* start) {
     const auto now = std::chrono::steady_clock::now();
@@ -37,7 +48,7 @@ void FitSession::start(int count, const Learning& learning, std::int64_t pixels)
     for (int table = 0; table < Tables::kCount; ++table) {
         const bool there = learning.values.table[table] != nullptr;
         gradient_begin_[table + 1] =
-            gradient_begin_[table] + (there ? std::int64_t{kColumns[table]} * count : 0);
+            gradient_begin_[table] + (there ? std::int64_t{columns_of(table, learning)} * count : 0);
     }
     gradients_.resize(gradient_begin_[Tables::kCount]);
 }
@@ -53,7 +64,8 @@ StepResult FitSession::step(int count, const Camera& camera, const Settings& set
                             const Learning& learning) {
     const std::int64_t pixels = static_cast<std::int64_t>(camera.width) * camera.height;
     float* const* table = learning.values.table;
-    const Splats splats{table[0], table[1], table[2], table[3], table[4], table[5]};
+    const Splats splats{table[0], table[1], table[2],
+                        table[3], table[4], table[5], learning.num_harmonics};
     StepResult result{};
     const auto begin = std::chrono::steady_clock::now();
     auto clock = begin;
@@ -77,8 +89,55 @@ ColorRow FitSession::color_row(const FitTarget& target, int channel, int y) cons
     const Camera& camera = rasteriser_.camera();
     const std::int64_t row = static_cast<std::int64_t>(y) * camera.width;
     const std::int64_t at = static_cast<std::int64_t>(channel) * camera.width * camera.height + row;
-    return {planes_.data() + at, target.planes + at, target.is_static + row,
-            target.gain[channel], camera.width};
+    const bool mixed = !mixed_.empty();
+    return {(mixed ? mixed_ : planes_).data() + at, target.planes + at, target.is_static + row,
+            mixed ? 1.0f : target.exposure[5 * channel], camera.width};
+}
+
+// Colours as they would come out with an exposure that mixes channels; none where it does not.
+void FitSession::mix_planes(const FitTarget& target) {
+    const Camera& camera = rasteriser_.camera();
+    const std::int64_t width = camera.width, pixels = width * camera.height;
+    mixed_.resize(mixes(target) ? 3 * pixels : 0);
+    if (mixed_.empty()) return;
+    const InParallel timed(&parallel_s_);
+#pragma omp parallel for schedule(static) num_threads(threads_)
+    for (int y = 0; y < camera.height; ++y) {
+        const float* red = planes_.data() + y * width;
+        const float *green = red + pixels, *blue = green + pixels;
+        for (int channel = 0; channel < 3; ++channel) {
+            const float* row = target.exposure + 4 * channel;
+            float* out = mixed_.data() + channel * pixels + y * width;
+            for (std::int64_t x = 0; x < width; ++x)
+                out[x] = row[0] * red[x] + row[1] * green[x] + row[2] * blue[x] + row[3];
+        }
+    }
+}
+
+// Carries gradients on mixed colours back to those drawn, and to the diagonal of the exposure.
+void FitSession::unmix_gradients(const FitTarget& target) {
+    if (mixed_.empty()) return;
+    const Camera& camera = rasteriser_.camera();
+    const std::int64_t width = camera.width, pixels = width * camera.height;
+    const float* e = target.exposure;
+    const InParallel timed(&parallel_s_);
+#pragma omp parallel for schedule(static) num_threads(threads_)
+    for (int y = 0; y < camera.height; ++y) {
+        float* red = plane_gradients_.data() + y * width;
+        float *green = red + pixels, *blue = green + pixels;
+        const float* drawn = planes_.data() + y * width;
+        double sums[3] = {0, 0, 0};
+        for (std::int64_t x = 0; x < width; ++x) {
+            const float on[3] = {red[x], green[x], blue[x]};
+            for (int channel = 0; channel < 3; ++channel)
+                sums[channel] += on[channel] * drawn[channel * pixels + x];
+            red[x] = e[0] * on[0] + e[4] * on[1] + e[8] * on[2];
+            green[x] = e[1] * on[0] + e[5] * on[1] + e[9] * on[2];
+            blue[x] = e[2] * on[0] + e[6] * on[1] + e[10] * on[2];
+        }
+        for (int channel = 0; channel < 3; ++channel)
+            row_sums_[channel * camera.height + y] = sums[channel];
+    }
 }
 
 // Fills the images to compare and the sums of their differences, row by row.
@@ -139,6 +198,7 @@ double FitSession::compare(const FitTarget& target, const LossWeights& weights,
     const Camera& camera = rasteriser_.camera();
     const int height = camera.height, tasks = 3 * height;
     const double entries = 3.0 * camera.width * height;
+    mix_planes(target);
     compare_rows(target);
     std::int64_t measured = 0;
     for (int y = 0; y < height; ++y) {
@@ -167,6 +227,7 @@ double FitSession::compare(const FitTarget& target, const LossWeights& weights,
     }
     const double depth_share = measured == 0 ? 0.0 : weights.depth / static_cast<double>(measured);
     gradient_rows(target, row_weights, static_cast<float>(depth_share));
+    unmix_gradients(target);
     for (int task = 0; task < tasks; ++task) result->gain[task / height] += row_sums_[task];
     double depth = 0;
     for (int y = 0; y < height; ++y) depth += row_sums_[tasks + y];
@@ -178,7 +239,7 @@ void FitSession::learn(int count, const Learning& learning) {
     std::vector<LearnBlock> blocks;
     for (int table = 0; table < Tables::kCount; ++table) {
         if (learning.rates[table] == 0 || learning.values.table[table] == nullptr) continue;
-        const std::int64_t size = std::int64_t{kColumns[table]} * count;
+        const std::int64_t size = std::int64_t{columns_of(table, learning)} * count;
         for (std::int64_t at = 0; at < size; at += kLearnBlock)
             blocks.push_back({table, at, static_cast<int>(std::min(kLearnBlock, size - at))});
     }

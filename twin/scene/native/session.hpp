@@ -14,7 +14,8 @@ struct FitTarget {
     const std::uint8_t* planes;     // 3 x height x width
     const float* depth_m;           // height x width
     const std::uint8_t* is_static;  // height x width
-    float gain[3];                  // the drawn colours times these are compared
+    // 3 x 4, row-major: what is compared is the exposure times (red, green, blue, 1) as drawn.
+    float exposure[12];
 };
 
 struct LossWeights {
@@ -26,7 +27,7 @@ struct LossWeights {
 struct StepResult {
     double loss, squared;        // squared: sum over static pixels and channels
     std::int64_t static_pixels;
-    double gain[3];              // dL/dgain
+    double gain[3];              // dL/d(diagonal of the exposure)
     double pose[kPoseEntries];   // dL/d[R | t]
     double draw_s, compare_s, pull_s, learn_s;
     double serial_s;             // of these, outside of the loops that threads share
@@ -40,6 +41,7 @@ struct Tables {
 
 struct Learning {
     Tables values, first, second;
+    int num_harmonics;  // of each colour
     float rates[Tables::kCount];  // 0: the table is left as it is
     float beta1, beta2, epsilon;
     int step;  // counted from 1
@@ -63,6 +65,8 @@ class FitSession {
     void start(int count, const Learning&, std::int64_t pixels);
     SplatGradients gradient_tables(bool with_harmonics);
     double compare(const FitTarget&, const LossWeights&, StepResult*);
+    void mix_planes(const FitTarget&);
+    void unmix_gradients(const FitTarget&);
     void compare_rows(const FitTarget&);
     void gradient_rows(const FitTarget&, const ColorWeights&, float depth_weight);
     void learn(int count, const Learning&);
@@ -73,6 +77,7 @@ class FitSession {
     Rasteriser rasteriser_;
     Similarity similarity_;
     std::vector<float> planes_, plane_gradients_;
+    std::vector<float> mixed_;  // colours after an exposure that mixes channels, else empty
     std::vector<float> compared_, wanted_;  // 3 x height x width
     std::vector<double> row_sums_;
     std::vector<std::int64_t> row_counts_;

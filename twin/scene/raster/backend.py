@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from bridge.errors import GstError, MissingDependencyError, UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import SH_FIRST, GaussianCloud, arrays
+from twin.scene.gaussians import GaussianCloud, arrays
+from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import (
     CloudGradient,
     RasterConfig,
@@ -317,8 +318,9 @@ class CudaRasteriser:
             return leaves["colors"]
         ray = leaves["means_m"] - centre
         x, y, z = (ray / ray.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
-        basis = self._torch.stack([-y, z, -x], dim=1) * SH_FIRST
-        return leaves["colors"] + (basis[:, :, None] * leaves["harmonics"]).sum(dim=1)
+        harmonics = leaves["harmonics"]
+        basis = self._torch.stack(harmonic_terms(x, y, z, harmonics.shape[1]), dim=1)
+        return leaves["colors"] + (basis[:, :, None] * harmonics).sum(dim=1)
 
     def _last(self) -> _Drawn:
         if self._drawn is None:

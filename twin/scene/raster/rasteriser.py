@@ -102,7 +102,8 @@ def native_camera(
 
 NAMES = ("means_m", "quats_wxyz", "scales_log", "opacities_logit", "colors", "harmonics")
 STAGES = ("draw", "compare", "pull", "learn")
-UNIT_GAIN = (1.0, 1.0, 1.0)
+SAME_EXPOSURE = np.eye(3, 4)
+"""Colours as they were drawn."""
 
 Moments = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
@@ -115,7 +116,7 @@ class StepReport:
     mse: float | None
     """Mean squared colour error over the static pixels; None when there are none."""
     gain: Float[np.ndarray, "3"]
-    """Gradient of the loss on the gain."""
+    """Gradient of the loss on the diagonal of the exposure."""
     T_camera_base: Float[np.ndarray, "3 4"]
     """Gradient of the loss on the camera's pose, as in ``CloudGradient``."""
     seconds: Mapping[str, float]
@@ -176,7 +177,7 @@ class FitSession:
         target: Target,
         T_base_camera: Float[np.ndarray, "4 4"],
         rates: Mapping[str, float],
-        gain: Float[np.ndarray, "3"] | tuple[float, float, float] = UNIT_GAIN,
+        exposure: Float[np.ndarray, "3 4"] = SAME_EXPOSURE,
     ) -> StepReport:
         """Draw one view, compare it with what was seen, and follow the gradient.
 
@@ -185,10 +186,9 @@ class FitSession:
             T_base_camera: Where it was seen from.
             rates: Adam's step size for each array by name; arrays without one stay as they are,
                 and so do their moments.
-            gain: The drawn colours times these are compared with the image.
+            exposure: Times the drawn (red, green, blue, 1) is compared with the image.
         """
         self.steps += 1
-        red, green, blue = (float(value) for value in gain)
         loss, squared, num_static, d_gain, d_pose, seconds, serial_s = self._native.step(
             self._tables(dict(arrays(self._cloud))),
             self._tables(self._first),
@@ -199,7 +199,7 @@ class FitSession:
             target.planes_u8,
             target.depth_m,
             target.static_mask,
-            (red, green, blue),
+            as_float32(exposure),
             self._loss,
             tuple(float(rates.get(name, 0.0)) for name in NAMES),
             self.steps,
@@ -214,7 +214,7 @@ class FitSession:
         )
 
     def planes(self) -> Float32[np.ndarray, "5 height width"]:
-        """A copy of what the last step drew, before gain."""
+        """A copy of what the last step drew, before the exposure."""
         drawn: np.ndarray = self._native.planes()
         return drawn
 
@@ -259,8 +259,14 @@ def _carried(
     known = parents >= 0
     for name, rows in carried.items():
         if name in moments:
-            rows[known] = moments[name][parents[known]]
+            kept = moments[name][parents[known]]
+            rows[known] = kept if name != "harmonics" else _widened(kept, rows.shape[1])
     return carried
+
+
+def _widened(harmonics: np.ndarray, count: int) -> np.ndarray:
+    """The same with zeros for more harmonics."""
+    return np.pad(harmonics, ((0, 0), (0, count - harmonics.shape[1]), (0, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -252,6 +252,9 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     settings.pop("force")
     settings["fit"].pop("threads")
     settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
+    settings["fit"]["gain"] = config.fit.exposure != "none"  # likewise
+    if config.fit.exposure != "affine":
+        settings["fit"].pop("exposure")
     settings["models"].pop("device")
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = scanned_tasks(sources).task  # shapes and colours decide the objects

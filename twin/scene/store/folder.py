@@ -128,11 +128,11 @@ def take_back(run: RunFolder, file: Path, object_id: str = "") -> dict[str, Any]
     """Make a splat file the scene's background, or the Gaussians of one of its objects.
 
     The file is read first, so a bad one changes nothing. It may have other Gaussians than before,
-    more or fewer, lack normals and harmonics, or have harmonics of degree 1 to 3, of which degree
-    1 is kept. Its frame must be the one the file had when it left. A new background is a new
-    scene: it has another hash. The views held out of the fit still show, and name, the old one.
-    What was said of each Gaussian (names, parts, features) is dropped unless all of them are where
-    they were, in the same order: it would be said of others.
+    more or fewer, lack normals and harmonics, or have harmonics of degree 1 to 3. Its frame must be
+    the one the file had when it left. A new background is a new scene: it has another hash. The
+    views held out of the fit still show, and name, the old one. What was said of each Gaussian
+    (names, parts, features) is dropped unless all of them are where they were, in the same order:
+    it would be said of others.
 
     Args:
         run: Run folder with a rebuilt scene.

@@ -126,4 +126,4 @@ def test_counting_images_knows_no_time(
     found = fitted(room, clock, config=replace(BUDGET, iterations=12, budget_s=None))
     assert found.iterations == 12
     assert found.colour_steps == BUDGET.appearance_steps
-    assert np.isfinite(found.gains).all()
+    assert np.isfinite(found.exposures).all()

@@ -8,6 +8,7 @@ import pytest
 import textured_room
 
 from bridge.geometry import se3
+from twin.scene.fit.appearance import degree_shares
 from twin.scene.fit.camera_correction import corrected_pose
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import Checkpoint, fit
@@ -19,7 +20,7 @@ from twin.scene.settings import FitConfig, InitialiseConfig
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 Kind = Literal["3dgs", "paper"]
 ADAM_ALONE = FitConfig(
-    iterations=1, threads=1, appearance_steps=0, harmonics=0, gain=False, densify=False
+    iterations=1, threads=1, appearance_steps=0, harmonics=0, exposure="none", densify=False
 )
 
 
@@ -78,11 +79,12 @@ def test_frames_of_different_exposure_are_told_from_the_scene(
     ]
     config = FitConfig(iterations=30, threads=1, densify=False)
     told = fit(start, exposed, config, lambda *_: None)
-    untold = fit(start, exposed, replace(config, gain=False), lambda *_: None)
+    untold = fit(start, exposed, replace(config, exposure="none"), lambda *_: None)
     assert told.train_psnr_db > untold.train_psnr_db + 1.0
-    np.testing.assert_allclose(told.gains.mean(axis=0), 1.0, rtol=1e-9)
-    np.testing.assert_allclose(told.gains / gains[:, None] * gains.mean(), 1.0, atol=0.06)
-    np.testing.assert_array_equal(untold.gains, 1.0)
+    found = np.diagonal(told.exposures, axis1=1, axis2=2)
+    np.testing.assert_allclose(told.exposures.mean(axis=0), np.eye(3, 4), rtol=1e-9)
+    np.testing.assert_allclose(found / gains[:, None] * gains.mean(), 1.0, atol=0.06)
+    np.testing.assert_array_equal(untold.exposures, np.tile(np.eye(3, 4), (4, 1, 1)))
 
 
 def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
@@ -143,16 +145,40 @@ def stop_after(count: int) -> Callable[[int, str], None]:
     return advance
 
 
-def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
-    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
+def test_higher_degrees_come_with_the_solved_colours_where_enough_views_show(
+    room: tuple[GaussianCloud, list[TrainingView]],
 ) -> None:
     start, views = room
-    config = FitConfig(iterations=14, threads=1, refine_poses=True)
+    config = FitConfig(iterations=20, threads=1)
+    plain, few, enough = (
+        fit(start, chosen, replace(config, harmonics=degree), lambda *_: None).cloud
+        for chosen, degree in ((4 * views, 1), (views, 3), (4 * views, 3))
+    )
+    assert (plain.num_harmonics, few.num_harmonics, enough.num_harmonics) == (3, 15, 15)
+    assert degree_shares(few) == {2: 0.0, 3: 0.0}
+    shares = degree_shares(enough)
+    assert 1.0 > shares[2] > shares[3] > 0.1
+    # Until then nothing is different.
+    assert np.median(np.abs(plain.means_m - enough.means_m)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("config", "stop"),
+    [
+        (FitConfig(iterations=14, threads=1, refine_poses=True), 9),
+        (FitConfig(iterations=20, threads=1, harmonics=2, exposure="affine"), 20),
+    ],
+)
+def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
+    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path, config: FitConfig, stop: int
+) -> None:
+    start, views = room
+    views = 3 * views if config.harmonics > 1 else views
     most = len(start) + 50
     whole = fit(start, views, config, lambda *_: None, max_splats=most)
     kept = Checkpoint(path=tmp_path / "fit.npz", key="this fit", period_s=0.0)
     with pytest.raises(StopError):
-        fit(start, views, config, stop_after(9), max_splats=most, checkpoint=kept)
+        fit(start, views, config, stop_after(stop), max_splats=most, checkpoint=kept)
     steps: list[str] = []
     resumed = fit(
         start,
@@ -162,10 +188,11 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
         max_splats=most,
         checkpoint=kept,
     )
-    assert len(steps) == 14 - 8
+    assert len(steps) == config.iterations - (stop - 1)
     for name, rows in arrays(whole.cloud):
         np.testing.assert_array_equal(rows, getattr(resumed.cloud, name))
     np.testing.assert_array_equal(whole.Ts_base_color, resumed.Ts_base_color)
+    np.testing.assert_array_equal(whole.exposures, resumed.exposures)
     assert whole.train_psnr_db == resumed.train_psnr_db
 
 

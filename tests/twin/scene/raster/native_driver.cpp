@@ -39,7 +39,7 @@ int main(int, char** arguments) {
     const splat::Kernels* kernels = splat::kernels_named("auto");
     splat::Rasteriser rasteriser(*kernels, 1);
     const splat::Splats splats{means.data(),     quats.data(),  scales.data(),
-                               opacities.data(), colors.data(), harmonics.data()};
+                               opacities.data(), colors.data(), harmonics.data(), 3};
     std::vector<float> planes(5 * pixels), upstream(5 * pixels, 1.0f), gradients(23 * n);
     std::vector<float> features(n, 1.0f), drawn(pixels);
     rasteriser.draw(splats, static_cast<int>(n), camera, {1.0f / 255.0f, 1e-4f}, planes.data());

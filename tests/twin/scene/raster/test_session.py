@@ -9,7 +9,7 @@ from reference_loss import Loss
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.frames.rgbd import Target
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
 from twin.scene.raster.rasteriser import (
     FitSession,
     RasterConfig,
@@ -27,7 +27,8 @@ RATES = {
     "colors": 2e-2,
     "harmonics": 3e-3,
 }
-GAIN = (0.9, 1.05, 1.2)
+GAIN = np.diag([0.9, 1.05, 1.2]) @ np.eye(3, 4)
+MIXED = np.array([[0.9, 0.1, -0.05, 0.02], [-0.08, 1.05, 0.03, -0.03], [0.02, -0.04, 1.2, 0.01]])
 
 
 def some_cloud(count: int = 400, num_harmonics: int = 3) -> GaussianCloud:
@@ -77,14 +78,17 @@ class SeparateSteps:
         self.rasteriser = Rasteriser(RasterConfig(threads=1))
         self.steps = 0
 
-    def step(self, target: Target, gain: tuple[float, ...]) -> tuple[float, float, np.ndarray]:
+    def step(self, target: Target, exposure: np.ndarray) -> tuple[float, float, np.ndarray]:
         self.steps += 1
         planes = self.rasteriser.draw_planes(self.cloud, target.camera, a_pose())
-        factor = np.array([*gain, 1.0, 1.0], dtype=np.float32)[:, None, None]
-        seen = planes * factor
+        E = as_float32(exposure)
+        seen = planes.copy()
+        seen[:3] = np.einsum("ck,khw->chw", E[:, :3], planes[:3]) + E[:, 3, None, None]
         wanted = np.where(target.static_mask, target.image(), seen[:3])
         value, mse, upstream = self.loss(seen, wanted, target.depth_m)
-        gradient = self.rasteriser.pull_back(planes, upstream * factor)
+        d_drawn = upstream.copy()
+        d_drawn[:3] = np.einsum("ck,chw->khw", E[:, :3], upstream[:3])
+        gradient = self.rasteriser.pull_back(planes, d_drawn)
         for name, rows in arrays(self.cloud):
             first, second = self.moments[name]
             load_native().adam_step(
@@ -96,16 +100,18 @@ class SeparateSteps:
 
 
 @pytest.mark.parametrize("kind", ["3dgs", "paper"])
-@pytest.mark.parametrize("num_harmonics", [0, 3])
+@pytest.mark.parametrize(
+    ("num_harmonics", "exposure"), [(0, GAIN), (3, GAIN), (3, MIXED), (8, GAIN), (15, MIXED)]
+)
 def test_a_fused_step_equals_the_separate_steps(
-    kind: Literal["3dgs", "paper"], num_harmonics: int
+    kind: Literal["3dgs", "paper"], num_harmonics: int, exposure: np.ndarray
 ) -> None:
     cloud, target = some_cloud(num_harmonics=num_harmonics), some_target()
     session = FitSession(cloud, RasterConfig(threads=1), loss=kind, depth_weight=0.3)
     separate = SeparateSteps(cloud, Loss(kind, depth_weight=0.3, threads=1))
     for count in range(4):
-        report = session.step(target, a_pose(), RATES, GAIN)
-        loss, mse, d_gain = separate.step(target, GAIN)
+        report = session.step(target, a_pose(), RATES, exposure)
+        loss, mse, d_gain = separate.step(target, exposure)
         assert report.loss == pytest.approx(loss, rel=1e-4)
         assert report.mse == pytest.approx(mse, rel=1e-4)
         np.testing.assert_allclose(report.gain, d_gain, rtol=2e-3, atol=1e-5)
@@ -125,16 +131,17 @@ def test_a_fused_step_equals_the_separate_steps(
         assert np.quantile(difference, 0.98) < 0.02 * moved, name
 
 
-def test_a_step_follows_a_finite_difference_of_the_gain() -> None:
+@pytest.mark.parametrize("exposure", [GAIN, MIXED])
+def test_a_step_follows_a_finite_difference_of_the_gain(exposure: np.ndarray) -> None:
     cloud, target = some_cloud(), some_target()
     session = FitSession(cloud, RasterConfig(threads=1, alpha_cut=2.0**-24), loss="paper")
-    gradient = session.step(target, a_pose(), {}, GAIN).gain
+    gradient = session.step(target, a_pose(), {}, exposure).gain
     for channel in range(3):
         losses = []
         for sign in (1, -1):
-            gain = np.array(GAIN)
-            gain[channel] += sign * 1e-2
-            losses.append(session.step(target, a_pose(), {}, gain).loss)
+            other = exposure.copy()
+            other[channel, channel] += sign * 1e-2
+            losses.append(session.step(target, a_pose(), {}, other).loss)
         assert (losses[0] - losses[1]) / 2e-2 == pytest.approx(gradient[channel], rel=1e-2)
 
 
@@ -161,11 +168,12 @@ def test_fitting_one_view_lowers_its_loss(isa: str) -> None:
     assert losses[-1] < 0.9 * losses[0]
 
 
-def test_any_number_of_threads_fits_the_same_bits() -> None:
+@pytest.mark.parametrize(("num_harmonics", "exposure"), [(3, GAIN), (15, MIXED)])
+def test_any_number_of_threads_fits_the_same_bits(num_harmonics: int, exposure: np.ndarray) -> None:
     results = []
     for threads in (1, 2, 3):
-        session = FitSession(some_cloud(5000), RasterConfig(threads=threads))
-        reports = [session.step(some_target(), a_pose(), RATES, GAIN) for _ in range(3)]
+        session = FitSession(some_cloud(5000, num_harmonics), RasterConfig(threads=threads))
+        reports = [session.step(some_target(), a_pose(), RATES, exposure) for _ in range(3)]
         results.append(
             [
                 *(rows for _, rows in arrays(session.cloud)),
@@ -209,6 +217,20 @@ def test_moments_go_along_with_their_gaussians() -> None:
     other = twin.step(some_target(), a_pose(), RATES)
     assert report.loss == other.loss
     assert not np.array_equal(session.cloud.means_m[0], twin.cloud.means_m[0])
+
+
+def test_a_cloud_that_gets_more_harmonics_goes_on_with_its_moments() -> None:
+    wide, narrow = (FitSession(some_cloud(40), RasterConfig(threads=1)) for _ in range(2))
+    for session in (wide, narrow):
+        session.step(some_target(), a_pose(), RATES)
+    wide.rearrange(with_harmonics(wide.cloud, 15), np.arange(40))
+    for session in (wide, narrow):
+        session.step(some_target(), a_pose(), RATES)
+    for name, rows in arrays(narrow.cloud):
+        found = getattr(wide.cloud, name)
+        found = found[:, :3] if name == "harmonics" else found
+        np.testing.assert_allclose(found, rows, rtol=1e-4, atol=1e-6)
+    assert wide.cloud.harmonics[:, 3:].any()
 
 
 def test_an_image_of_another_size_is_refused() -> None:
