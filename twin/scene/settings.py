@@ -237,6 +237,10 @@ class ModelConfig:
     """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
     clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
+    depth_model: str = ""
+    """Guess distances with depth-anything:FOLDER where colour was seen and no depth measured. Each
+    image's guess is first laid onto the depth measured in it, and not used where it does not fit;
+    without this the views are compared, and where they say nothing the surface beside decides."""
     generator: str = ""
     """Program with its arguments that completes the shape of an object from one view, for example
     SAM 3D Objects in an environment of its own; what it must read and write is in

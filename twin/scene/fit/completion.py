@@ -4,12 +4,14 @@ Depth is missing on black and shiny things, beyond the camera's reach and in its
 starts from depth leaves black holes there. Each pixel of a training view in which the fitted scene
 shows nothing asks along its ray: which distance looks alike in the other views (a plane sweep,
 Collins 1996), contradicts none of their measurements, and goes on where the surface beside it ends?
-Where no other view helps, the surface beside it decides. No depth loss ever applies to these
+Where no other view helps, the surface beside it decides. Where something else guesses the distance,
+a network for example, the guess takes the place of that surface and is one more distance to try;
+one that contradicts the measurement of any view is dropped. No depth loss ever applies to these
 Gaussians. They are marked as completed, so that renders can say what was seen.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -45,8 +47,35 @@ RETRIES, FARTHER = 8, 1.1
 """What stands before another view's measurement is moved away this often, by this factor."""
 SMOOTH = 0.03
 """Weight of leaving the surface beside a hole, by the logarithm of the distance, beside colour."""
+GUESS_COST, LEAST_SCATTER = 0.01, 0.01
+"""Weight of leaving a guess by its own scatter, beside colour; and the least scatter of one."""
 SPACING_PX = 1.6
 """Size of a new Gaussian in pixels of the half-size image."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthGuess:
+    """Distances of one view's pixels that nobody measured."""
+
+    depth_m: Float32[np.ndarray, "height width"]
+    """Of the half-size image; 0 where there is none."""
+    scatter: float
+    """Standard deviation of its logarithm about what was measured in the view."""
+
+
+Guesser = Callable[[TrainingView], DepthGuess | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedHoles:
+    """What was added for what nobody measured."""
+
+    cloud: GaussianCloud
+    """Marked as completed."""
+    guessed: Bool[np.ndarray, " num_splats"]
+    """Whose distance was guessed, and not found by comparing views."""
+    num_guessed_px: int
+    """Pixels of holes whose distance was."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +86,7 @@ class _Hole:
     mask: Bool[np.ndarray, "height width"]
     beside_m: Float32[np.ndarray, "height width"]
     """Depth of the nearest pixel in which something is drawn."""
+    guess: DepthGuess | None = None
 
     @property
     def target(self) -> Target:
@@ -68,7 +98,8 @@ def complete_holes(
     views: Sequence[TrainingView],
     config: InitialiseConfig,
     raster: RasterConfig | None = None,
-) -> GaussianCloud:
+    guesser: Guesser | None = None,
+) -> ClosedHoles:
     """Gaussians that close the holes of the training views, marked; none without holes.
 
     Args:
@@ -76,8 +107,10 @@ def complete_holes(
         views: What it was fitted to.
         config: ``completion`` and ``max_splats`` say how many there may be.
         raster: How to draw.
+        guesser: Asked about the distances in a view with holes; None: only views are compared.
     """
     added = cloud.take(np.zeros(0, dtype=np.int64))
+    guessed, num_guessed_px = [np.zeros(0, dtype=bool)], 0
     most = round(config.completion * config.max_splats)
     rasteriser = Rasteriser(raster or RasterConfig())
     holes = [_hole(view, cloud, rasteriser) for view in views]
@@ -87,9 +120,17 @@ def complete_holes(
             break
         hole = _hole(views[index], concatenate([cloud, added]), rasteriser)
         if hole.mask.any():
+            if guesser is not None:
+                hole = replace(hole, guess=guesser(hole.view))
             closed = _closed(hole, views, config, most - len(added))
-            added = concatenate([added, closed])
-    return added.as_completed()
+            added = concatenate([added, closed.cloud])
+            guessed.append(closed.guessed)
+            num_guessed_px += closed.num_guessed_px
+    return ClosedHoles(
+        cloud=added.as_completed(),
+        guessed=np.concatenate(guessed),
+        num_guessed_px=num_guessed_px,
+    )
 
 
 def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _Hole:
@@ -109,9 +150,9 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
 
 def _closed(
     hole: _Hole, views: Sequence[TrainingView], config: InitialiseConfig, most: int
-) -> GaussianCloud:
+) -> ClosedHoles:
     """Gaussians for the pixels of one view, coarser where they would be too many."""
-    depth_m = _swept(hole, _references(hole.view, views))
+    depth_m, guessed = _swept(hole, views)
     step = 1
     while (depth_m[::step, ::step] > 0).sum() > most:
         step += 1
@@ -120,16 +161,22 @@ def _closed(
     camera, T = hole.target.camera, hole.view.T_base_color
     p_camera = camera.unproject(depth_m.astype(np.float64))[chosen]
     colors = np.moveaxis(hole.target.image(), 0, -1)[chosen]
-    allowed = np.ones(len(p_camera), dtype=bool)
+    allowed, from_guess = np.ones(len(p_camera), dtype=bool), guessed[chosen]
     for _ in range(RETRIES):
         _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
         if allowed.all():
             break
         p_camera[~allowed] *= FARTHER
+        from_guess = from_guess & allowed
     p_camera, colors = p_camera[allowed], colors[allowed]
     towards = -p_camera / np.maximum(np.linalg.norm(p_camera, axis=1, keepdims=True), 1e-9)
     sizes = SPACING_PX * step * p_camera[:, 2] / camera.fx
-    return flat_gaussians(se3.apply(T, p_camera), towards @ T[:3, :3].T, colors, sizes, config)
+    normals = towards @ T[:3, :3].T
+    return ClosedHoles(
+        cloud=flat_gaussians(se3.apply(T, p_camera), normals, colors, sizes, config),
+        guessed=from_guess[allowed],
+        num_guessed_px=int(guessed.sum()),
+    )
 
 
 def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[TrainingView]:
@@ -142,27 +189,52 @@ def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[Train
     return [views[i] for i in usable[np.argsort(baseline_m[usable])][:MOST_REFERENCES].tolist()]
 
 
-def _swept(hole: _Hole, references: Sequence[TrainingView]) -> Float32[np.ndarray, "height width"]:
-    """Depth of the hole's pixels; 0 elsewhere, and where every distance contradicts a view."""
+def _swept(
+    hole: _Hole, views: Sequence[TrainingView]
+) -> tuple[Float32[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+    """Depth of the hole's pixels, and where it is the guessed one.
+
+    0 elsewhere, and where every distance contradicts a view.
+    """
+    references = _references(hole.view, views)
     rows, columns = np.nonzero(hole.mask)
     beside = hole.beside_m[rows, columns].astype(np.float64)
     near, far = 0.7 * beside.min(), BEYOND * float(hole.beside_m.max())
-    depths = np.geomspace(near, far, NUM_DEPTHS)
     rays = hole.target.camera.rays()[rows, columns] @ hole.view.T_base_color[:3, :3].T
+    origin = hole.view.T_base_color[:3, 3]
     image = np.moveaxis(hole.target.image(), 0, -1)[rows, columns]
+    expected, weight = beside, np.full(len(rows), SMOOTH)
+    guess = np.zeros(len(rows))
+    if hole.guess is not None:
+        guess = hole.guess.depth_m[rows, columns].astype(np.float64)
+        _, possible = _disagreement(origin + guess[:, None] * rays, image, views)
+        guess[~possible] = 0.0
+    is_known = guess > 0
+    if hole.guess is not None and is_known.any():
+        near, far = min(near, 0.9 * guess[is_known].min()), max(far, 1.1 * guess.max())
+        expected = np.where(is_known, guess, beside)
+        weight[is_known] = GUESS_COST / max(hole.guess.scatter, LEAST_SCATTER)
+    depths = np.geomspace(near, far, NUM_DEPTHS)
     cost = np.empty((NUM_DEPTHS, len(rows)))
     allowed = np.empty((NUM_DEPTHS, len(rows)), dtype=bool)
     for index, depth in enumerate(depths):
-        p = hole.view.T_base_color[:3, 3] + depth * rays
-        difference, allowed[index] = _disagreement(p, image, references)
-        cost[index] = _averaged(difference, hole.mask) + SMOOTH * np.abs(np.log(depth / beside))
+        difference, allowed[index] = _disagreement(origin + depth * rays, image, references)
+        leaving = weight * np.abs(np.log(depth / expected))
+        cost[index] = _averaged(difference, hole.mask) + leaving
     cost[~allowed] = np.inf
     chosen = _least(cost, depths)
+    if is_known.any():
+        difference, _ = _disagreement(origin + expected[:, None] * rays, image, references)
+        is_best = is_known & (_averaged(difference, hole.mask) <= cost.min(axis=0))
+        chosen = np.where(is_best, guess, chosen)
+    else:
+        is_best = is_known
     found = np.zeros(hole.mask.shape, dtype=np.float32)
-    found[rows, columns] = chosen
+    guessed = np.zeros(hole.mask.shape, dtype=bool)
+    found[rows, columns], guessed[rows, columns] = chosen, is_best
     around = np.where(found > 0, found, hole.beside_m)
     smooth = ndimage.median_filter(around, size=BLOCK_PX)
-    return np.where(found > 0, smooth, np.float32(0.0))
+    return np.where(found > 0, smooth, np.float32(0.0)), guessed
 
 
 def _least(

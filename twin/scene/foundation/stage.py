@@ -22,6 +22,7 @@ from twin.scene.foundation.loading import (
     weights_hash,
 )
 from twin.scene.foundation.models import (
+    DEPTH_MODELS,
     FEATURES,
     SEGMENTERS,
     ClipEmbedder,
@@ -83,6 +84,9 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
         named.append(("features", folder, models.DINOV3_KIND))
     if config.clip:
         named.append(("clip", Path(config.clip).expanduser(), models.CLIP_KIND))
+    if config.depth_model:
+        _, folder = split_spec(config.depth_model, "--depth-model", DEPTH_MODELS)
+        named.append(("depth_model", folder, models.DEPTH_ANYTHING_KIND))
     if config.generator:
         generator_command(config.generator)
     hashes = {}

@@ -11,6 +11,7 @@ from bridge.episode import provenance, streams
 from twin.scene.dataset.training_set import TrainingSet
 from twin.scene.fit.appearance import degree_shares
 from twin.scene.fit.optimise import FitResult
+from twin.scene.foundation.monocular_depth import describe_guesses
 from twin.scene.frames.camera_poses import SAYS
 from twin.scene.frames.selection import FrameChoice, Sources, root_frame
 from twin.scene.gaussians import GaussianCloud
@@ -211,6 +212,8 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         for key, item in record.get("objects", {}).items()
         if item.get("num_completed")
     ]
+    if "depth_model" in record:
+        lines.append(describe_guesses(record["depth_model"]))
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
     lines += [

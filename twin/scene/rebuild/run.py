@@ -28,6 +28,7 @@ from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
 from twin.scene.foundation.complete import complete_shapes
+from twin.scene.foundation.monocular_depth import DepthGuesser
 from twin.scene.foundation.stage import check_models
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
 from twin.scene.frames.swept_episode import find_or_sweep_sources
@@ -123,8 +124,12 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     clock.end("initialise_and_fit")
     training = with_fitted_poses(training, fitted.Ts_base_color)
     raster = RasterConfig(threads=config.fit.threads)
-    completed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
+    guesser = DepthGuesser.load(config.models)
+    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster, guesser)
+    completed = closed.cloud
     output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
+    guesses = {} if guesser is None else {"depth_model": guesser.to_record(closed)}
+    del guesser  # and its network
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
@@ -172,7 +177,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
-    record |= extras
+    record |= extras | guesses
     write_record(run, record)
     kept.path.unlink(missing_ok=True)
     return record
@@ -256,6 +261,8 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
     if config.fit.exposure != "affine":
         settings["fit"].pop("exposure")
     settings["models"].pop("device")
+    if not config.models.depth_model:
+        settings["models"].pop("depth_model")  # keys of older scenes
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = scanned_tasks(sources).task  # shapes and colours decide the objects
     return provenance.hash_settings(
