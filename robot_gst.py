@@ -15,6 +15,7 @@ from cyclopts import App
 from cyclopts.config import Toml
 from rich.console import Console
 
+from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
 
 HELP = (
@@ -358,6 +359,7 @@ def run(arguments: Sequence[str]) -> int:
 def main() -> None:
     """Entry point of the ``robot-gst`` command."""
     _prepare_streams()
+    end_with_starter()
     sys.exit(run(sys.argv[1:]))
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bridge.ending import ending_with_me
 from bridge.episode.catalogue import outcome_of, sidecar_path
 from bridge.episode.mcap.part_file import lock_dead
 from bridge.episode.metadata import WITHOUT, Outcome
@@ -407,10 +408,16 @@ def step(
     output.say(f"    {time.monotonic() - started:.0f} s: robot-gst {' '.join(arguments)}")
 
 
-def start_command(arguments: list[str], **options: Any) -> subprocess.Popen[bytes]:
+def start_command(
+    arguments: list[str], *, env: Mapping[str, str] = os.environ, **options: Any
+) -> subprocess.Popen[bytes]:
     """Start a command that Ctrl-C does not reach: it is told to end in its turn."""
     return subprocess.Popen(
-        _command(arguments), stdin=subprocess.DEVNULL, start_new_session=True, **options
+        _command(arguments),
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
+        env=ending_with_me(env),
+        **options,
     )
 
 

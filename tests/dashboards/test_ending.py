@@ -73,3 +73,23 @@ def test_a_demo_terminated_while_it_replays_leaves_no_replay_behind(
         signal.signal(signal.SIGTERM, before)
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid_file.read_text()), 0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are adopted on POSIX")
+def test_what_a_killed_command_started_ends_too() -> None:
+    """Else a recorder that nobody needs writes on, and the command cannot be resumed."""
+    child = (
+        "import time; from bridge.ending import end_with_starter; end_with_starter(); "
+        "print('watches', flush=True); time.sleep(600)"
+    )
+    code = (
+        "import sys; from dashboards import demo; "
+        f"demo._command = lambda _: [sys.executable, '-c', {child!r}]; "
+        "demo.start_command([]).wait()"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        assert starter.stdout.readline() == "watches\n"
+        starter.kill()
+        assert starter.stdout.read() == ""  # nobody holds its other end any more

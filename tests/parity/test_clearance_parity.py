@@ -125,18 +125,57 @@ def test_bounds_are_those_of_numpy_and_never_above_what_coal_measures() -> None:
     assert exact > 0.2 * apart  # boxes about random hulls are loose
 
 
+def test_pairs_that_are_left_out_are_farther_apart_than_was_asked() -> None:
+    """Whatever was asked before: what parted a pair last time is tried first."""
+    rng = np.random.default_rng(8)
+    points = [rng.normal(size=(40, 3)) * rng.uniform(0.01, 0.1, 3) for _ in range(6)]
+    points += [box_corners(rng.uniform(0.02, 0.1, 3)) for _ in range(3)]
+    solids = [solid_of("body", convex_hull(p), p) for p in points]
+    solids.append(half_space_solid("table"))
+    pairs = list(combinations(range(10), 2))
+    near = NearPairs(solids, pairs)
+    kept = parted = beyond = 0
+    for seed in range(12):
+        near.R[:9], near.t[:9] = poses(9, seed)
+        bounds = {index: bound for bound, index in near.nearest_first()}
+        placed = [coal.Transform3s(R, t) for R, t in zip(near.R, near.t, strict=True)]
+        measured = {
+            index: signed_distance(solids[a].shape, placed[a], solids[b].shape, placed[b])
+            for index, (a, b) in enumerate(pairs)
+        }
+        for up_to_m in (0.03, -0.005, 0.0, 0.002):
+            few = list(near.nearest_first(up_to_m))
+            assert few == sorted(few)
+            assert all(bound == bounds[index] <= up_to_m for bound, index in few)
+            left = {index for _, index in few}
+            assert left >= {index for index, distance in measured.items() if distance <= up_to_m}
+            kept += len(left)
+            parted += sum(bounds[index] <= up_to_m for index in set(bounds) - left)
+            if up_to_m >= 0:  # depths are not looked for
+                hulls = [index for index in left if 9 not in pairs[index]]
+                beyond += sum(measured[index] > up_to_m + 1e-5 for index in hulls)
+    assert kept > 100
+    assert parted > 100
+    assert beyond == 0
+
+
 def test_bounds_refuse_what_does_not_fit_together() -> None:
-    one, three = np.ones(1), np.zeros((1, 3))
+    one, three, none = np.ones(1), np.zeros((1, 3)), np.zeros((1, 2), dtype=np.int32)
     with pytest.raises(ValueError, match="differ in number"):
-        _clearance.Bounds(three, np.zeros((2, 3)), one, np.zeros((1, 2), dtype=np.int32))
+        _clearance.Bounds(three, np.zeros((2, 3)), one, three, none, none)
+    with pytest.raises(ValueError, match="differ in number"):
+        _clearance.Bounds(three, three, one, three, np.zeros((2, 2), dtype=np.int32), none)
     with pytest.raises(IndexError, match="not there"):
-        _clearance.Bounds(three, three, one, np.array([[0, 1]], dtype=np.int32))
-    bounds = _clearance.Bounds(three, three, one, np.zeros((1, 2), dtype=np.int32))
+        _clearance.Bounds(three, three, one, three, none, np.array([[0, 1]], dtype=np.int32))
+    for wrong in ([[0, 2]], [[-1, 0]], [[1, 0]]):
+        with pytest.raises(IndexError, match="corner"):
+            _clearance.Bounds(three, three, one, three, np.array(wrong, dtype=np.int32), none)
+    bounds = _clearance.Bounds(three, three, one, three, none, none)
     order = np.zeros(1, dtype=np.int32)
     with pytest.raises(ValueError, match="differ in number"):
-        bounds.nearest_first(np.eye(3)[None], np.zeros((2, 3)), np.zeros(1), order)
+        bounds.nearest_first(np.eye(3)[None], np.zeros((2, 3)), np.zeros(1), order, 0.0)
     with pytest.raises(ValueError, match="differ in number"):
-        bounds.nearest_first(np.eye(3)[None], three, np.zeros(2), order)
+        bounds.nearest_first(np.eye(3)[None], three, np.zeros(2), order, 0.0)
 
 
 def bodies(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

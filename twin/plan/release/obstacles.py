@@ -53,7 +53,8 @@ class Obstacle:
 
     def describe(self) -> str:
         """Name it with its source and its error."""
-        return f"{self.name}: {self.source}, made thicker by {self.error_m * 1e3:.1f} mm"
+        thicker = f", made thicker by {self.error_m * 1e3:.1f} mm" if self.error_m else ""
+        return f"{self.name}: {self.source}{thicker}"
 
 
 class Obstacles:

@@ -39,6 +39,8 @@ class Solid:
     radius_m: float
     half_m: Float[np.ndarray, "3"]
     """Half the extents of the box, along the axes of the piece's frame."""
+    corners_m: Float[np.ndarray, "num_points 3"]
+    """Points whose hull holds the shape; none where it has no end."""
 
 
 def solid_of(
@@ -54,7 +56,7 @@ def solid_of(
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.linalg.norm(points_m - centre, axis=1).max())
-    return Solid(body, shape, centre, radius, (high - low) / 2)
+    return Solid(body, shape, centre, radius, (high - low) / 2, points_m)
 
 
 def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
@@ -72,7 +74,7 @@ def half_space_solid(body: str) -> Solid:
     """Everything below its frame; the box is as large as any cell and far beyond."""
     half = np.full(3, _FAR_M)
     shape = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    return Solid(body, shape, np.array([0.0, 0.0, -_FAR_M]), float("inf"), half)
+    return Solid(body, shape, np.array([0.0, 0.0, -_FAR_M]), float("inf"), half, np.empty((0, 3)))
 
 
 def names_of(body: str, gripper: Gripper) -> tuple[str, ...]:
@@ -115,6 +117,7 @@ def placed_panels(
 # Pairs of convex bodies with a lower bound of their distance, nearest first.
 # A body is at least as far away as the box and the sphere that hold it. Where boxes are turned
 # against each other this is nearly exact, so most pairs need no distance (tests/parity compares).
+# Where only near pairs are asked for, a plane between the hulls leaves out most of the others.
 
 _SLACK_M = 1e-6
 """Measured distances are exact to this much: bounds stay below them."""
@@ -136,17 +139,28 @@ class NearPairs:
         """Positions of the bodies' frames [m]."""
         self._bounds = np.empty(len(pairs))
         self._order = np.empty(len(pairs), dtype=np.int32)
+        corners = [np.asarray(solid.corners_m, dtype=np.float64) for solid in solids]
+        ends = np.cumsum([0, *map(len, corners)])
         self._native = Bounds(
             np.array([solid.centre for solid in solids], dtype=np.float64).reshape(-1, 3),
             np.array([solid.half_m for solid in solids], dtype=np.float64).reshape(-1, 3),
             np.array([solid.radius_m for solid in solids], dtype=np.float64),
+            np.concatenate([np.empty((0, 3)), *corners]),
+            np.column_stack([ends[:-1], ends[1:]]).astype(np.int32),
             np.array(pairs, dtype=np.int32).reshape(-1, 2),
         )
 
-    def nearest_first(self) -> Iterator[tuple[float, int]]:
-        """Yield a bound that the signed distance is not below [m], and the number of the pair."""
-        self._native.nearest_first(self.R, self.t, self._bounds, self._order)
-        return zip((self._bounds - _SLACK_M).tolist(), self._order.tolist(), strict=True)
+    def nearest_first(self, up_to_m: float = np.inf) -> Iterator[tuple[float, int]]:
+        """Yield a bound that the signed distance is not below [m], and the number of the pair.
+
+        Args:
+            up_to_m: Pairs that are surely farther apart are left out.
+        """
+        count = self._native.nearest_first(
+            self.R, self.t, self._bounds, self._order, up_to_m + _SLACK_M
+        )
+        bounds = self._bounds[:count] - _SLACK_M
+        return zip(bounds.tolist(), self._order[:count].tolist(), strict=True)
 
 
 class OwnLinks:
@@ -166,12 +180,9 @@ class OwnLinks:
         """Whether any touch where the hulls have been placed."""
         self._near.R[:] = self._hulls.rotations
         self._near.t[:] = self._hulls.translations
-        for bound_m, index in self._near.nearest_first():
-            if bound_m > 0:
-                return False
-            if self._hulls.pair_distance_m(index) <= 0:
-                return True
-        return False
+        return any(
+            self._hulls.pair_distance_m(index) <= 0 for _, index in self._near.nearest_first(0.0)
+        )
 
 
 @lru_cache(maxsize=4)

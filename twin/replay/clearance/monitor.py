@@ -425,7 +425,11 @@ class ClearanceMonitor:
     def _fail(self, t_ns: int, cause: str, body: str, other: str, distance: float) -> None:
         if any(failure.cause == cause for failure in self.failures):
             return
-        where = f"{abs(distance) * 1e3:.1f} mm {'inside' if distance < 0 else 'from'} {other}"
+        if distance < 0:
+            where = f"{-distance * 1e3:.1f} mm inside {other}"
+        else:
+            least_m = self.config.eps_col_m
+            where = f"{distance * 1e3:.2f} mm from {other}, nearer than {least_m * 1e3:g} mm"
         self.failures.append(
             Failure(
                 t_ns=t_ns,

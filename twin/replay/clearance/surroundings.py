@@ -177,7 +177,7 @@ class Surroundings:
         num_links = len(self.links)
         near.R[:num_links], near.t[:num_links] = links.rotations, links.translations
         best = below_m
-        for bound, number in near.nearest_first():
+        for bound, number in near.nearest_first(below_m):
             if bound > best:
                 break
             if pairing.names[number][0] in left_out:

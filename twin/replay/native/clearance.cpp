@@ -76,11 +76,13 @@ double least(const Values& values, const Vector& origin, double voxel, const Tur
 NB_MODULE(_clearance, module) {
     module.doc() = "Distances of surfaces to a grid, and which pairs of bodies may be near.";
     nb::class_<Bounds>(module, "Bounds")
-        .def(nb::init<const Points&, const Points&, const Vector&, const Ranges&>(), "centres"_a,
-             "halves"_a, "radii"_a, "pairs"_a,
-             "Bodies by their boxes and spheres about their centres, and the pairs of them.")
+        .def(nb::init<const Points&, const Points&, const Vector&, const Points&, const Ranges&,
+                      const Ranges&>(),
+             "centres"_a, "halves"_a, "radii"_a, "corners"_a, "ranges"_a, "pairs"_a,
+             "Bodies by their boxes, spheres about their centres and corners; the pairs of them.")
         .def("nearest_first", &Bounds::nearest_first, "R"_a, "t"_a, "bounds"_a.noconvert(),
-             "order"_a.noconvert(), "Lower bounds of the pairs' distances, and their order.");
+             "order"_a.noconvert(), "up_to"_a,
+             "Lower bounds of the pairs' distances that are not above a number, and their order.");
     module.def("nearest", &nearest, "values"_a, "origin"_a, "voxel"_a, "R"_a, "t"_a, "points"_a,
                "radius"_a, "children"_a, "roots"_a, "answers"_a.noconvert(),
                "Smallest distance of each placed body's points, into answers.");

@@ -11,10 +11,10 @@
 #include <memory>
 #include <vector>
 
+#include "../../../replay/native/geometry.hpp"
 #include "../../../replay/native/grid_search.hpp"
-#include "geometry.hpp"
+#include "../../../replay/native/separation.hpp"
 #include "kernels.hpp"
-#include "separation.hpp"
 
 struct Counts {
     std::int64_t postures = 0;
