@@ -165,9 +165,9 @@ def _line(
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, len(x), size=(2, NUM_PAIRS))
     run = x[second] - x[first]
-    apart = np.abs(run) > 1e-3
-    scale = (y[second] - y[first])[apart] / run[apart]
-    shift = y[first][apart] - scale * x[first][apart]
+    distinct = np.abs(run) > 1e-3
+    scale = (y[second] - y[first])[distinct] / run[distinct]
+    shift = y[first][distinct] - scale * x[first][distinct]
     scale, shift = scale[scale > 0], shift[scale > 0]
     if len(scale) == 0:
         message = "nearer in the guess is not nearer in the measurement"
