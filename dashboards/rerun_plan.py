@@ -110,7 +110,7 @@ def shown_plans(
         )
         for stamp_ns, plan in recording.plans
     ]
-    if run is None or recording.path.parent != run.plans_dir or not found:
+    if run is None or not run.holds_plan(recording.path) or not found:
         return found
     return [*_before(file, run, found[0]), *found]
 

@@ -399,7 +399,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
                     stages=any(side.recording.events for side in sides),
                     plans=bool(plans),
                     planned_path=counted_plan(plans).tool_path if plans else None,
-                    plans_first=run is not None and episode_path.parent == run.plans_dir,
+                    plans_first=run is not None and run.holds_plan(episode_path),
                 )
             )
         )

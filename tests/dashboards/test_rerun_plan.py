@@ -148,6 +148,18 @@ def test_the_text_says_what_steered_it(content: Content) -> None:
     assert text.index("trial_0001_p1`: ") < text.index("trial_0001_p2`: ")
 
 
+def test_what_was_refused_before_is_shown_from_a_relative_path_too(
+    run: RunFolder, tmp_path: Path, content: Content, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run.path.parent)
+    path = episode_of(run.plans_dir.relative_to(run.path.parent) / "trial_0001_p2.json")
+    assert not path.is_absolute()
+    export_rrd(path, tmp_path / "plan.rrd", run_of(path))
+    found = read_back(tmp_path / "plan.rrd")
+    assert "/plans/trial_0001_p1/tool_path" in found
+    assert found.keys() == content.keys()
+
+
 def test_a_refused_plan_that_is_gone_is_a_note(
     run: RunFolder, tmp_path: Path, synthetic: ModuleType
 ) -> None:

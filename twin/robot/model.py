@@ -212,7 +212,9 @@ class RobotModel:
         self.name = str(self.model.name)
         self._check_joints()
         self.data = self.model.createData()
-        self._neutral: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
+        self._opened: Float[np.ndarray, " num_values"] = pin.neutral(self.model)
+        """With the fingers where they were asked for last, at this width [m]."""
+        self._opened_m = math.nan
         self.arm_ids = np.array([self._q_id(name) for name in self.joints])
         self.arm_velocity_ids = np.array(
             [int(self.model.joints[self.model.getJointId(name)].idx_v) for name in self.joints]
@@ -389,10 +391,12 @@ class RobotModel:
             joints_rad: Of the arm, from base to hand.
             width_m: Distance between the finger pads.
         """
-        q = self._neutral.copy()
+        if width_m != self._opened_m:  # along a path it seldom changes
+            self._opened_m = width_m
+            for index, finger in self._fingers:
+                self._opened[index] = finger.value(width_m)
+        q = self._opened.copy()
         q[self.arm_ids] = joints_rad
-        for index, finger in self._fingers:
-            q[index] = finger.value(width_m)
         if len(self._follower_ids):
             q[self._follower_ids] = self._ratios * q[self._leader_ids] + self._shifts
         return q

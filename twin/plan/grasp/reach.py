@@ -65,10 +65,7 @@ class ArmReach:
         self.hulls.place(joints_rad, open_m)
         if self._links.touch():
             return False
-        found, _ = self._around.measure(
-            {}, [], near_m=self._eps_m, counts=lambda _body, _other: True
-        )
-        return min(found.values(), default=np.inf) >= self._eps_m
+        return self._around.least_m(frozenset(), self._eps_m) >= self._eps_m
 
 
 class _Reaches:

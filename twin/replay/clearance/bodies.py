@@ -159,6 +159,8 @@ class NearPairs:
         count = self._native.nearest_first(
             self.R, self.t, self._bounds, self._order, up_to_m + _SLACK_M
         )
+        if not count:  # most often, where only what touches is asked for
+            return iter(())
         bounds = self._bounds[:count] - _SLACK_M
         return zip(bounds.tolist(), self._order[:count].tolist(), strict=True)
 
@@ -175,11 +177,11 @@ class OwnLinks:
         self._hulls = hulls
         solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
         self._near = NearPairs(solids, hulls.pairs)
+        # The same memory: the pairs are where the hulls have been placed last.
+        self._near.R, self._near.t = hulls.rotations, hulls.translations
 
     def touch(self) -> bool:
         """Whether any touch where the hulls have been placed."""
-        self._near.R[:] = self._hulls.rotations
-        self._near.t[:] = self._hulls.translations
         return any(
             self._hulls.pair_distance_m(index) <= 0 for _, index in self._near.nearest_first(0.0)
         )
