@@ -1,4 +1,4 @@
-"""How hard the tasks of the cell standin_cubes are for the scripted planner, on development seeds.
+"""How hard the tasks with several cubes are for the scripted planner, on development seeds.
 
 The cell's own physics carries out one plan per start as the cell draws it, errors and all, without
 cameras, zenoh and twin. A control runs the same starts in a laboratory that is as published, with a
@@ -26,8 +26,13 @@ from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
 
-CELL = "standin_cubes"
-TASKS = ("sort_by_colour", "cube_beside_cube", "clear_then_place", "cube_on_block")
+TASKS = (
+    "sort_by_colour",
+    "cube_beside_cube",
+    "clear_then_place",
+    "cube_on_block",
+    "stack_and_pack",
+)
 
 
 def trial(cell: StandinCell, start_seed: int, *, errs: bool) -> dict[str, Any]:
@@ -59,7 +64,8 @@ def trial(cell: StandinCell, start_seed: int, *, errs: bool) -> dict[str, Any]:
 
 def measured(name: str, *, labs: int, starts: int, controls: int, first: int) -> dict[str, Any]:
     """All trials of one task, and the control."""
-    file, task = load_cell(CELL), load_task(name)
+    task = load_task(name)
+    file = load_cell(task.cell)
     low, high = file.development_seeds
     rows, began_s = [], time.process_time()
     for seed in range(low + first, low + first + labs):
@@ -75,6 +81,7 @@ def measured(name: str, *, labs: int, starts: int, controls: int, first: int) ->
     control = [trial(plain, seed, errs=False) for seed in seeds]
     return {
         "task": name,
+        "cell": task.cell,
         "n": len(rows),
         "k": sum(row["result"] == "success" for row in rows),
         "objects_n": len(rows) * len(task.manipulated),
@@ -117,7 +124,7 @@ def main() -> None:
             for trial_row in row["trials"]:
                 print(f"  {trial_row['lab']} {trial_row['result']}: {trial_row['detail']}")
     if asked.out:
-        asked.out.write_text(json.dumps({"cell": CELL, "tasks": found}, indent=1) + "\n")
+        asked.out.write_text(json.dumps({"tasks": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
