@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from twin.errors import TwinError
 from twin.scene.fit.completion import ClosedHoles, DepthGuess
-from twin.scene.foundation.loading import Placement, weights_hash
+from twin.scene.foundation.loading import Placement
 from twin.scene.foundation.models import (
-    DEPTH_ANYTHING_KIND,
     DEPTH_MODELS,
     DepthAnything,
     split_spec,
@@ -205,11 +204,12 @@ class DepthGuesser:
         self._refused: list[dict[str, Any]] = []
 
     @staticmethod
-    def load(config: ModelConfig) -> "DepthGuesser | None":
+    def load(config: ModelConfig, sha256: str) -> "DepthGuesser | None":
         """The network that is named, None where none is.
 
         Args:
             config: Names the folder and the device.
+            sha256: Of its weights, which ``check_models`` read.
 
         Raises:
             UsageError: When the folder or the device cannot be used.
@@ -219,7 +219,7 @@ class DepthGuesser:
             return None
         _, folder = split_spec(config.depth_model, "--depth-model", DEPTH_MODELS)
         network = DepthAnything.load(folder, Placement(device=config.device))
-        return DepthGuesser(network, weights_hash(folder, DEPTH_ANYTHING_KIND))
+        return DepthGuesser(network, sha256)
 
     def __call__(self, view: TrainingView) -> DepthGuess | None:
         """What the network guesses for a view's half-size image, aligned; None where it is refused.

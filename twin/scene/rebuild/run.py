@@ -5,7 +5,7 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -107,7 +107,8 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)
-    key = _key(sources, config, calibration)
+    models = check_models(config.models, scanned_tasks(sources).task)
+    key = _key(sources, config, calibration, models)
     done = None if config.force else _already_done(run, key)
     if done is not None:
         output.say("the scene is up to date (same episodes, same settings); --force redoes it")
@@ -123,13 +124,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     fitted = _fit(training, config, kept, output)
     clock.end("initialise_and_fit")
     training = with_fitted_poses(training, fitted.Ts_base_color)
-    raster = RasterConfig(threads=config.fit.threads)
-    guesser = DepthGuesser.load(config.models)
-    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster, guesser)
-    completed = closed.cloud
-    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
-    guesses = {} if guesser is None else {"depth_model": guesser.to_record(closed)}
-    del guesser  # and its network
+    completed, guesses = _close_holes(training, fitted, config, models, output)
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
@@ -201,6 +196,25 @@ def _fit(
         )
 
 
+def _close_holes(
+    training: TrainingSet,
+    fitted: FitResult,
+    config: RebuildConfig,
+    models: Mapping[str, str],
+    output: Output,
+) -> tuple[GaussianCloud, dict[str, Any]]:
+    """Gaussians where no depth was measured, and the record of the network that guessed, if any.
+
+    The network lives no longer than this.
+    """
+    raster = RasterConfig(threads=config.fit.threads)
+    guesser = DepthGuesser.load(config.models, models.get("depth_model", ""))
+    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster, guesser)
+    output.say(f"{len(closed.cloud)} Gaussians where colour was seen and no depth measured")
+    record = {} if guesser is None else {"depth_model": guesser.to_record(closed)}
+    return closed.cloud, record
+
+
 def _hold_out(
     run: RunFolder,
     training: TrainingSet,
@@ -252,7 +266,12 @@ def _marked_objects(decomposed: Decomposition) -> GaussianCloud | None:
     )
 
 
-def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | None) -> str:
+def _key(
+    sources: Sources,
+    config: RebuildConfig,
+    calibration: Calibration | None,
+    models: Mapping[str, str],
+) -> str:
     settings = asdict(config)
     settings.pop("force")
     settings["fit"].pop("threads")
@@ -270,7 +289,7 @@ def _key(sources: Sources, config: RebuildConfig, calibration: Calibration | Non
             "method": METHOD_VERSION,
             "episodes": hashes,
             "settings": settings,
-            "models": check_models(config.models, task),
+            "models": dict(models),
             "task": None if task is None else asdict(task),
             "calibration": _mounts(config, calibration),
         }

@@ -317,7 +317,7 @@ def test_a_rebuild_says_what_the_model_did_and_the_hole_is_closed_on_the_surface
 
     class Loaded(DepthGuesser):
         @staticmethod
-        def load(config: ModelConfig) -> DepthGuesser:
+        def load(config: ModelConfig, sha256: str) -> DepthGuesser:
             return DepthGuesser(network, "f" * 64)
 
     monkeypatch.setattr("twin.scene.rebuild.run.DepthGuesser", Loaded)
@@ -337,7 +337,6 @@ def test_the_key_of_a_scene_depends_on_the_model_only_where_one_is_named(
     from twin.scene.rebuild import run as stages
 
     hashed: list[dict[str, Any]] = []
-    monkeypatch.setattr(stages, "check_models", lambda config, task: {})
     monkeypatch.setattr(
         stages.provenance, "hash_settings", lambda content: hashed.append(content) or "key"
     )
@@ -345,14 +344,14 @@ def test_the_key_of_a_scene_depends_on_the_model_only_where_one_is_named(
     nothing = Sources(episodes=(), remark="")
     monkeypatch.setattr(stages, "scanned_tasks", lambda sources: type("T", (), {"task": None}))
     for config in (ModelConfig(), ModelConfig(depth_model="depth-anything:folder")):
-        stages._key(nothing, RebuildConfig(models=config), None)
+        stages._key(nothing, RebuildConfig(models=config), None, {})
     assert "depth_model" not in hashed[0]["settings"]["models"]
     assert hashed[1]["settings"]["models"]["depth_model"] == "depth-anything:folder"
 
 
 def test_without_a_named_model_nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monocular_depth, "DepthAnything", None)
-    assert DepthGuesser.load(ModelConfig()) is None
+    assert DepthGuesser.load(ModelConfig(), "") is None
 
 
 @pytest.mark.slow
