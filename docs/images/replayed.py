@@ -4,7 +4,7 @@ Example: .venv/bin/python docs/images/replayed.py runs/toys docs/images/replayed
 Needs robot-gst replay RUN --render. Columns: recorded, planned in the twin, executed in the twin.
 Of a plan that was never executed there is one column, and no recording beside it. The picture of
 the README (twin.jpg): --episode trial_0002 --trajectory executed --at 0.35 0.65 --headings, after
-robot-gst rebuild RUN --iterations 600 of the quick demo.
+robot-gst replay RUN --episode trial_0002 --render of the demo.
 """
 
 import argparse
