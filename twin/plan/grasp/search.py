@@ -587,7 +587,8 @@ def in_tools(
     """Points of the object, in the tool frame of each grasp: all x, then y, then z."""
     R, p = lines.Ts_object_tcp[:, :3, :3], lines.Ts_object_tcp[:, :3, 3]
     # One product, not one for each grasp.
-    found = (R.transpose(2, 0, 1).reshape(-1, 3) @ points_m.T).reshape(3, len(R), -1)
+    turned_all = R.transpose(2, 0, 1).reshape(-1, 3) @ points_m.T
+    found = turned_all.reshape(3, len(R), len(points_m))
     found -= np.einsum("nij,ni->jn", R, p)[..., None]
     return np.asarray(found)
 

@@ -236,7 +236,7 @@ def test_where_no_finger_fits_the_neighbours_are_named() -> None:
     assert refusal(among_cubes(0.008), "red").cause == "neighbour"
 
 
-@pytest.mark.parametrize("gap_m", [0.02, 0.035])
+@pytest.mark.parametrize("gap_m", [0.025, 0.035])
 def test_neighbours_that_no_hand_comes_near_are_left_out_and_nothing_else(
     gap_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
