@@ -9,7 +9,7 @@ of missing are added up, and their sum is told as the standard deviations of one
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from twin.plan.grasp.open_hand import OpenHand
@@ -42,6 +42,12 @@ class Lines:
     widths_m: Float[np.ndarray, " num_grasps"]
     cosines: Float[np.ndarray, " num_grasps"]
     """Of the larger angle between line and normal."""
+
+    def chosen(
+        self, which: Bool[np.ndarray, " num_grasps"] | Int[np.ndarray, " num_chosen"]
+    ) -> "Lines":
+        """Some of them."""
+        return Lines(**{name: value[which] for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +107,7 @@ def slacks(
     surface: SampledSurface,
     lines: Lines,
     hand: OpenHand,
-    points_m: Float[np.ndarray, "num_grasps num_points 3"],
+    points_m: Float[np.ndarray, "3 num_grasps num_points"],
     *,
     over_table_m: Float[np.ndarray, " num_grasps"],
     cone_rad: float,
@@ -113,12 +119,12 @@ def slacks(
         surface: The object's.
         lines: The grasps.
         hand: As it comes.
-        points_m: Of the surface, in the tool frame of each grasp.
+        points_m: Of the surface, in the tool frame of each grasp; x, y and z one after the other.
         over_table_m: Height of the lowest point of each hand over the table.
         cone_rad: Half the opening of the friction cone.
         lever_m: At what distance from the closing line the weight still cannot turn the object.
     """
-    x, y, z = (points_m[..., axis] for axis in range(3))
+    x, y, z = points_m
     column = (np.abs(x) < hand.pad_half_m) & (z < hand.tip_m) & (z > -hand.depth_m)
     widest = np.where(column, np.abs(y), 0.0).max(axis=1)
     across = hand.open_m / 2 - np.maximum(widest, lines.widths_m / 2)
@@ -133,7 +139,7 @@ def slacks(
     palm = z.min(axis=1) + hand.depth_m
     angle = cone_rad - np.arccos(np.clip(lines.cosines, -1.0, 1.0))
     # Only what lies beside the closing line turns the object about it.
-    middle = points_m.mean(axis=1) - from_tcp
+    middle = points_m.mean(axis=2).T - from_tcp
     lever = lever_m - np.hypot(middle[:, 0], middle[:, 2])
     rows = [across, np.minimum(*sides), shallow, palm, over_table_m, angle, lever]
     return np.stack(rows, axis=1)

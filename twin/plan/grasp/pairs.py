@@ -28,25 +28,38 @@ _LEAST_M = 0.004
 """Thinner things are not taken between two pads: the mesh is not that exact."""
 
 
+_tensor: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough
+
+
 class SampledSurface:
-    """One object's surface, asked by rays; made once per shape."""
+    """One object's surface, asked by rays; made once per shape, and only what is asked of it."""
 
     def __init__(self, shape: Shape) -> None:
-        """Build the tree that answers rays."""
+        """Keep the shape."""
         self.shape = shape
-        self._normals = self._averaged()
+
+    @cached_property
+    def ball(self) -> tuple[Float[np.ndarray, "3"], float]:
+        """Middle and radius of a sphere that holds all of it, object frame."""
+        vertices = self.shape.vertices_m
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        return middle, float(np.linalg.norm(vertices - middle, axis=1).max())
+
+    @cached_property
+    def _rays(self) -> Any:
         make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-        self._scene = make(nthreads=1)
-        vertices, triangles = shape.vertices_m.astype("f4"), shape.triangles.astype("u4")
-        tensor: Any = open3d.core.Tensor  # its stubs leave out that an array alone is enough
-        self._scene.add_triangles(tensor(vertices), tensor(triangles))
-        self._tensor = tensor
+        rays, shape = make(nthreads=1), self.shape
+        rays.add_triangles(
+            _tensor(shape.vertices_m.astype("f4")), _tensor(shape.triangles.astype("u4"))
+        )
+        return rays
 
     @cached_property
     def _facets(self) -> tuple[Float[np.ndarray, "num_faces 3"], Float[np.ndarray, " num_faces"]]:
         return face_normals(self.shape.vertices_m, self.shape.triangles)
 
-    def _averaged(self) -> Float[np.ndarray, "num_faces 3"]:
+    @cached_property
+    def _normals(self) -> Float[np.ndarray, "num_faces 3"]:
         """Normals of the triangles as a pad feels them."""
         normals, areas = self._facets
         if self.shape.error_m <= 0:
@@ -76,10 +89,20 @@ class SampledSurface:
             count: How many.
             seed: Of their places within the triangles.
         """
+        points, chosen = self._sampled(count, seed)
+        return points, self._normals[chosen]
+
+    def points(self, count: int, seed: int) -> Float[np.ndarray, "num_samples 3"]:
+        """The same points alone: of what is only kept clear of, nobody asks the normals."""
+        return self._sampled(count, seed)[0]
+
+    def _sampled(
+        self, count: int, seed: int
+    ) -> tuple[Float[np.ndarray, "num_samples 3"], Int[np.ndarray, " num_samples"]]:
         shape, rng = self.shape, np.random.default_rng(seed)
         chosen, u, v = sample_triangles(self._facets[1], count, rng, in_order=True)
         a, b, c = (shape.vertices_m[shape.triangles[chosen, k]] for k in range(3))
-        return a * (1 - u - v) + b * u + c * v, self._normals[chosen]
+        return a * (1 - u - v) + b * u + c * v, chosen
 
     def leave(
         self,
@@ -93,7 +116,7 @@ class SampledSurface:
             directions: Unit vectors.
         """
         rays = np.concatenate([points_m, directions], axis=1).astype("f4")
-        found = self._scene.cast_rays(self._tensor(rays), nthreads=1)
+        found = self._rays.cast_rays(_tensor(rays), nthreads=1)
         away = found["t_hit"].numpy().astype(np.float64)
         ids = found["primitive_ids"].numpy().astype(np.int64)
         hit = np.isfinite(away)

@@ -146,7 +146,7 @@ class _Candidates:
     def keep(self, mask: Bool[np.ndarray, " num_candidates"], cause: str) -> None:
         """Reject the others."""
         _count(self.rejected, cause, int((~mask).sum()))
-        self.lines = Lines(**{name: value[mask] for name, value in vars(self.lines).items()})
+        self.lines = self.lines.chosen(mask)
 
     def __len__(self) -> int:
         return len(self.lines.widths_m)
@@ -251,11 +251,10 @@ class GraspSearcher:
         pairs, rejected = self._pairs(object_id, part_points_m, open_m)
         hand = open_hand(self.problem.robot, open_m, config.pregrasp_m)
         found = self._hands_on(pairs, T, hand, rejected)
-        points = self._surface(object_id).samples(_TARGET_POINTS, config.seed)[0]
-        around = self._neighbours(object_id, T)
+        points = self._surface(object_id).points(_TARGET_POINTS, config.seed)
         self._past_table(found, T, hand)
         self._past_object(found, points, hand)
-        self._past_neighbours(found, T, around, hand)
+        self._past_neighbours(found, object_id, T, hand)
         margin = self._margins(found, object_id, points, hand)
         return hand, found, self._choose(found, margin, object_id, hand)
 
@@ -309,10 +308,16 @@ class GraspSearcher:
         except (QhullError, ValueError):
             return None
         top_m = float(own[:, 2].max())
+        middle = own[:, :2].mean(axis=0)
+        reach_m = float(np.linalg.norm(own[:, :2] - middle, axis=1).max())
         for name, T in scene.movable().items():
             if name == object_id or not np.isfinite(T).all():
                 continue
-            other = se3.apply(T, self._surface(name).samples(_NEIGHBOUR_POINTS, 0)[0])
+            centre, radius_m = self._surface(name).ball
+            away = se3.apply(T, centre[None])[0, :2] - middle
+            if np.linalg.norm(away) > reach_m + radius_m:
+                continue
+            other = se3.apply(T, self._surface(name).points(_NEIGHBOUR_POINTS, 0))
             over = other[(other[:, :2] @ sides[:, :2].T + sides[:, 2] <= 0).all(axis=1)]
             if len(over) and over[:, 2].min() > top_m - _COVERED_M:
                 return ("covered", f"{name} is on top of it", f"Move {name} away first.")
@@ -438,41 +443,31 @@ class GraspSearcher:
         found.keep(~hits["palm"], "palm")
         found.keep(~fingers, "fingers")
 
-    def _neighbours(
-        self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
-    ) -> list[tuple[Float[np.ndarray, "num_points 3"], float]]:
-        """Points of other objects, in the object's frame, and how far they may be off."""
-        scene, rows = self.problem.scene, []
-        T_object_base = se3.invert(T_base_object)
-        for name, T in scene.Ts_base_object.items():
-            if name == object_id or not np.isfinite(T).all():
-                continue
-            points = self._surface(name).samples(_NEIGHBOUR_POINTS, self.config.seed)[0]
-            covariance = self._covariance(name)
-            sigma_m = float(np.sqrt(np.abs(np.diag(covariance)[:3]).max()))
-            near = se3.apply(T_object_base @ T, points)
-            rows.append((near, self.config.clearance_m + sigma_m))
-        return rows
-
     def _past_neighbours(
         self,
         found: _Candidates,
-        T: Float[np.ndarray, "4 4"],
-        around: list[tuple[Float[np.ndarray, "num_points 3"], float]],
+        object_id: str,
+        T_base_object: Float[np.ndarray, "4 4"],
         hand: OpenHand,
     ) -> None:
-        for points, margin_m in around:
-            if not len(found):
-                return
-            low = np.min([piece.low_m for piece in hand.pieces], axis=0)
-            high = np.max([piece.high_m for piece in hand.pieces], axis=0)
-            reach_m = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
-            centre = found.lines.Ts_object_tcp[:, :3, 3].mean(axis=0)
-            spread = np.linalg.norm(found.lines.Ts_object_tcp[:, :3, 3] - centre, axis=1).max()
-            near = points[np.linalg.norm(points - centre, axis=1) < reach_m + spread + margin_m]
-            if len(near):
-                hits = hand.hits(in_tools(found.lines, near), margin_m)
-                found.keep(~(hits["fingers"] | hits["palm"]), "neighbour")
+        """Reject hands that another object is in the way of, wherever it may be off to."""
+        scene, T_object_base = self.problem.scene, se3.invert(T_base_object)
+        for name, T in scene.Ts_base_object.items():
+            if name == object_id or not np.isfinite(T).all():
+                continue
+            sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
+            margin_m = self.config.clearance_m + sigma_m
+            surface, T_object_other = self._surface(name), T_object_base @ T
+            middle, radius_m = surface.ball
+            centres = in_tools(found.lines, se3.apply(T_object_other, middle[None]))[..., 0].T
+            near = np.flatnonzero(hand.passes(centres, radius_m, margin_m))
+            if not len(near):
+                continue
+            points = se3.apply(T_object_other, surface.points(_NEIGHBOUR_POINTS, self.config.seed))
+            hits = hand.hits(in_tools(found.lines.chosen(near), points), margin_m)
+            clear: Bool[np.ndarray, " num_candidates"] = np.ones(len(found), dtype=bool)
+            clear[near] = ~(hits["fingers"] | hits["palm"])
+            found.keep(clear, "neighbour")
 
     def _margins(
         self,
@@ -588,12 +583,14 @@ def turned(Ts: Float[np.ndarray, "num_poses 4 4"]) -> Float[np.ndarray, "num_pos
 
 def in_tools(
     lines: Lines, points_m: Float[np.ndarray, "num_points 3"]
-) -> Float[np.ndarray, "num_grasps num_points 3"]:
-    """Points of the object, in the tool frame of each grasp."""
+) -> Float[np.ndarray, "3 num_grasps num_points"]:
+    """Points of the object, in the tool frame of each grasp: all x, then y, then z."""
     R, p = lines.Ts_object_tcp[:, :3, :3], lines.Ts_object_tcp[:, :3, 3]
-    shift = np.einsum("nij,ni->nj", R, p)
-    turned_all = points_m @ R.transpose(1, 0, 2).reshape(3, -1)  # one product, not one for each
-    return np.asarray(turned_all.reshape(len(points_m), -1, 3).transpose(1, 0, 2) - shift[:, None])
+    # One product, not one for each grasp.
+    turned_all = R.transpose(2, 0, 1).reshape(-1, 3) @ points_m.T
+    found = turned_all.reshape(3, len(R), len(points_m))
+    found -= np.einsum("nij,ni->jn", R, p)[..., None]
+    return np.asarray(found)
 
 
 def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:

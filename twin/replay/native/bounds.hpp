@@ -14,8 +14,8 @@
 #include <stdexcept>
 #include <vector>
 
-#include "grid_search.hpp"
-#include "separation.hpp"
+#include "twin/robot/native/grid_search.hpp"
+#include "twin/robot/native/separation.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;

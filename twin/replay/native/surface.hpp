@@ -4,7 +4,7 @@
 #pragma once
 
 #include "bounds.hpp"
-#include "grid_search.hpp"
+#include "twin/robot/native/grid_search.hpp"
 
 using Values = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Distances = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;

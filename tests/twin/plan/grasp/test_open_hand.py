@@ -21,7 +21,7 @@ def test_a_point_is_hit_when_a_piece_passes_it_on_the_way(name: str) -> None:
     hand = open_hand(robot, 0.06, APPROACH_M)
     rng = np.random.default_rng(5)
     points = rng.uniform([-0.05, -0.12, -0.25], [0.05, 0.12, 0.03], (4000, 3))
-    hits = hand.hits(points[:, None], 0.0)
+    hits = hand.hits(points.T[:, :, None], 0.0)
     back = np.linspace(0.0, APPROACH_M, 161)
     for group, is_finger in (("fingers", True), ("palm", False)):
         passed = np.zeros(len(points), dtype=bool)
@@ -36,12 +36,27 @@ def test_a_point_is_hit_when_a_piece_passes_it_on_the_way(name: str) -> None:
         assert (hits[group] & ~passed).mean() < 0.005
 
 
+@pytest.mark.parametrize("name", ["ur5_parallel_gripper", "panda"])
+def test_a_hand_that_does_not_come_near_a_ball_hits_nothing_in_it(name: str) -> None:
+    hand = open_hand(robot_of_name(name), 0.06, APPROACH_M)
+    rng = np.random.default_rng(7)
+    centres = rng.uniform([-0.1, -0.15, -0.3], [0.1, 0.15, 0.1], (3000, 3))
+    for radius_m, margin_m in ((0.002, 0.008), (0.03, 0.0), (0.05, 0.012)):
+        inside = rng.normal(size=(3000, 40, 3))
+        inside *= radius_m / np.linalg.norm(inside, axis=2, keepdims=True)
+        points = np.moveaxis(centres[:, None] + inside, 2, 0)
+        hits = hand.hits(points, margin_m)
+        near = hand.passes(centres, radius_m, margin_m)
+        assert not ((hits["fingers"] | hits["palm"]) & ~near).any()
+        assert (hits["fingers"] | hits["palm"]).any()  # else nothing was asked
+        assert not near.all()
+
+
 def test_the_open_fingers_leave_the_opening_free() -> None:
     for width in (0.02, 0.05, 0.085):
         hand = open_hand(robot_of_name("ur5_parallel_gripper"), width, APPROACH_M)
-        y = np.array([[width / 2 - 1e-4, width / 2 + 1e-4]])
-        points = np.zeros((2, 1, 3))
-        points[:, 0, 1] = y
+        points = np.zeros((3, 2, 1))
+        points[1, :, 0] = width / 2 - 1e-4, width / 2 + 1e-4
         assert hand.hits(points, 0.0)["fingers"].tolist() == [False, True]
 
 

@@ -10,6 +10,7 @@ import pytest
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot
 from bridge.task.task_file import Task, load_task
+from twin.plan.grasp.open_hand import OpenHand
 from twin.plan.grasp.search import CAUSES, GraspConfig, GraspSearch, GraspSearcher, NoGraspError
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
@@ -233,6 +234,28 @@ def test_the_hand_opens_as_far_as_its_neighbours_let_it() -> None:
 
 def test_where_no_finger_fits_the_neighbours_are_named() -> None:
     assert refusal(among_cubes(0.008), "red").cause == "neighbour"
+
+
+@pytest.mark.parametrize("gap_m", [0.025, 0.035])
+def test_neighbours_that_no_hand_comes_near_are_left_out_and_nothing_else(
+    gap_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = among_cubes(gap_m)
+    quick = GraspSearcher(given, FEW).search("red")
+    asked: list[float] = []
+
+    def all_of_them(hand: OpenHand, centres_m: np.ndarray, *_: float) -> np.ndarray:
+        asked.append(len(centres_m))
+        return np.ones(len(centres_m), dtype=bool)
+
+    monkeypatch.setattr(OpenHand, "passes", all_of_them)
+    thorough = GraspSearcher(given, FEW).search("red")
+    assert asked
+    assert quick.rejected == thorough.rejected
+    assert quick.rejected["neighbour"] > 0
+    for one, other in zip(quick.grasps, thorough.grasps, strict=True):
+        np.testing.assert_array_equal(one.T_object_tcp, other.T_object_tcp)
+        assert one.margin == other.margin
 
 
 def test_a_part_restricts_both_contacts() -> None:

@@ -10,11 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toy_frames import AT, DUCK, DUCKS, SLOTH, off, only, shoot, table_with
 
+from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.record import check_record
 from bridge.task.task_file import Task
 from twin.scene.localise import soft
-from twin.scene.localise.objects import localise_objects
+from twin.scene.localise.mesh_fit import facing, fit_mesh, known_surface
+from twin.scene.localise.objects import LocaliseConfig, localise_objects
+from twin.scene.localise.points import Cluster, fuse_stationary
 from twin.scene.shape.known import pose_of
 
 
@@ -70,6 +73,40 @@ def test_the_basket_looks_the_same_from_behind_and_its_pose_says_one_thing(
     assert distance_mm < 3.0
     assert angle_deg < 1.5
     assert np.degrees(np.sqrt(basket.covariance[5, 5])) < 5.0  # the half turn is no doubt
+
+
+def test_cameras_that_disagree_make_the_direction_of_a_duck_no_more_doubtful(
+    stage: Callable[..., Any],
+) -> None:
+    frames = shoot(table_with(stage, (DUCK, AT)))
+    apart = np.eye(4)
+    apart[1, 3] = 0.009
+    side = replace(
+        frames[0],
+        T_base_color=apart @ frames[0].T_base_color,
+        T_base_depth=apart @ frames[0].T_base_depth,
+    )
+    duck = localise_objects([side, *frames[1:]], only(DUCKS, "duck_1"))["duck_1"]
+    assert duck.found, duck.reason
+    assert off(duck.T_base_object, AT)[1] < 2.0
+    assert np.degrees(np.sqrt(duck.covariance[5, 5])) < 5.0
+
+
+def test_what_looks_the_same_from_behind_is_said_to_be_doubtful(stage: Callable[..., Any]) -> None:
+    model = SLOTH.objects["basket"]  # the same after half a turn, which the fit is not told
+    T = pose_of(np.array([0.48, 0.05, 0.0, 0.1]))
+    task, config = only(SLOTH, "basket"), LocaliseConfig()
+    views = fuse_stationary(shoot(table_with(stage, (model, T))), 3, 8, task, config.points)
+    surface, other = known_surface(model, 2500), known_surface(model, 2700)
+    seen = [se3.apply(T, other.p_m[facing(se3.invert(T), view, other)]) for view in views]
+    points = np.concatenate(seen)
+    points += np.random.default_rng(3).normal(scale=0.002, size=points.shape)
+    group = Cluster(
+        p_base=points, view_ids=np.repeat(np.arange(len(views)), [len(rows) for rows in seen])
+    )
+    every = replace(config.mesh, num_refined=config.mesh.num_starts)
+    fit = fit_mesh(group, views, surface, config.fit, every, tilt_sigma_rad=0.01)
+    assert np.degrees(np.sqrt(fit.covariance[5, 5])) > 45.0
 
 
 def test_a_toy_on_its_side_is_found_and_said_to_lie(stage: Callable[..., Any]) -> None:

@@ -11,9 +11,9 @@
 #include <memory>
 #include <vector>
 
-#include "../../../replay/native/geometry.hpp"
-#include "../../../replay/native/grid_search.hpp"
-#include "../../../replay/native/separation.hpp"
+#include "twin/robot/native/geometry.hpp"
+#include "twin/robot/native/grid_search.hpp"
+#include "twin/robot/native/separation.hpp"
 #include "kernels.hpp"
 
 struct Counts {

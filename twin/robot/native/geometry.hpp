@@ -1,4 +1,4 @@
-// Vectors, poses and random numbers of distances and the path search: plain doubles, no library.
+// Vectors, poses and random numbers of distances and of paths: plain doubles, no library.
 #pragma once
 
 #include <cmath>
