@@ -110,7 +110,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
     )
     digest = episode.sha256()
     calibration = read_calibration(run)
-    replay = for_task(calibrated(config.replay, calibration), task)
+    replay = for_task(calibrated(config.replay, calibration, task), task)
     jobs, events = [], streams.events(episode)
     for index, (stamp_ns, plan) in enumerate(plans):
         execution = execution_of(events, plan.id)
