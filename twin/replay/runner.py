@@ -139,7 +139,13 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
         )
         jobs.append(common)
         if common.was_executed:
-            executed = replace(common, trajectory="executed", end=starts.after(plan.id))
+            # Varied replays say what a plan is worth; what was executed happened once.
+            executed = replace(
+                common,
+                trajectory="executed",
+                end=starts.after(plan.id),
+                config=replace(common.config, samples=0),
+            )
             jobs.append(executed)
             # Which engine is asked makes no other kinematic replay.
             alone = replace(replay, engine="pybullet", engines_must_agree=False)
