@@ -63,13 +63,13 @@ class VariedIntervals(GroupIntervals):
 
     def _replicates(self) -> list[tuple[GroupCounts, ...]]:
         rng = np.random.default_rng(SEED)
-        answers = [drawn_answers(rows, rng) for rows in self._members]
+        drawn = [drawn_answers(rows, rng) for rows in self._members]
         return [
             tuple(
                 GroupCounts(
-                    recorded=(0, 0), sim=(0, 0), pairs=_pairs(rows, said[:, turn]), task=name
+                    recorded=(0, 0), sim=(0, 0), pairs=_pairs(rows, answers[:, turn]), task=name
                 )
-                for rows, said, name in zip(self._members, answers, self._names, strict=True)
+                for rows, answers, name in zip(self._members, drawn, self._names, strict=True)
             )
             for turn in range(REPLICATES)
         ]
@@ -92,9 +92,9 @@ def drawn_answers(rows: Sequence[TrialRow], rng: np.random.Generator) -> np.ndar
     return (places + rng.random((len(rows), 1))) / REPLICATES < shares[:, None]
 
 
-def _pairs(rows: Sequence[TrialRow], said: np.ndarray) -> tuple[int, int, int, int]:
+def _pairs(rows: Sequence[TrialRow], answers: np.ndarray) -> tuple[int, int, int, int]:
     table = [0, 0, 0, 0]
-    for row, yes in zip(rows, said, strict=True):
+    for row, yes in zip(rows, answers, strict=True):
         table[(0 if row.recorded else 1) if yes else (2 if row.recorded else 3)] += 1
     return table[0], table[1], table[2], table[3]
 
