@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.wire.config import DEFAULT_ENDPOINT
 
 BUILT_IN_POLICY = "perturbed"
@@ -80,6 +81,11 @@ class TrialsConfig:
     The first one is tried in --arms, the others in the arm without alone."""
     trials: int = 5
     """Starts of each task; each is tried once in each arm of each policy."""
+    first_start: int = 0
+    """Number of the first of them in the session; runs of other starts share none with this one."""
+    calibration: Path | None = None
+    """A run of the same session and of other starts, after calibrate --posterior: gate and replays
+    use what was learned there of each task."""
     arms: tuple[str, ...] = ("without", "with")
     """Of the first policy: without, with, control."""
     coin: float | None = None
@@ -109,7 +115,8 @@ class TrialsConfig:
         refuse_outside(
             self,
             {
-                "trials": (1, 1000),
+                "trials": (1, SEEDS_PER_SESSION),
+                "first_start": (0, SEEDS_PER_SESSION - self.trials),
                 "coin": (0, 1),
                 "rounds": (1, 1000),
                 "workers": (0, 256),

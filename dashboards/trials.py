@@ -69,6 +69,7 @@ class Job:
     arms: tuple[str, ...]
     session_seed: int
     start: int
+    """Its number in the session."""
     coin: float | None
 
     @property
@@ -99,10 +100,18 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
         DashboardError: When a command failed.
     """
     protocol, chosen = protocol_of(config)
+    learned = None
+    if config.calibration is not None:
+        from dashboards.learned import learned_in  # noqa: PLC0415  # reads robots, a second
+
+        learned = learned_in(RunFolder.open(config.calibration), protocol)
+        protocol = learned.named_in(protocol)
     run = RunFolder.create(path)
     jobs = jobs_of(protocol, chosen)
     with ending_on_signals():
         keep_protocol(run.path, protocol, has_trials=bool(run.episodes()))
+        if learned is not None:
+            learned.put_into(run)
         left = _clear(run, jobs, output, retry=config.retry)
         if left:
             _do(run, config, left, output)
@@ -133,6 +142,7 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
             task_sha256=file.sha256,
             session_seed=config.seed,
             starts=config.trials,
+            first_start=config.first_start,
         )
         for file in files.values()
     )
@@ -206,7 +216,7 @@ def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
                         policy=policy.policy,
                         arms=policy.arms,
                         session_seed=task.session_seed,
-                        start=start,
+                        start=task.first_start + start,
                         coin=task.coin if "control" in policy.arms else None,
                     )
                 )

@@ -401,6 +401,27 @@ MMRV_RECORDED = _agreement(
     agreement.mmrv,
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
 )
+VARIED_R = _agreement(
+    "varied.pearson_r",
+    "1",
+    "higher",
+    agreement.pearson,
+    "Pearson r of recorded rates and the twin's of varied replays (each trial's share that succeed, averaged) {what}",
+)
+VARIED_BIAS = _agreement(
+    "varied.bias_pp",
+    "pp",
+    "none",
+    agreement.bias,
+    "the twin's rate of varied replays - recorded rate, averaged {what}",
+)
+VARIED_MMRV = _agreement(
+    "varied.mmrv_recorded_gap",
+    "1",
+    "lower",
+    agreement.mmrv,
+    "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
+)
 MMRV_SIM = _agreement(
     "mmrv_sim_gap",
     "1",

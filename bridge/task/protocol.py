@@ -46,10 +46,12 @@ class StudyTask:
     starts: int
     coin: float | None = None
     """In the arm control, the chance of yes to each plan."""
+    first_start: int = 0
+    """Number of its first start in the session; the others follow it."""
 
     def start_seed(self, start: int) -> int:
-        """Return the seed of a start, counted from 0."""
-        return self.session_seed * SEEDS_PER_SESSION + start
+        """Return the seed of a start, counted from 0 for the first of the study."""
+        return self.session_seed * SEEDS_PER_SESSION + self.first_start + start
 
     def start_id(self, start: int) -> str:
         """Return the name under which the trials of a start are recorded."""
@@ -103,6 +105,11 @@ class Protocol:
     """Draws the order of the arms on each start, and the coins."""
     coin_from: str = ""
     """Where the coins' chances are from, in words."""
+    calibration_sha256: str = ""
+    """Of the calibration.json that gate and replays use, learned in a run of other starts; empty:
+    the study takes none over."""
+    calibration_from: str = ""
+    """Which run that is and what it learned from, in words."""
     stopping: str = "fixed"
     """fixed: after all starts of every task; nobody looks before."""
     retry: bool = False
@@ -244,6 +251,7 @@ def read_protocol(run_path: Path) -> Protocol | None:
 
 CARRIED_OUT = (
     *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
+    *("calibration_sha256", "calibration_from"),
 )
 """What whoever carries a study out decides, too; the rest is the design's alone."""
 

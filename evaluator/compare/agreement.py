@@ -287,7 +287,7 @@ def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
     units = sorted({group.unit for group in usable})
     what = f"over groups (task x condition x policy), n = {len(usable)}"
     what += f", rates counted in different units ({', '.join(units)})" if len(units) > 1 else ""
-    make = partial(_measure, usable, intervals, what)
+    make = partial(measure_over, usable, intervals, what)
     return [
         _pearson(usable, PEARSON_R, what),
         *_pearson_by_condition(usable),
@@ -318,7 +318,7 @@ def _episodes(groups: Sequence[RateGroup]) -> list[str]:
     return [name for group in groups for name in group.episodes]
 
 
-def _measure(
+def measure_over(
     groups: Sequence[RateGroup],
     intervals: GroupIntervals,
     what: str,
@@ -327,7 +327,17 @@ def _measure(
     value: Statistic,
     **parts: str,
 ) -> Measurement:
-    """Measure one statistic with the interval that the coverage map chooses for it."""
+    """Measure one statistic with the interval that the coverage map chooses for it.
+
+    Args:
+        groups: With both rates.
+        intervals: Of the groups; the model's goes before the map's.
+        what: Says over which groups.
+        quantity: Percentage points or 1.
+        statistic: A name in ``weighted.STATISTICS``.
+        value: Computes it.
+        **parts: Further variable parts of its id or definition.
+    """
     factor = 100.0 if quantity.unit == "pp" else 1.0
     found = intervals.of(statistic)
     model = intervals.model(statistic)
@@ -385,7 +395,7 @@ def _pearson(
     groups: Sequence[RateGroup], quantity: Quantity, what: str, **parts: str
 ) -> Measurement:
     recorded, sim = sides(groups)
-    return _measure(
+    return measure_over(
         groups,
         GroupIntervals(groups),
         what,

@@ -44,6 +44,7 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
+from evaluator.compare.varied_agreement import varied_agreement
 from evaluator.result import Exclusion, Measurement, Table
 
 
@@ -127,6 +128,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *gains,
         *gain_tests(groups),
         *again,
+        *varied_agreement(rows, groups),
         *study,
         *paired_gain(pairs),
         *paired_progress(pairs),

@@ -72,9 +72,10 @@ class TrialRow:
     verdict: bool | None = None
     """The gate's verdict on the sent plan, made before its execution started."""
     p_success: float | None = None
-    """Share of varied replays that succeed: of the planned replay, else of the gate."""
+    """Chance of success as stated: of the planned replay, else of the gate."""
     sim_varied: float | None = None
-    """The same of the planned replay alone, whose draws the gate did not use."""
+    """Share of varied replays that succeed, of the planned replay, whose draws the gate did not
+    use; without what a posterior adds of how far answers are trusted."""
     first_failing: str | None = None
     """ik, clearance or terminal of the planned replay, or of the verdict where there is none."""
     failing_detail: str | None = None

@@ -69,6 +69,7 @@ class VerdictSummary:
     """None where the twin could not decide."""
     why_undecided: str
     p_success: float | None
+    """As it was stated: with a posterior each varied replay counts as far as it is trusted."""
     first_failing: str | None
     """ik, clearance, terminal or a further check; None where none is false."""
     failing_cause: str | None
@@ -81,6 +82,8 @@ class VerdictSummary:
     """What touched, came too close or was lost, in the verdict's order."""
     failing_t_ns: int | None = None
     """First instant at which it is false, since the start of the plan."""
+    varied_share: float | None = None
+    """Of the varied replays themselves that succeed."""
 
 
 def summarise_verdict(verdict: Verdict) -> VerdictSummary:
@@ -99,7 +102,16 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         engine=verdict.engine,
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,
+        varied_share=_share(verdict.p_success),
     )
+
+
+def _share(p_success: Mapping[str, float] | None) -> float | None:
+    """Share of varied replays that succeed; as it was stated where nobody counted them."""
+    if p_success is None:
+        return None
+    n = p_success.get("n", 0)
+    return p_success["k"] / n if n and "k" in p_success else p_success.get("value")
 
 
 def _undecided(verdict: Verdict) -> str:

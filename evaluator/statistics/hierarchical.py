@@ -297,18 +297,19 @@ class AgreementModel:
         return estimate(values, self.weights)
 
     @cached_property
-    def _others(self) -> tuple[np.ndarray, np.ndarray]:
+    def others(self) -> tuple[np.ndarray, np.ndarray]:
+        """Correlation and mean difference over all groups of this kind, at every node."""
         return population(self.nodes)
 
     @property
     def pearson_others(self) -> Estimate:
         """Correlation of true rates over all groups of this kind, of new tasks too."""
-        return self.of_nodes(self._others[0])
+        return self.of_nodes(self.others[0])
 
     @property
     def bias_others(self) -> Estimate:
         """Mean of the twin's rate - recorded rate over all groups of this kind."""
-        return self.of_nodes(self._others[1])
+        return self.of_nodes(self.others[1])
 
     @property
     def within(self) -> Estimate:
@@ -400,6 +401,20 @@ def _draw_places(
 
 
 POPULATION_NODES = 33
+
+
+def pooled_others(models: Sequence[AgreementModel]) -> tuple[Estimate, Estimate]:
+    """Return r and the bias over all groups of this kind, each model's posterior counting alike.
+
+    For counts of which there are several, as likely one as another: a mixture of posteriors that
+    each hold what they promise holds it too, and is as wide as they lie apart.
+
+    Args:
+        models: Of the same groups, at least one.
+    """
+    weights = np.concatenate([model.weights for model in models]) / len(models)
+    r, bias = (np.concatenate([model.others[side] for model in models]) for side in (0, 1))
+    return estimate(r, weights), estimate(bias, weights)
 
 
 def population(

@@ -108,7 +108,8 @@ def answer(question: Question) -> Verdict:
             f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
             f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
         )
-    config = for_task(calibrated(question.config, read_calibration(run)), question.task)
+    known = calibrated(question.config, read_calibration(run), question.task)
+    config = for_task(known, question.task)
     # Of a plan with impossible times the replay says what is wrong.
     end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
     steps = max(1, num_steps(end_ns, config))

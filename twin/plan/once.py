@@ -271,7 +271,8 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
     path = run.plans_dir / f"{plan.id}{ending}"
     write_whole(path, plan.to_json())
     scene, episode = start.problem.scene, start.episode
-    config = for_task(calibrated(ReplayConfig(mode="dynamic"), read_calibration(run)), scene.task)
+    known = calibrated(ReplayConfig(mode="dynamic"), read_calibration(run), scene.task)
+    config = for_task(known, scene.task)
     result = replace(replay_plan(plan, scene, config), verdict=verdict)
     replay_path = run.plans_dir / f"{plan.id}{PLAN_REPLAY}"
     replay_path.unlink(missing_ok=True)

@@ -282,8 +282,8 @@ class ReplayRunConfig:
     """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
     docs/scale.md says how it is kept closed."""
     samples: int = 0
-    """Varied replays of each dynamic trajectory; they give the success probability of its verdict.
-    A kinematic replay moves no objects and has none."""
+    """Varied replays of each plan; they give the success probability of its verdict. A kinematic
+    replay moves no objects and has none."""
     render: bool = False
     """Also draw what the recorded cameras would have seen, with the rebuilt scene's Gaussians."""
     force: bool = False

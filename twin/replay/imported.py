@@ -88,7 +88,7 @@ def motion_replays(
     """
     calibration = read_calibration(run)
     fit = _fit_of(calibration)
-    with_boxes = calibrated(config, calibration).physics
+    with_boxes = calibrated(config, calibration, None).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}
     for name in names:

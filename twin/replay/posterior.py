@@ -1,11 +1,12 @@
 """What a session's own trials say of what nobody measured: draws from wide priors, weighed by them.
 
 Friction, masses, the force of the fingers and what localisation is off as a whole are the same in
-all trials of a session. Draws from priors as wide as what is not known are replayed through every
-trial that was executed; a draw that ends as the trial did counts for more (importance sampling,
-Gordon, Salmond and Smith 1993, without their motion). Most draws differ in numbers that no trial
-shows one by one, such as force and friction of the fingers: only together they matter, and the
-draws that are left keep them together.
+all trials of a task in a session. Draws from priors as wide as what is not known are replayed
+through every trial that was executed; a draw that ends as the trial did counts for more (importance
+sampling, Gordon, Salmond and Smith 1993, without their motion). Most draws differ in numbers that
+no trial shows one by one, such as force and friction of the fingers: only together they matter, and
+the draws that are left keep them together. Friction and mass belong to the objects of a task, so
+each task is weighed by its own trials alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -70,6 +71,39 @@ class Trial:
     success: bool
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
     """Where objects that move were localised afterwards, x and y; without those not found."""
+    cell: str = ""
+    task_sha256: str = ""
+    start_seed: int | None = None
+    """What it began from and with what file, so that others can be kept apart from it."""
+
+    def to_record(self) -> dict[str, Any]:
+        """What a posterior says of its source."""
+        return {
+            "sha256": self.sha256,
+            "success": self.success,
+            "cell": self.cell,
+            "task_sha256": self.task_sha256,
+            "start_seed": self.start_seed,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trials:
+    """What a run has to weigh draws by."""
+
+    usable: list[Trial]
+    skipped: dict[str, str]
+    """Why an episode is none, by its id."""
+    tasks: frozenset[str]
+    """Of all trials that were recorded, usable or not."""
+
+    def of_each_task(self) -> dict[str, list[Trial]]:
+        """The usable ones by name of their task, in the order of names."""
+        names = sorted({trial.scene.task.name for trial in self.usable})
+        return {
+            name: [trial for trial in self.usable if trial.scene.task.name == name]
+            for name in names
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,26 +141,24 @@ def draw_beforehand(count: int) -> list[PosteriorDraw]:
     ]
 
 
-def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, str]]:
+def read_trials(run: RunFolder, output: Output) -> Trials:
     """Read every trial of a run that was executed and judged; missing localisations are made.
 
     Args:
         run: Its episodes, and its scene and calibration.
         output: Shows progress.
 
-    Returns:
-        The trials, and per episode why it is none.
-
     Raises:
         NoTrialsError: When there is none.
     """
-    trials, reasons = [], {}
+    trials, reasons, tasks = [], {}, set[str]()
     paths = run.episodes()
     with output.progress("localise", len(paths)) as advance:
         for index, path in enumerate(paths):
             try:
                 episode = Episode.open(path)
                 if episode.info.kind == "trial":
+                    tasks.add(episode.info.task)
                     trials.append(_trial(run, episode))
             except GstError as error:
                 reasons[path.stem] = str(error)
@@ -135,7 +167,7 @@ def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, 
         why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         message = f"{run.path} has no executed trial with an outcome. {why}".rstrip()
         raise NoTrialsError(message)
-    return trials, reasons
+    return Trials(usable=trials, skipped=reasons, tasks=frozenset(tasks - {""}))
 
 
 def _trial(run: RunFolder, episode: Episode) -> Trial:
@@ -159,7 +191,7 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    config = for_task(calibrated(ReplayConfig(), _without_posterior(run)), task)
+    config = for_task(calibrated(ReplayConfig(), _without_posterior(run), task), task)
     return Trial(
         episode=episode.info.id,
         sha256=episode.sha256(),
@@ -170,6 +202,9 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
         ends_m={
             name: T[:2, 3] for name, T in after.Ts_base_object.items() if name in scene.movable()
         },
+        cell=episode.info.cell,
+        task_sha256=episode.info.task_sha256,
+        start_seed=episode.info.start_seed,
     )
 
 
@@ -262,7 +297,7 @@ def weighed(
 
     Args:
         draws: From ``draw_beforehand``.
-        trials: Executed ones.
+        trials: Executed ones, of one task.
         workers: Processes that replay side by side; 1: this one alone.
         output: Shows progress.
     """
@@ -307,11 +342,11 @@ def effective(draws: Sequence[PosteriorDraw]) -> float:
 def calibrate_posterior(
     run: RunFolder, *, num_draws: int, workers: int, output: Output
 ) -> tuple[dict[str, Any], str]:
-    """Weigh draws by a run's trials and write them to ``calibration.json``.
+    """Weigh draws by a run's trials, task by task, and write them to ``calibration.json``.
 
     Args:
         run: Whose trials are read, and in whose scene folder the posterior goes.
-        num_draws: From the priors.
+        num_draws: From the priors, for each task.
         workers: Processes.
         output: Shows progress.
 
@@ -321,15 +356,18 @@ def calibrate_posterior(
     Raises:
         NoTrialsError: When no trial can be used.
     """
-    trials, skipped = read_trials(run, output)
-    draws = weighed(draw_beforehand(num_draws), trials, workers=workers, output=output)
+    found, tasks = read_trials(run, output), dict[str, Any]()
+    for name, trials in found.of_each_task().items():
+        draws = weighed(draw_beforehand(num_draws), trials, workers=workers, output=output)
+        tasks[name] = {
+            "draws": [draw.to_record() for draw in draws],
+            "effective_draws": effective(draws),
+            "sources": {trial.episode: trial.to_record() for trial in trials},
+        }
     record: dict[str, Any] = {
-        "draws": [draw.to_record() for draw in draws],
-        "effective_draws": effective(draws),
-        "sources": {
-            trial.episode: {"sha256": trial.sha256, "success": trial.success} for trial in trials
-        },
-        "skipped": skipped,
+        "tasks": tasks,
+        "without_trials": sorted(found.tasks - tasks.keys()),
+        "skipped": found.skipped,
     }
     record["id"] = provenance.hash_settings(record)
     return record, str(write_posterior(run, record)["calibration_id"])
@@ -342,21 +380,32 @@ def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
         record: As ``calibrate_posterior`` makes it.
         calibration_id: Of the calibration that holds now.
     """
-    draws, trials = record["draws"], record["sources"]
+    lines = [f"posterior: {len(record['tasks'])} tasks; calibration {calibration_id}"]
+    for name, found in record["tasks"].items():
+        lines += _described(name, found)
+    lines += [
+        f"{name}: no trial of it can be used, so its samples draw from the priors"
+        for name in record["without_trials"]
+    ]
+    lines += [f"  {name} not used: {why}" for name, why in record["skipped"].items()]
+    return "\n".join(lines)
+
+
+def _described(name: str, found: Mapping[str, Any]) -> list[str]:
+    """What the trials of one task left, in lines."""
+    draws, trials = found["draws"], found["sources"]
     good = sum(item["success"] for item in trials.values())
     lines = [
-        f"posterior: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
-        f"succeeded; as much as {record['effective_draws']:.1f} equal ones; "
-        f"calibration {calibration_id}"
+        f"{name}: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
+        f"succeeded; as much as {found['effective_draws']:.1f} equal ones"
     ]
     weights = np.array([draw["weight"] for draw in draws])
-    for name in (key for key in draws[0] if key != "weight"):
-        values = np.array([np.atleast_1d(draw[name]) for draw in draws])
+    for quantity in (key for key in draws[0] if key != "weight"):
+        values = np.array([np.atleast_1d(draw[quantity]) for draw in draws])
         for axis, column in enumerate(values.T):
             order = np.argsort(column)
             share = np.cumsum(weights[order])
             low, middle, high = (column[order][np.searchsorted(share, q)] for q in (0.1, 0.5, 0.9))
-            label = name if values.shape[1] == 1 else f"{name} {'xy'[axis]}"
+            label = quantity if values.shape[1] == 1 else f"{quantity} {'xy'[axis]}"
             lines.append(f"  {label:<22} {middle:8.3g}, eight of ten in [{low:.3g}, {high:.3g}]")
-    lines += [f"  {name} not used: {why}" for name, why in record["skipped"].items()]
-    return "\n".join(lines)
+    return lines

@@ -36,6 +36,12 @@ class UnreadablePosteriorError(TwinError):
     """The posterior of calibration.json is none; make it again: calibrate RUN --posterior."""
 
 
+OTHER_TASKS = "the posterior has no trials of this task: its samples draw from the priors"
+ALL_TASKS = (
+    "the posterior was weighed by all tasks of its run together, by an older version; make it "
+    "again: calibrate RUN --posterior"
+)
+
 INTERVAL_SIGMAS = 2 * 1.96
 """Width of a 95 % interval in standard deviations."""
 PLANE = (0, 1, 5)
@@ -129,7 +135,9 @@ def correction_of(calibration: Calibration | None) -> Correction:
     )
 
 
-def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayConfig:
+def calibrated(
+    config: ReplayConfig, calibration: Calibration | None, task: Task | None
+) -> ReplayConfig:
     """Use calibrated physics, but for the fields that the user set to something of their own.
 
     Samples then vary what was identified by as much as the calibration leaves open.
@@ -137,6 +145,7 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     Args:
         config: As the user set it.
         calibration: Of the run; None: there is none, and nothing changes.
+        task: Its own draws of a posterior are taken; None: a recording without one takes none.
     """
     if calibration is None:
         return config
@@ -157,17 +166,20 @@ def calibrated(config: ReplayConfig, calibration: Calibration | None) -> ReplayC
     masses = _mass_spread(calibration)
     if masses is not None:
         spreads += ((RIGID_MASSES, masses),)
-    variation = replace(config.variation, calibrated=spreads, posterior=posterior_of(calibration))
+    draws = () if task is None else posterior_of(calibration, task)
+    variation = replace(config.variation, calibrated=spreads, posterior=draws)
     return replace(config, physics=physics, variation=variation)
 
 
-def posterior_of(calibration: Calibration) -> tuple[PosteriorDraw, ...]:
-    """The draws that a run's trials left some weight; empty where there is no posterior.
+def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, ...]:
+    """The draws that a task's trials left some weight; empty where it has none of its own.
+
+    Of a file that is older than draws of each task, those of all its tasks together.
 
     Raises:
         UnreadablePosteriorError: When one lacks a number.
     """
-    draws = _mapping(calibration.record, "posterior").get("draws", [])
+    draws = _posterior(calibration, task).get("draws", [])
     try:
         return tuple(
             PosteriorDraw(**{**draw, "bias_m": tuple(float(value) for value in draw["bias_m"])})
@@ -175,6 +187,19 @@ def posterior_of(calibration: Calibration) -> tuple[PosteriorDraw, ...]:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UnreadablePosteriorError(f"the posterior of calibration.json: {error!r}") from error
+
+
+def _posterior(calibration: Calibration, task: Task) -> Mapping[str, Any]:
+    found = _mapping(calibration.record, "posterior")
+    return _mapping(_mapping(found, "tasks"), task.name) if "tasks" in found else found
+
+
+def posterior_notes(calibration: Calibration | None, task: Task) -> tuple[str, ...]:
+    """What has to be said where a posterior is not this task's own; nothing where it is."""
+    found = {} if calibration is None else _mapping(calibration.record, "posterior")
+    if not found or task.name in _mapping(found, "tasks"):
+        return ()
+    return (OTHER_TASKS if "tasks" in found else ALL_TASKS,)
 
 
 def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
@@ -315,11 +340,12 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
         shape_sources=sources,
         calibration_id=None if calibration is None else calibration.calibration_id,
         correction=correction_of(calibration),
+        notes=posterior_notes(calibration, task),
     )
     record = read_record(run)
     if record is None:
         return rebuilt
-    lattices, notes = {}, []
+    lattices, notes = {}, list(rebuilt.notes)
     for key in task.soft_objects:
         arrays, sources[key] = _lattice(run.scene_dir / "objects" / key, task.objects[key])
         if arrays is None:

@@ -110,7 +110,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
     )
     digest = episode.sha256()
     calibration = read_calibration(run)
-    replay = for_task(calibrated(config.replay, calibration), task)
+    replay = for_task(calibrated(config.replay, calibration, task), task)
     jobs, events = [], streams.events(episode)
     for index, (stamp_ns, plan) in enumerate(plans):
         execution = execution_of(events, plan.id)
@@ -139,7 +139,13 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
         )
         jobs.append(common)
         if common.was_executed:
-            executed = replace(common, trajectory="executed", end=starts.after(plan.id))
+            # Varied replays say what a plan is worth; what was executed happened once.
+            executed = replace(
+                common,
+                trajectory="executed",
+                end=starts.after(plan.id),
+                config=replace(common.config, samples=0),
+            )
             jobs.append(executed)
             # Which engine is asked makes no other kinematic replay.
             alone = replace(replay, engine="pybullet", engines_must_agree=False)

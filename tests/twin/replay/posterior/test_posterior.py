@@ -1,6 +1,6 @@
 """A session's own trials as evidence: what draws are kept, how much a yes is trusted afterwards."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from twin.replay.posterior import (
     NoTrialsError,
     Record,
     Trial,
+    Trials,
     calibrate_posterior,
     describe_posterior,
     draw_beforehand,
@@ -40,7 +41,14 @@ from twin.replay.posterior import (
     log_nearness,
     weighed,
 )
-from twin.replay.rebuilt_scene import UnreadablePosteriorError, calibrated, posterior_of
+from twin.replay.rebuilt_scene import (
+    ALL_TASKS,
+    OTHER_TASKS,
+    UnreadablePosteriorError,
+    calibrated,
+    posterior_of,
+    read_rebuilt_scene,
+)
 from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import Calibration, read_calibration, write_posterior
 
@@ -227,28 +235,88 @@ def test_without_a_posterior_the_interval_is_wilsons() -> None:
     assert (p["low"], p["high"]) == pytest.approx((wilson.low, wilson.high))
 
 
-def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
-    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
-    record = {
+def of_one_task(draws: Sequence[PosteriorDraw]) -> dict[str, object]:
+    return {
         "draws": [draw.to_record() for draw in draws],
-        "effective_draws": 4.0,
-        "sources": {"trial_0001": {"sha256": "0", "success": True}},
+        "effective_draws": float(len(draws)),
+        "sources": {"trial_0001": trial(success=True).to_record()},
+    }
+
+
+def record_of(tasks: Mapping[str, Sequence[PosteriorDraw]]) -> dict[str, object]:
+    return {
+        "tasks": {name: of_one_task(draws) for name, draws in tasks.items()},
+        "without_trials": ["cube_into_box"],
         "skipped": {"trial_0002": "nobody said how it ended"},
     }
+
+
+def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
+    record = record_of({TASK.name: draws})
     before = write_posterior(run, record)["calibration_id"]
     known = read_calibration(run)
     assert known is not None
-    assert calibrated(ReplayConfig(), known).variation.posterior == tuple(draws)
+    assert calibrated(ReplayConfig(), known, TASK).variation.posterior == tuple(draws)
     told = describe_posterior(record, str(before))
-    assert "4 draws weighed by 1 trials, 1 of which succeeded" in told
+    assert f"{TASK.name}: 4 draws weighed by 1 trials, 1 of which succeeded" in told
+    assert "cube_into_box: no trial of it can be used" in told
     assert "trial_0002 not used" in told
-    write_posterior(run, {**record, "draws": record["draws"][:2]})
+    write_posterior(run, record_of({TASK.name: draws[:2]}))
     again = read_calibration(run)
     assert again is not None
     assert again.calibration_id != before
-    damaged: Mapping[str, object] = {**known.record, "posterior": {"draws": [{"weight": 1.0}]}}
+    damaged = {**known.record, "posterior": {"tasks": {TASK.name: {"draws": [{"weight": 1.0}]}}}}
     with pytest.raises(UnreadablePosteriorError, match="bias_m"):
-        posterior_of(Calibration(record=damaged, cameras={}))
+        posterior_of(Calibration(record=damaged, cameras={}), TASK)
+
+
+def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) -> None:
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
+    other = load_task("heavy_block_into_box")
+    write_posterior(run, record_of({TASK.name: draws[:1], other.name: draws[1:]}))
+    known = read_calibration(run)
+    assert known is not None
+    assert posterior_of(known, TASK) == tuple(draws[:1])
+    assert posterior_of(known, other) == tuple(draws[1:])
+    assert read_rebuilt_scene(run, TASK).notes == ()
+    alone = load_task("cube_into_box")
+    assert calibrated(ReplayConfig(), known, alone).variation.posterior == ()
+    assert read_rebuilt_scene(run, alone).notes == (OTHER_TASKS,)
+
+
+def test_a_file_older_than_draws_of_each_task_is_read_and_says_what_it_is(tmp_path: Path) -> None:
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(2)
+    write_posterior(run, {**of_one_task(draws), "skipped": {}})
+    known = read_calibration(run)
+    assert known is not None
+    assert posterior_of(known, TASK) == tuple(draws)
+    assert read_rebuilt_scene(run, TASK).notes == (ALL_TASKS,)
+
+
+def test_a_task_is_weighed_by_its_own_trials_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One task's trials all fall and another's are all held: neither moves the other's draws."""
+    monkeypatch.setattr(posterior, "end_of", holds_from(0.3))
+    run, other = RunFolder.create(tmp_path / "run"), load_task("heavy_block_into_box")
+    start = scene().Ts_base_object["block"][:2, 3]
+    fell = [trial(success=False, end_m=tuple(start)) for _ in range(3)]
+    held = [
+        replace(each, episode="held", scene=replace(each.scene, task=other))
+        for each in [trial(success=True)] * 3
+    ]
+    found = Trials(usable=[*held, *fell], skipped={}, tasks=frozenset({TASK.name, "unused"}))
+    monkeypatch.setattr(posterior, "read_trials", lambda run, output: found)
+    record, _ = calibrate_posterior(run, num_draws=16, workers=1, output=QUIET)
+    assert sorted(record["tasks"]) == sorted([TASK.name, other.name])
+    assert record["without_trials"] == ["unused"]
+    known = read_calibration(run)
+    assert known is not None
+    for task, mine in ((TASK, fell), (other, held)):
+        alone = weighed(draw_beforehand(16), mine, workers=1, output=QUIET)
+        assert posterior_of(known, task) == tuple(alone), "as from a run of this task alone"
+    assert posterior_of(known, TASK) != posterior_of(known, other)
 
 
 def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def test_samples_are_drawn_around_what_was_found_and_as_widely_as_it_leaves_open
     sure = {name: np.zeros((6, 6)) for name in seen.Ts_base_object}
     place = read_rebuilt_scene(run, seen.task)
     scene = place.scene(seen.task, seen.urdf, seen.Ts_base_object, covariances=sure)
-    config = calibrated(ReplayConfig(), known)
+    config = calibrated(ReplayConfig(), known, seen.task)
     draws = [draw_variation(sample_rng(0, "s", k), scene, config) for k in range(150)]
     shift = np.array([d.Ts_base_object["cube"][:3, 3] for d in draws])
     shift -= seen.Ts_base_object["cube"][:3, 3]
@@ -161,7 +161,7 @@ def test_the_gripper_presses_as_the_task_is_set_unless_somebody_knows_better() -
     mine = ReplayConfig(physics=PhysicsConfig(grip_force_N=15.0))
     assert for_task(mine, toys) == mine
     found = calibration(identified={"grip_force_N": {"value": 7.5}})
-    assert for_task(calibrated(ReplayConfig(), found), toys).physics.grip_force_N == 7.5
+    assert for_task(calibrated(ReplayConfig(), found, toys), toys).physics.grip_force_N == 7.5
 
 
 def test_distances_are_found_where_the_robot_finds_them(tmp_path: Path) -> None:

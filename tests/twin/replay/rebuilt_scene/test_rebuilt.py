@@ -135,14 +135,14 @@ def calibration(**identified: object) -> Calibration:
 
 def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
     found = calibration(object_friction=0.42, grip_force_N={"value": 9.0}, gravity_m_s2=None)
-    physics = calibrated(ReplayConfig(), found).physics
+    physics = calibrated(ReplayConfig(), found, TASK).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.42, 9.0)
     assert physics.gravity_m_s2 == PhysicsConfig().gravity_m_s2
     mine = ReplayConfig(physics=PhysicsConfig(object_friction=0.7))
-    physics = calibrated(mine, found).physics
+    physics = calibrated(mine, found, TASK).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.7, 9.0)
 
 
 def test_without_a_calibration_nothing_is_moved() -> None:
-    assert calibrated(ReplayConfig(), None) == ReplayConfig()
-    assert calibrated(ReplayConfig(), calibration(unheard_of=3.0)).physics == PhysicsConfig()
+    assert calibrated(ReplayConfig(), None, TASK) == ReplayConfig()
+    assert calibrated(ReplayConfig(), calibration(unheard_of=3.0), TASK).physics == PhysicsConfig()
