@@ -94,7 +94,7 @@ def test_memory_does_not_grow_while_a_cell_is_recorded(cell: FaultCell) -> None:
     for _ in range(WINDOWS - 1):
         if slope >= MAX_MB_PER_MIN:
             slope = slope_mb_per_min(recorder, publisher)
-    # The stop follows the last message in the publisher's own queue: had it to wait for this process
+    # The stop follows the last message in the publisher's own queue. If it waited for this process
     # on a busy machine, the silence before it would be reported.
     publisher.flow(0.0, *MIX, "raw")
     publisher.tell(ask="stop", payload="")
