@@ -152,7 +152,7 @@ def _closed(
     hole: _Hole, views: Sequence[TrainingView], config: InitialiseConfig, most: int
 ) -> ClosedHoles:
     """Gaussians for the pixels of one view, coarser where they would be too many."""
-    depth_m, guessed = _swept(hole, views)
+    depth_m, guessed = _depth_of(hole, views)
     step = 1
     while (depth_m[::step, ::step] > 0).sum() > most:
         step += 1
@@ -189,49 +189,85 @@ def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[Train
     return [views[i] for i in usable[np.argsort(baseline_m[usable])][:MOST_REFERENCES].tolist()]
 
 
-def _swept(
+class _Hypotheses:
+    """Distances that the pixels of one hole may have, and what speaks against each of them.
+
+    Two sources, judged by the same agreement of colours: distances tried one after another, which
+    cost more the farther they lie from what is expected, and a guess where there is one.
+    """
+
+    def __init__(self, hole: _Hole, views: Sequence[TrainingView]) -> None:
+        """Look along the rays; a guess that contradicts the measurement of any view is dropped."""
+        self._mask = hole.mask
+        self._references = _references(hole.view, views)
+        rows, columns = np.nonzero(hole.mask)
+        self._rays = hole.target.camera.rays()[rows, columns] @ hole.view.T_base_color[:3, :3].T
+        self._origin = hole.view.T_base_color[:3, 3]
+        self._colors = np.moveaxis(hole.target.image(), 0, -1)[rows, columns]
+        beside_m = hole.beside_m[rows, columns].astype(np.float64)
+        self._expected_m, self._weight = beside_m, np.full(len(rows), SMOOTH)
+        self._range_m = (0.7 * beside_m.min(), BEYOND * float(hole.beside_m.max()))
+        self._is_guess = np.zeros(len(rows), dtype=bool)
+        if hole.guess is not None:
+            self._expect(hole.guess, hole.guess.depth_m[rows, columns].astype(np.float64), views)
+
+    def _expect(
+        self,
+        guess: DepthGuess,
+        guess_m: Float[np.ndarray, " num_points"],
+        views: Sequence[TrainingView],
+    ) -> None:
+        """Let a guess take the place of the surface beside the hole, where it is possible."""
+        _, is_possible = self._disagreement(guess_m, views)
+        is_guess = is_possible & (guess_m > 0)
+        if not is_guess.any():
+            return
+        near_m, far_m = self._range_m
+        known_m = guess_m[is_guess]
+        self._range_m = (min(near_m, 0.9 * known_m.min()), max(far_m, 1.1 * known_m.max()))
+        self._expected_m = np.where(is_guess, guess_m, self._expected_m)
+        self._weight[is_guess] = GUESS_COST / max(guess.scatter, LEAST_SCATTER)
+        self._is_guess = is_guess
+
+    def best(
+        self,
+    ) -> tuple[Float[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+        """Distance of least cost, and where that is the guess; 0 where none is possible."""
+        swept_m, cost = self._swept()
+        if not self._is_guess.any():
+            return swept_m, self._is_guess
+        difference, _ = self._disagreement(self._expected_m, self._references)
+        guess_wins = self._is_guess & (_averaged(difference, self._mask) <= cost)
+        return np.where(guess_wins, self._expected_m, swept_m), guess_wins
+
+    def _swept(self) -> tuple[Float[np.ndarray, " num_points"], Float[np.ndarray, " num_points"]]:
+        """The best of the distances tried by comparing views, and its cost."""
+        depths = np.geomspace(*self._range_m, NUM_DEPTHS)
+        cost = np.empty((NUM_DEPTHS, len(self._rays)))
+        for index, depth in enumerate(depths):
+            difference, is_possible = self._disagreement(depth, self._references)
+            leaving = self._weight * np.abs(np.log(depth / self._expected_m))
+            cost[index] = _averaged(difference, self._mask) + leaving
+            cost[index, ~is_possible] = np.inf
+        return _least(cost, depths), cost.min(axis=0)
+
+    def _disagreement(
+        self, depth_m: Float[np.ndarray, " num_points"] | float, views: Sequence[TrainingView]
+    ) -> tuple[Float[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
+        p_base = self._origin + np.reshape(depth_m, (-1, 1)) * self._rays
+        return _disagreement(p_base, self._colors, views)
+
+
+def _depth_of(
     hole: _Hole, views: Sequence[TrainingView]
 ) -> tuple[Float32[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Depth of the hole's pixels, and where it is the guessed one.
+    """Depth of the hole's pixels, smoothed, and where it is the guessed one.
 
     0 elsewhere, and where every distance contradicts a view.
     """
-    references = _references(hole.view, views)
-    rows, columns = np.nonzero(hole.mask)
-    beside = hole.beside_m[rows, columns].astype(np.float64)
-    near, far = 0.7 * beside.min(), BEYOND * float(hole.beside_m.max())
-    rays = hole.target.camera.rays()[rows, columns] @ hole.view.T_base_color[:3, :3].T
-    origin = hole.view.T_base_color[:3, 3]
-    image = np.moveaxis(hole.target.image(), 0, -1)[rows, columns]
-    expected, weight = beside, np.full(len(rows), SMOOTH)
-    guess = np.zeros(len(rows))
-    if hole.guess is not None:
-        guess = hole.guess.depth_m[rows, columns].astype(np.float64)
-        _, possible = _disagreement(origin + guess[:, None] * rays, image, views)
-        guess[~possible] = 0.0
-    is_known = guess > 0
-    if hole.guess is not None and is_known.any():
-        near, far = min(near, 0.9 * guess[is_known].min()), max(far, 1.1 * guess.max())
-        expected = np.where(is_known, guess, beside)
-        weight[is_known] = GUESS_COST / max(hole.guess.scatter, LEAST_SCATTER)
-    depths = np.geomspace(near, far, NUM_DEPTHS)
-    cost = np.empty((NUM_DEPTHS, len(rows)))
-    allowed = np.empty((NUM_DEPTHS, len(rows)), dtype=bool)
-    for index, depth in enumerate(depths):
-        difference, allowed[index] = _disagreement(origin + depth * rays, image, references)
-        leaving = weight * np.abs(np.log(depth / expected))
-        cost[index] = _averaged(difference, hole.mask) + leaving
-    cost[~allowed] = np.inf
-    chosen = _least(cost, depths)
-    if is_known.any():
-        difference, _ = _disagreement(origin + expected[:, None] * rays, image, references)
-        is_best = is_known & (_averaged(difference, hole.mask) <= cost.min(axis=0))
-        chosen = np.where(is_best, guess, chosen)
-    else:
-        is_best = is_known
     found = np.zeros(hole.mask.shape, dtype=np.float32)
     guessed = np.zeros(hole.mask.shape, dtype=bool)
-    found[rows, columns], guessed[rows, columns] = chosen, is_best
+    found[hole.mask], guessed[hole.mask] = _Hypotheses(hole, views).best()
     around = np.where(found > 0, found, hole.beside_m)
     smooth = ndimage.median_filter(around, size=BLOCK_PX)
     return np.where(found > 0, smooth, np.float32(0.0)), guessed

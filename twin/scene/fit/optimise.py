@@ -88,7 +88,7 @@ class SurfacePrior:
 
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 3
+STATE_VERSION = 4
 SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")
 SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
@@ -223,8 +223,9 @@ SOLVE_AT = (0.9,)
 Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
 EXPOSURES_AT = (0.1, 0.3, 0.6)
 """Shares of the budget at which exposures are solved, besides with the colours."""
-SPLIT_AT = (0.1, 0.2, 0.3)
-"""Shares of the budget at which Gaussians are split and dropped."""
+SPLIT_AT = (0.1, 0.25, 0.4, 0.6)
+"""Shares of the budget at which Gaussians are split and dropped. The last one is where images are
+of full size by default: they show errors of a texture that half-size ones have averaged away."""
 SOLVE_SHARE, EXPOSURES_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
 """At most this much of the budget for each of them."""
 
@@ -375,7 +376,7 @@ RATES = {
     "harmonics": 3e-3,
 }
 """Adam's step sizes at the start."""
-DECAY = 0.05
+DECAY = 0.1
 """What is left of them at the end."""
 HOLD_EVERY = 5
 """Images between two looks at whether Gaussians left the surface."""

@@ -8,7 +8,8 @@ import pytest
 import textured_room
 
 from bridge.geometry import se3
-from twin.scene.fit.appearance import degree_shares
+from twin.scene.fit import densify, optimise
+from twin.scene.fit.appearance import ImageObservation, degree_shares
 from twin.scene.fit.camera_correction import corrected_pose
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import Checkpoint, fit
@@ -99,6 +100,25 @@ def test_gaussians_are_added_within_their_budget_and_only_if_wanted(
     fixed = fit(start, views, replace(config, densify=False), lambda *_: None, max_splats=most)
     assert len(fixed.cloud) == len(start)
     assert len(fit(start, views, config, lambda *_: None).cloud) <= len(start)
+
+
+def test_errors_are_lifted_from_images_of_both_sizes_the_full_ones_last(
+    room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths: list[int] = []
+
+    def noted(
+        cloud: GaussianCloud, observations: list[ImageObservation], *rest: object
+    ) -> densify.Scores:
+        widths.append(observations[0].target.camera.width)
+        return densify.score(cloud, observations, *rest)
+
+    monkeypatch.setattr(optimise, "score", noted)
+    fit(*room, FitConfig(iterations=20, threads=1), lambda *_: None)
+    half, full = (target.camera.width for target in (room[1][0].half, room[1][0].full))
+    assert widths[0] == half
+    assert widths[-1] == full
+    assert widths == sorted(widths)
 
 
 @pytest.mark.slow
