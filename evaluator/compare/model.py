@@ -42,10 +42,14 @@ CERTAIN = 0.95
 WHAT = "model of agreement"
 
 
+def shared_by(groups: Sequence[RateGroup]) -> list[str]:
+    """Name for each group what it shares with others: its task, of one task alone its policy."""
+    by_task = len({group.task for group in groups}) > 1
+    return [group.task if by_task else group.policy for group in groups]
+
+
 def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
     """Return what was counted in each group, paired trials apart from those without a partner.
-
-    Of one task alone, groups of one policy belong together.
 
     Args:
         groups: With both rates.
@@ -54,8 +58,7 @@ def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
         UndefinedStatisticError: When the number of trials of a group is not known.
     """
     found = []
-    by_task = len({group.task for group in groups}) > 1
-    for group in groups:
+    for group, shared in zip(groups, shared_by(groups), strict=True):
         sides = []
         pairs = group.trial_table or (0, 0, 0, 0)
         for side, common in (
@@ -67,7 +70,6 @@ def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
                 raise UndefinedStatisticError(statistic=WHAT, reason=reason)
             paired = (common.k or 0, common.n or 0) if group.trial_table and common else (0, 0)
             sides.append((side.k - paired[0], side.n - paired[1]))
-        shared = group.task if by_task else group.policy
         found.append(GroupCounts(recorded=sides[0], sim=sides[1], pairs=pairs, task=shared))
     return tuple(found)
 

@@ -211,7 +211,9 @@ def rate_groups(
                 episodes=tuple(names_of(both)),
                 recorded_common=recorded_common,
                 sim_common=sim_common,
-                trial_table=_trial_table(both) if both else None,
+                trial_table=(
+                    trial_table(both, [row.sim_planned for row in both]) if both else None
+                ),
             )
         )
     return tuple(groups)
@@ -224,11 +226,18 @@ def fraction_of(measurement: Measurement) -> Fraction | None:
     return Fraction(measurement.k, measurement.n)
 
 
-def _trial_table(both: Sequence[TrialRow]) -> tuple[int, int, int, int]:
-    """Count trials in which both succeed, only sim, only recorded, neither."""
+def trial_table(
+    both: Sequence[TrialRow], answers: Sequence[bool | None]
+) -> tuple[int, int, int, int]:
+    """Count trials in which both succeed, only sim, only recorded, neither.
+
+    Args:
+        both: Trials with both sides.
+        answers: The twin's, one for each.
+    """
     table = [0, 0, 0, 0]
-    for row in both:
-        place = (0 if row.recorded else 1) if row.sim_planned else (2 if row.recorded else 3)
+    for row, yes in zip(both, answers, strict=True):
+        place = (0 if row.recorded else 1) if yes else (2 if row.recorded else 3)
         table[place] += row.count
     return table[0], table[1], table[2], table[3]
 

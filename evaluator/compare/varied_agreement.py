@@ -12,9 +12,9 @@ from fractions import Fraction
 import numpy as np
 
 from evaluator.compare.agreement import GroupIntervals, measure_over, sides
-from evaluator.compare.model import HEADLINE_FROM
+from evaluator.compare.model import HEADLINE_FROM, shared_by
 from evaluator.compare.rows import RateGroup, TrialRow
-from evaluator.compare.success import group_rows, names_of
+from evaluator.compare.success import group_rows, names_of, trial_table
 from evaluator.measurements import VARIED_BIAS, VARIED_MMRV, VARIED_R
 from evaluator.result import Interval, Measurement
 from evaluator.statistics import agreement
@@ -44,8 +44,7 @@ class VariedIntervals(GroupIntervals):
             members: Trials of each, with both sides.
         """
         super().__init__(groups)
-        by_task = len({group.task for group in groups}) > 1
-        self._names = [group.task if by_task else group.policy for group in groups]
+        self._names = shared_by(groups)
         self._members = members
         self._found: dict[str, Interval] = {}
 
@@ -67,7 +66,10 @@ class VariedIntervals(GroupIntervals):
         return [
             tuple(
                 GroupCounts(
-                    recorded=(0, 0), sim=(0, 0), pairs=_pairs(rows, answers[:, turn]), task=name
+                    recorded=(0, 0),
+                    sim=(0, 0),
+                    pairs=trial_table(rows, answers[:, turn].tolist()),
+                    task=name,
                 )
                 for rows, answers, name in zip(self._members, drawn, self._names, strict=True)
             )
@@ -90,13 +92,6 @@ def drawn_answers(rows: Sequence[TrialRow], rng: np.random.Generator) -> np.ndar
     shares = np.array([row.sim_varied for row in rows], dtype=np.float64)
     places = rng.permuted(np.tile(np.arange(REPLICATES), (len(rows), 1)), axis=1)
     return (places + rng.random((len(rows), 1))) / REPLICATES < shares[:, None]
-
-
-def _pairs(rows: Sequence[TrialRow], answers: np.ndarray) -> tuple[int, int, int, int]:
-    table = [0, 0, 0, 0]
-    for row, yes in zip(rows, answers, strict=True):
-        table[(0 if row.recorded else 1) if yes else (2 if row.recorded else 3)] += 1
-    return table[0], table[1], table[2], table[3]
 
 
 def varied_agreement(rows: Sequence[TrialRow], groups: Sequence[RateGroup]) -> list[Measurement]:

@@ -97,7 +97,11 @@ def lengths(rows: Float[np.ndarray, "num_rows 3"]) -> Float[np.ndarray, " num_ro
 
 
 def seen_through(
-    T: Float[np.ndarray, "4 4"], surface: MeshSurface, views: Sequence[CameraView], margin_m: float
+    T: Float[np.ndarray, "4 4"],
+    surface: MeshSurface,
+    views: Sequence[CameraView],
+    margin_m: float,
+    shifts_m: Float[np.ndarray, "num_views 2"] | None = None,
 ) -> float:
     """Share of the mesh's facing surface behind which cameras measured something.
 
@@ -106,9 +110,15 @@ def seen_through(
         surface: The mesh.
         views: With their depth.
         margin_m: How far behind.
+        shifts_m: Of the object in each view, x and y; None: where ``T`` says.
     """
-    T_object_base = se3.invert(T)
-    looked = [_looked_at(T, T_object_base, surface, view) for view in views]
+    looked = []
+    for view, shift in zip(
+        views, np.zeros((len(views), 2)) if shifts_m is None else shifts_m, strict=True
+    ):
+        moved = T.copy()
+        moved[:2, 3] += shift
+        looked.append(_looked_at(moved, se3.invert(moved), surface, view))
     through = sum(int((measured > z + margin_m).sum()) for measured, z in looked)
     return _share(through, sum(int((measured > 0).sum()) for measured, _ in looked))
 
@@ -304,7 +314,8 @@ def fit_mesh(
     sides = _SIDES if lying else _SIDES[:1]
     first = [T for side in sides for T in _starts(problem, config.num_starts, side, yaw_period_rad)]
     tried = [_icp(T, coarse, iterations=6, wide=4.0)[0] for T in first]
-    scores = [_score(T, coarse, config)[0] for T in tried]
+    unshifted = np.zeros((len(coarse.views), _PER_VIEW))
+    scores = [_score(T, unshifted, coarse, config)[0] for T in tried]
     best = [tried[index] for index in np.argsort(scores)[: config.num_refined]]
     ends = [_icp(T, problem, iterations=fit.iterations, wide=2.0) for T in best]
     return _choose(ends, problem, config, yaw_period_rad)
@@ -411,37 +422,16 @@ def _icp(
 
 
 def _score(
-    T: Float[np.ndarray, "4 4"], problem: _Problem, config: MeshFitConfig
-) -> tuple[float, float]:
-    """Return the mean bounded distance in bounds plus the share seen through, and that share."""
-    bound = problem.fit.tukey_m
-    r, _, _ = _residuals(T, np.zeros((len(problem.views), _PER_VIEW)), problem)
-    misfit = float(np.minimum(np.abs(r) / bound, 1.0).mean()) if len(r) else 1.0
-    through = seen_through(T, problem.surface, problem.views, config.see_through_m)
-    return misfit + through, through
-
-
-def _compared(
     T: Float[np.ndarray, "4 4"],
     shifts: Float[np.ndarray, "num_views 2"],
     problem: _Problem,
     config: MeshFitConfig,
-) -> float:
-    """The score with each camera where the fit found it.
-
-    What cameras are off by makes every pose look bad, the right one too: with it, one that is
-    turned by 50 degrees scores within a tenth of it; without, four times as high.
-    """
+) -> tuple[float, float]:
+    """Return the mean bounded distance in bounds plus the share seen through, and that share."""
     r, _, _ = _residuals(T, shifts, problem)
     misfit = float(np.minimum(np.abs(r) / problem.fit.tukey_m, 1.0).mean()) if len(r) else 1.0
-    through = whole = 0
-    for view, shift in zip(problem.views, shifts, strict=True):
-        moved = T.copy()
-        moved[:2, 3] += shift
-        measured, z = _looked_at(moved, se3.invert(moved), problem.surface, view)
-        through += int((measured > z + config.see_through_m).sum())
-        whole += int((measured > 0).sum())
-    return misfit + _share(through, whole)
+    through = seen_through(T, problem.surface, problem.views, config.see_through_m, shifts)
+    return misfit + through, through
 
 
 def _choose(
@@ -450,11 +440,14 @@ def _choose(
     config: MeshFitConfig,
     period_rad: float,
 ) -> MeshFit:
-    compared = [(_compared(T, shifts, problem, config), T, shifts) for T, shifts in ends]
+    # With each camera where the fit found it: what cameras are off by makes every pose look bad,
+    # the right one too. With it, one that is turned by 50 degrees scores within a tenth of the
+    # right one; without, four times as high.
+    compared = [(_score(T, shifts, problem, config)[0], T, shifts) for T, shifts in ends]
     compared.sort(key=lambda item: item[0])
     least, T, shifts = compared[0]
     # Limits on what is told were set with the cameras where they are said to be.
-    score, through = _score(T, problem, config)
+    score, through = _score(T, np.zeros_like(shifts), problem, config)
     others = [(value, _turn(T[:3, :3].T @ R[:3, :3], period_rad)) for value, R, _ in compared[1:]]
     rivals = [(value, angle) for value, angle in others if angle > np.radians(30)]
     weak = 1 / np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0]) ** 2
