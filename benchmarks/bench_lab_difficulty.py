@@ -8,13 +8,15 @@ them: everything stands on the table z = 0. A control runs the same starts in a
 laboratory that is as published: what fails only in the hidden one fails because of the world.
 
     python benchmarks/bench_lab_difficulty.py --labs 20 --starts 2
+
+``--as-published steps`` runs the same starts with full edges: how much of the difficulty is theirs.
 """
 
 import argparse
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ import numpy as np
 from bridge.geometry import se3
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
+from bridge.sources.standin.deviations import Deviations
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, GraspError, plan_pick_and_place
@@ -79,6 +82,44 @@ def as_published(file: CellFile, task: Task) -> HiddenParameters:
         joint_offset_rad=np.zeros_like(drawn.joint_offset_rad),
         deviations=None,
     )
+
+
+SHIFT = "shift"
+"""What localisation is off as a whole: no part of a laboratory, but of how it is seen."""
+
+
+def partly_as_published(hidden: HiddenParameters, what: str) -> HiddenParameters:
+    """The same laboratory but for one of its deviations; see ``PARTS``."""
+    found = hidden.deviations
+    if found is None or what not in PARTS:
+        return hidden
+    if what == "arm":
+        hidden = replace(hidden, joint_offset_rad=np.zeros_like(hidden.joint_offset_rad))
+    return replace(hidden, deviations=PARTS[what](found))
+
+
+def _objects(found: Deviations, **fields: Any) -> Deviations:
+    objects = {key: replace(item, **fields) for key, item in found.objects.items()}
+    return replace(found, objects=objects)
+
+
+def _straight_arm(found: Deviations) -> Deviations:
+    still = (0.0,) * len(found.joint_zero_rad)
+    links = dict.fromkeys(found.link_length_m, 0.0)
+    return replace(found, link_length_m=links, joint_zero_rad=still, joint_backlash_rad=still)
+
+
+PARTS: dict[str, Callable[[Deviations], Deviations]] = {
+    "steps": lambda found: _objects(found, rebate_m=0.0),
+    "centres": lambda found: _objects(found, centre_of_mass=(0.0, 0.0, 0.0)),
+    "sizes": lambda found: _objects(found, size_scale=(1.0, 1.0, 1.0)),
+    "table": lambda found: replace(found, table_height_m=0.0, table_tilt_rad=(0.0, 0.0)),
+    "fingers": lambda found: replace(
+        found, finger_shift_m=0.0, finger_thickness_m=0.0, finger_length_m=0.0
+    ),
+    "arm": _straight_arm,
+}
+"""What can be as published while all else stays hidden."""
 
 
 def seen(
@@ -154,7 +195,9 @@ def laboratory(file: CellFile, task: Task, hidden: HiddenParameters, seed: int) 
     )
 
 
-def measured(name: str, *, labs: int, starts: int, controls: int, first: int) -> dict[str, Any]:
+def measured(
+    name: str, *, labs: int, starts: int, controls: int, first: int, known: str = ""
+) -> dict[str, Any]:
     """All trials of one task, and the control."""
     file, task = load_cell(CELL), load_task(name)
     low, high = file.development_seeds
@@ -163,9 +206,11 @@ def measured(name: str, *, labs: int, starts: int, controls: int, first: int) ->
         if seed > high:
             message = f"seed {seed} is no development seed"
             raise ValueError(message)
-        cell = laboratory(file, task, draw_hidden(file, seed, task), seed)
+        hidden = partly_as_published(draw_hidden(file, seed, task), known)
+        cell = laboratory(file, task, hidden, seed)
+        shifted = None if known == SHIFT else seed
         for index in range(starts):
-            rows.append({"lab": seed, **trial(cell, seed * SEEDS_PER_SESSION + index, seed)})
+            rows.append({"lab": seed, **trial(cell, seed * SEEDS_PER_SESSION + index, shifted)})
     plain = laboratory(file, task, as_published(file, task), low)
     control = [trial(plain, (low + first + k) * SEEDS_PER_SESSION) for k in range(controls)]
     return {
@@ -192,11 +237,17 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="development seed to begin with")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--details", action="store_true")
+    parser.add_argument("--as-published", choices=[*PARTS, SHIFT], default="")
     asked = parser.parse_args()
     found = []
     for name in asked.tasks:
         row = measured(
-            name, labs=asked.labs, starts=asked.starts, controls=asked.controls, first=asked.first
+            name,
+            labs=asked.labs,
+            starts=asked.starts,
+            controls=asked.controls,
+            first=asked.first,
+            known=asked.as_published,
         )
         found.append(row)
         print(

@@ -14,6 +14,7 @@ from twin.physics.arm import Hulls, Joints
 from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
 from twin.physics.engine import ENGINE_VERSION
 from twin.physics.soft_world import SoftWorld
+from twin.physics.unseen import EVEN, Unseen
 from twin.physics.world import Box, World
 
 
@@ -69,6 +70,7 @@ class PhysicsWorld(Protocol):
         size_m: Float[np.ndarray, "3"],
         mass_kg: float,
         T_base_object: Float[np.ndarray, "4 4"],
+        unseen: Unseen = EVEN,
     ) -> None:
         """Add a solid box that moves."""
 

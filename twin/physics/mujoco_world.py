@@ -25,6 +25,7 @@ from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
 from twin.physics.config import RIGID_ONLY, PhysicsConfig
 from twin.physics.soft_world import SoftWorld
+from twin.physics.unseen import EVEN, Unseen, box_inertia
 from twin.physics.world import Box
 
 STEP_HZ = 480
@@ -236,11 +237,13 @@ class _Shape:
     on_table: bool = False
     """Of the robot's base, which touches the table by construction."""
     table: bool = False
+    body: str = ""
+    """Which object it is a part of."""
 
     def meets(self, other: "_Shape") -> bool:
         """Whether contact between the two counts: something of a pair must move by itself."""
         if self.owner == other.owner:
-            return self.owner == "object"
+            return self.owner == "object" and self.body != other.body
         return not ((self.on_table and other.table) or (self.table and other.on_table))
 
 
@@ -333,13 +336,20 @@ class MujocoWorld:
         size_m: Float[np.ndarray, "3"],
         mass_kg: float,
         T_base_object: Float[np.ndarray, "4 4"],
+        unseen: Unseen = EVEN,
     ) -> None:
         """Add a solid box that moves."""
         q, p = se3.split(T_base_object)
         name = _OBJECT + object_id
         body = self._spec.worldbody.add_body(name=name, pos=p, quat=q)
         body.add_freejoint(name=name)
-        body.add_geom(name=name, mass=mass_kg, **_box(size_m))
+        if unseen != EVEN:
+            body.explicitinertial, body.mass = True, mass_kg
+            body.ipos, body.inertia = unseen.centre_of_mass_m, box_inertia(size_m, mass_kg)
+        solids = unseen.solids(size_m)
+        shapes = [f"{name}/{k}" if k else name for k in range(len(solids))]
+        for shape, extents in zip(shapes, solids, strict=True):
+            body.add_geom(name=shape, mass=mass_kg, **_box(extents))
         weld = self._spec.add_equality(
             name=name,
             type=mujoco.mjtEq.mjEQ_WELD,
@@ -350,7 +360,9 @@ class MujocoWorld:
         )
         weld.solref = _CONTACT["solref"]
         self.free_objects.append(object_id)
-        self._pair(_Shape(name=name, friction=self.config.object_friction, owner="object"))
+        for shape in shapes:
+            friction = self.config.object_friction
+            self._pair(_Shape(name=shape, friction=friction, owner="object", body=object_id))
 
     def _pair(self, shape: _Shape) -> None:
         """Let a shape meet those that are there already."""
@@ -375,7 +387,10 @@ class MujocoWorld:
         self._addresses = {
             name: int(self._model.joint(_OBJECT + name).qposadr[0]) for name in self.free_objects
         }
-        self._geoms = {name: int(self._model.geom(_OBJECT + name).id) for name in self.free_objects}
+        self._geoms: dict[str, set[int]] = {name: set() for name in self.free_objects}
+        for shape in self._shapes:
+            if shape.owner == "object":
+                self._geoms[shape.body].add(int(self._model.geom(shape.name).id))
         self._robot_geoms = {
             int(self._model.geom(shape.name).id) for shape in self._shapes if shape.owner == "robot"
         }
@@ -413,8 +428,8 @@ class MujocoWorld:
         self._address(object_id)
         mine = self._geoms[object_id]
         return any(
-            (first == mine and second in self._finger_geoms)
-            or (second == mine and first in self._finger_geoms)
+            (first in mine and second in self._finger_geoms)
+            or (second in mine and first in self._finger_geoms)
             for first, second in self._data.contact.geom.tolist()
         )
 

@@ -17,6 +17,7 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.soft import Skin, SoftHealth, SoftModel, bind_points, health_of, rigid_fit
 from twin.physics.soft_solver import ConvexPiece, SoftSolver, add_body, box_piece, link_pieces
+from twin.physics.unseen import EVEN, Unseen, box_inertia
 
 # What soft bodies do to the robot: forces on its links, and fingers that yield.
 # Called in every physics step, so in plain numbers: arrays of three cost more than the sums.
@@ -182,23 +183,27 @@ class SoftWorld:
         size_m: Float[np.ndarray, "3"],
         mass_kg: float,
         T_base_box: Float[np.ndarray, "4 4"],
+        unseen: Unseen = EVEN,
     ) -> None:
-        """Add a box that PyBullet moves.
+        """Add a box that PyBullet moves; soft bodies meet it with full edges.
 
         Args:
             body: PyBullet's number of it.
             size_m: Whole lengths of the edges.
-            mass_kg: Spread evenly over the box.
-            T_base_box: Pose of the box's centre.
+            mass_kg: Of the box.
+            T_base_box: Pose of the box's middle.
+            unseen: Where its weight lies.
         """
-        x, y, z = (np.asarray(size_m) ** 2).tolist()
+        T_base_body, T_body_box = T_base_box.copy(), np.eye(4)
+        T_base_body[:3, 3] = se3.apply(T_base_box, np.array(unseen.centre_of_mass_m))
+        T_body_box[:3, 3] = -np.array(unseen.centre_of_mass_m)
         self._free[body] = self._add(
             _Placed(
-                piece=box_piece(size_m, np.eye(4)),
-                pose=_pose(T_base_box),
+                piece=box_piece(size_m, T_body_box),
+                pose=_pose(T_base_body),
                 friction=self._config.object_friction,
                 mass_kg=mass_kg,
-                inertia=tuple(mass_kg / 12 * value for value in (y + z, x + z, x + y)),
+                inertia=box_inertia(size_m, mass_kg),
             )
         )
 

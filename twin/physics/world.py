@@ -19,6 +19,7 @@ from twin.physics.arm import Arm, Hulls, PhysicsError, Press
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, open_client, pybullet
 from twin.physics.soft_world import SoftWorld
+from twin.physics.unseen import EVEN, Unseen, box_inertia
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
 # Without anchors friction acts against velocities only, and what the solver leaves of them adds
@@ -100,6 +101,7 @@ class World:
         self.config = config
         self._client = open_client(config)
         self.free_ids: dict[str, int] = {}
+        self._centres_m: dict[str, Float[np.ndarray, 3]] = {}
         self._anchors = FrictionAnchors(self._client)
         try:
             self.robot = Arm(self._client, urdf, mesh_hulls_m, config)
@@ -154,20 +156,26 @@ class World:
         size_m: Float[np.ndarray, "3"],
         mass_kg: float,
         T_base_object: Float[np.ndarray, "4 4"],
+        unseen: Unseen = EVEN,
     ) -> None:
         """Add a solid box that moves.
 
         Args:
             object_id: What the task calls it.
             size_m: Whole lengths of the edges.
-            mass_kg: Spread evenly over the box.
-            T_base_object: Pose of the box's centre.
+            mass_kg: Spread evenly over the box, but for where its centre is said to be.
+            T_base_object: Pose of the box's middle.
+            unseen: Its edges, and where its weight lies.
         """
-        body = self._box(size_m, mass_kg, T_base_object)
+        if unseen == EVEN:
+            body = self._box(size_m, mass_kg, T_base_object)
+        else:
+            body = self._uneven_box(size_m, mass_kg, T_base_object, unseen)
+            self._centres_m[object_id] = np.array(unseen.centre_of_mass_m)
         self._set_friction(body, self.config.object_friction)
         self._undamp(body)
         self._anchors.add(body)
-        self.soft.add_free(body, size_m, mass_kg, T_base_object)
+        self.soft.add_free(body, size_m, mass_kg, T_base_object, unseen)
         self.free_ids[object_id] = body
 
     def _box(
@@ -188,6 +196,39 @@ class World:
                 physicsClientId=self._client,
             )
         )
+
+    def _uneven_box(
+        self,
+        size_m: Float[np.ndarray, "3"],
+        mass_kg: float,
+        T_base_object: Float[np.ndarray, "4 4"],
+        unseen: Unseen,
+    ) -> int:
+        """A box whose frame is its centre of mass, as the engine wants it."""
+        solids, centre = unseen.solids(size_m), np.array(unseen.centre_of_mass_m)
+        q, _ = se3.split(T_base_object)
+        shape = pybullet.createCollisionShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(solids),
+            halfExtents=[(extents / 2).tolist() for extents in solids],
+            collisionFramePositions=[(-centre).tolist()] * len(solids),
+            physicsClientId=self._client,
+        )
+        body = int(
+            pybullet.createMultiBody(
+                baseMass=mass_kg,
+                baseCollisionShapeIndex=shape,
+                basePosition=se3.apply(T_base_object, centre).tolist(),
+                baseOrientation=[q[1], q[2], q[3], q[0]],
+                physicsClientId=self._client,
+            )
+        )
+        pybullet.changeDynamics(
+            body,
+            -1,
+            localInertiaDiagonal=list(box_inertia(size_m, mass_kg)),
+            physicsClientId=self._client,
+        )
+        return body
 
     def _undamp(self, body: int) -> None:
         """Nothing slows down in the air; the engine would take 3 s for 83 % of a spin's energy."""
@@ -232,6 +273,11 @@ class World:
         p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
             self._free(object_id), physicsClientId=self._client
         )
+        centre = self._centres_m.get(object_id)
+        if centre is not None:
+            p = (
+                np.array(p) - se3.rotation_from_quaternion(np.array([w, x, y, z])) @ centre
+            ).tolist()
         return (*p, w, x, y, z)
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
@@ -278,7 +324,7 @@ class World:
                 pybullet.JOINT_FIXED,
                 [0, 0, 0],
                 np.asarray(p).tolist(),
-                [0, 0, 0],
+                (-self._centres_m.get(object_id, np.zeros(3))).tolist(),
                 [x, y, z, w],
                 [0, 0, 0, 1],
                 physicsClientId=self._client,

@@ -18,6 +18,17 @@ RIGID_MASSES = "masses of rigid objects"
 
 
 @dataclass(frozen=True, kw_only=True)
+class BoxDraw:
+    """What one draw says of a rigid object that moves, in parts of its size."""
+
+    name: str
+    edge_share: float
+    """Width of a step along its edges, in half its smallest extent."""
+    centre_of_mass: tuple[float, float, float]
+    """From its middle, in half extents."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PosteriorDraw:
     """One draw of what nobody measured and all trials of a session have in common."""
 
@@ -31,6 +42,8 @@ class PosteriorDraw:
     """Times the force that the gripper is said to have."""
     bias_m: tuple[float, float]
     """Added to every localised pose along x and y [m]."""
+    boxes: tuple[BoxDraw, ...] = ()
+    """Of each rigid object that moves; none in files from before, where they were taken as even."""
     weight: float
     """How much it counts; those of all draws together are 1."""
     wrong_yes: float
@@ -41,7 +54,23 @@ class PosteriorDraw:
 
     def to_record(self) -> dict[str, Any]:
         """Return plain numbers."""
-        return {**asdict(self), "bias_m": list(self.bias_m)}
+        boxes = [{**asdict(box), "centre_of_mass": list(box.centre_of_mass)} for box in self.boxes]
+        return {**asdict(self), "bias_m": list(self.bias_m), "boxes": boxes}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "PosteriorDraw":
+        """The inverse of ``to_record``.
+
+        Raises:
+            KeyError, TypeError, ValueError: When something lacks or is no number.
+        """
+        x, y = record["bias_m"]
+        boxes = []
+        for box in record.get("boxes", ()):
+            a, b, c = box["centre_of_mass"]
+            centre = (float(a), float(b), float(c))
+            boxes.append(BoxDraw(**{**box, "centre_of_mass": centre}))
+        return cls(**{**record, "bias_m": (float(x), float(y)), "boxes": tuple(boxes)})
 
 
 @dataclass(frozen=True, kw_only=True)

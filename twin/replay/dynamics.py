@@ -17,6 +17,7 @@ from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
 from twin.physics.engines import Attachment, PhysicsWorld, open_world
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
+from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import ReplayConfig
 from twin.replay.failure import NotEvaluatedError
@@ -65,7 +66,8 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]
         if name in soft:
             world.soft_bodies().add(name, soft[name], T_free)
         else:
-            world.add_free(name, np.array(model.size_m), model.mass_kg, T_free)
+            unseen = scene.unseen.get(name, EVEN)
+            world.add_free(name, np.array(model.size_m), model.mass_kg, T_free, unseen)
 
 
 def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "num_points 3"]:

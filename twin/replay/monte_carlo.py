@@ -7,7 +7,7 @@ order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from bridge.task.record import check_record
 from bridge.task.task_file import ObjectModel
 from bridge.task.verdict import Verdict
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
+from twin.physics.unseen import Unseen
+from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig, VariationConfig
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
@@ -41,11 +42,13 @@ class Variation:
     """How much later than the arm the gripper acts."""
     objects: dict[str, ObjectModel]
     """The task's, with the drawn masses and stiffnesses."""
+    unseen: Mapping[str, Unseen] = field(default_factory=dict)
+    """Edges and centres of mass of rigid objects, where a posterior has draws of them."""
 
     def scene(self, scene: ReplayScene) -> ReplayScene:
         """The varied start."""
         task = replace(scene.task, objects=self.objects)
-        return replace(scene, task=task, Ts_base_object=self.Ts_base_object)
+        return replace(scene, task=task, Ts_base_object=self.Ts_base_object, unseen=self.unseen)
 
     def config(self, config: ReplayConfig) -> ReplayConfig:
         """The varied settings; a varied replay has no samples of its own."""
@@ -65,6 +68,7 @@ class Variation:
                 name: model.mass_kg for name, model in self.objects.items() if not model.fixed
             },
             "young_pa": {name: material.young_pa for name, material in soft.items()},
+            "unseen": {name: unseen.to_record() for name, unseen in sorted(self.unseen.items())},
         }
 
 
@@ -89,7 +93,8 @@ def with_draw(
 
     Args:
         draw: What is not known.
-        scene: Its movable objects get other masses, all of its objects are shifted.
+        scene: Its movable objects get other masses, edges and centres of mass; all of its objects
+            are shifted.
         config: With the force that the gripper is said to have.
     """
     own = config.physics.object_friction
@@ -107,8 +112,16 @@ def with_draw(
     for name, T in scene.Ts_base_object.items():
         poses[name] = T.copy()
         poses[name][:2, 3] += draw.bias_m
-    moved = replace(scene, task=replace(scene.task, objects=objects), Ts_base_object=poses)
+    task = replace(scene.task, objects=objects)
+    unseen = {box.name: _unseen(box, objects[box.name]) for box in draw.boxes}
+    moved = replace(scene, task=task, Ts_base_object=poses, unseen=unseen)
     return moved, replace(config, physics=physics)
+
+
+def _unseen(box: BoxDraw, model: ObjectModel) -> Unseen:
+    half = np.array(model.size_m) / 2
+    x, y, z = (half * box.centre_of_mass).tolist()
+    return Unseen(edge_m=float(box.edge_share * half.min()), centre_of_mass_m=(x, y, z))
 
 
 def halving(index: int) -> float:
@@ -169,6 +182,7 @@ def draw_variation(
         physics=physics,
         grip_delay_s=delay_s,
         objects={name: objects[name] for name in scene.task.objects},
+        unseen=scene.unseen,
     )
 
 

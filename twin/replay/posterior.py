@@ -9,7 +9,7 @@ the draws that are left keep them together. Friction and mass belong to the obje
 each task is weighed by its own trials alone.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,8 +26,9 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, ProcessPool
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
+from bridge.task.task_file import Task
 from bridge.terminal import Output
-from twin.replay.config import PosteriorDraw, ReplayConfig
+from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
 from twin.replay.monte_carlo import with_draw
 from twin.replay.path import path_of_plan
@@ -53,6 +54,14 @@ NEAR_M = 0.01
 """Standard deviation of where an object ends about where the twin has it end, at the right draw."""
 ASTRAY = 0.1
 """Weight that a draw keeps however far from there: what falls ends anywhere."""
+
+
+EDGE_SHARE = 0.4
+"""Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
+blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""
+CENTRE_OF_MASS = 0.15
+"""Spread of where the weight of a rigid object lies off its middle, in half extents: even things
+have 0, a bottle that is half full 0.5 along its height."""
 
 
 class NoTrialsError(UsageError):
@@ -114,13 +123,21 @@ class Ended:
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
 
 
-def draw_beforehand(count: int) -> list[PosteriorDraw]:
+def rigid_movers(task: Task) -> tuple[str, ...]:
+    """Names of a task's objects whose edges and centre of mass are drawn."""
+    return tuple(
+        sorted(name for name, item in task.objects.items() if not item.fixed and not item.soft)
+    )
+
+
+def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDraw]:
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
         count: A power of two covers best.
+        movers: Rigid objects that move, each with edges and a centre of mass of its own.
     """
-    unit = qmc.Sobol(d=6, scramble=True, seed=0).random(count)
+    unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
     frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
     factors = np.exp(FACTOR_LOG * z[:, 2:4])
@@ -131,14 +148,27 @@ def draw_beforehand(count: int) -> list[PosteriorDraw]:
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
+            boxes=_boxes(movers, row.reshape(-1, 4)),
             weight=1.0 / count,
             wrong_yes=Record(right=0, wrong=0).probability_wrong,
             wrong_no=Record(right=0, wrong=0).probability_wrong,
         )
-        for (finger, surface), (mass, grip), bias in zip(
-            frictions, factors, BIAS_M * z[:, 4:], strict=True
+        for (finger, surface), (mass, grip), bias, row in zip(
+            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:], strict=True
         )
     ]
+
+
+def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tuple[BoxDraw, ...]:
+    centres = np.clip(CENTRE_OF_MASS * ndtri(np.clip(unit[:, 1:], 1e-6, 1 - 1e-6)), -0.9, 0.9)
+    return tuple(
+        BoxDraw(
+            name=name,
+            edge_share=EDGE_SHARE * float(share),
+            centre_of_mass=(float(centre[0]), float(centre[1]), float(centre[2])),
+        )
+        for name, share, centre in zip(movers, unit[:, 0], centres, strict=True)
+    )
 
 
 def read_trials(run: RunFolder, output: Output) -> Trials:
@@ -358,7 +388,8 @@ def calibrate_posterior(
     """
     found, tasks = read_trials(run, output), dict[str, Any]()
     for name, trials in found.of_each_task().items():
-        draws = weighed(draw_beforehand(num_draws), trials, workers=workers, output=output)
+        beforehand = draw_beforehand(num_draws, rigid_movers(trials[0].scene.task))
+        draws = weighed(beforehand, trials, workers=workers, output=output)
         tasks[name] = {
             "draws": [draw.to_record() for draw in draws],
             "effective_draws": effective(draws),
@@ -400,12 +431,34 @@ def _described(name: str, found: Mapping[str, Any]) -> list[str]:
         f"succeeded; as much as {found['effective_draws']:.1f} equal ones"
     ]
     weights = np.array([draw["weight"] for draw in draws])
-    for quantity in (key for key in draws[0] if key != "weight"):
-        values = np.array([np.atleast_1d(draw[quantity]) for draw in draws])
-        for axis, column in enumerate(values.T):
-            order = np.argsort(column)
-            share = np.cumsum(weights[order])
-            low, middle, high = (column[order][np.searchsorted(share, q)] for q in (0.1, 0.5, 0.9))
-            label = quantity if values.shape[1] == 1 else f"{quantity} {'xy'[axis]}"
-            lines.append(f"  {label:<22} {middle:8.3g}, eight of ten in [{low:.3g}, {high:.3g}]")
+    for label, values in _columns(draws):
+        order = np.argsort(values)
+        share = np.cumsum(weights[order])
+        low, middle, high = (values[order][np.searchsorted(share, q)] for q in (0.1, 0.5, 0.9))
+        lines.append(f"  {label:<22} {middle:8.3g}, eight of ten in [{low:.3g}, {high:.3g}]")
     return lines
+
+
+def _columns(
+    draws: Sequence[Mapping[str, Any]],
+) -> Iterator[tuple[str, Float[np.ndarray, " num_draws"]]]:
+    """Each number of the draws but their weight, with its name."""
+    for key in draws[0]:
+        if key == "boxes":
+            yield from _box_columns([draw[key] for draw in draws])
+        elif key == "bias_m":
+            for axis in range(2):
+                yield f"{key} {'xy'[axis]}", np.array([draw[key][axis] for draw in draws])
+        elif key != "weight":
+            yield key, np.array([draw[key] for draw in draws])
+
+
+def _box_columns(
+    rows: Sequence[Sequence[Mapping[str, Any]]],
+) -> Iterator[tuple[str, Float[np.ndarray, " num_draws"]]]:
+    for boxes in zip(*rows, strict=True):
+        name = boxes[0]["name"]
+        yield f"{name} edge_share", np.array([box["edge_share"] for box in boxes])
+        centres = np.array([box["centre_of_mass"] for box in boxes])
+        for axis in range(3):
+            yield f"{name} centre of mass {'xyz'[axis]}", centres[:, axis]

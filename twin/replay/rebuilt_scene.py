@@ -181,10 +181,7 @@ def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, .
     """
     draws = _posterior(calibration, task).get("draws", [])
     try:
-        return tuple(
-            PosteriorDraw(**{**draw, "bias_m": tuple(float(value) for value in draw["bias_m"])})
-            for draw in draws
-        )
+        return tuple(PosteriorDraw.from_record(draw) for draw in draws)
     except (KeyError, TypeError, ValueError) as error:
         raise UnreadablePosteriorError(f"the posterior of calibration.json: {error!r}") from error
 

@@ -12,6 +12,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import Task
+from twin.physics.unseen import Unseen
 from twin.replay.failure import with_reasons
 from twin.scene.localise.episode import Phase, quiet_phases, write_localised
 from twin.scene.shape.static import StaticSdf
@@ -43,6 +44,8 @@ class ReplayScene:
     lattices: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     """Soft objects by the arrays of the scene's ``soft.npz``; the task's mesh stands in for
     others."""
+    unseen: Mapping[str, Unseen] = field(default_factory=dict)
+    """Of rigid objects: edges and centre of mass as a draw has them; full and even where absent."""
     shape_sources: Mapping[str, str] = field(default_factory=dict)
     """Per object: where its shape comes from."""
     start_rad: Float[np.ndarray, " num_joints"] | None = None

@@ -1,5 +1,6 @@
 """A session's own trials as evidence: what draws are kept, how much a yes is trusted afterwards."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,8 @@ from twin.replay.monte_carlo import (
 )
 from twin.replay.posterior import (
     BIAS_M,
+    CENTRE_OF_MASS,
+    EDGE_SHARE,
     FRICTION,
     WRONG,
     Ended,
@@ -39,6 +42,7 @@ from twin.replay.posterior import (
     draw_beforehand,
     effective,
     log_nearness,
+    rigid_movers,
     weighed,
 )
 from twin.replay.rebuilt_scene import (
@@ -186,6 +190,41 @@ def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None
     assert after.task.objects["box"] == before.task.objects["box"]
 
 
+def test_each_rigid_mover_has_edges_and_weight_of_its_own_within_the_priors() -> None:
+    movers = rigid_movers(load_task("clear_then_place"))
+    assert movers == ("block", "cube")
+    draws = draw_beforehand(256, movers)
+    for place, name in enumerate(movers):
+        boxes = [draw.boxes[place] for draw in draws]
+        assert {box.name for box in boxes} == {name}
+        shares = np.array([box.edge_share for box in boxes])
+        assert 0 <= shares.min() < 0.01 < shares.max() <= EDGE_SHARE
+        assert shares.mean() == pytest.approx(EDGE_SHARE / 2, rel=0.02)
+        centres = np.array([box.centre_of_mass for box in boxes])
+        np.testing.assert_allclose(centres.std(axis=0), CENTRE_OF_MASS, rtol=0.05)
+        np.testing.assert_allclose(centres.mean(axis=0), 0.0, atol=0.01)
+    first, second = (np.array([d.boxes[k].edge_share for d in draws]) for k in (0, 1))
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.1
+    assert rigid_movers(load_task("sloth_into_basket")) == ()
+
+
+def test_a_draw_of_boxes_survives_its_record_and_reaches_the_varied_start() -> None:
+    (draw,) = draw_beforehand(1, rigid_movers(TASK))
+    assert PosteriorDraw.from_record(json.loads(json.dumps(draw.to_record()))) == draw
+    box = replace(draw.boxes[0], edge_share=0.25, centre_of_mass=(0.5, -0.25, 0.0))
+    draw = replace(draw, boxes=(box,), weight=1.0)
+    half = np.array(TASK.objects["block"].size_m) / 2
+    config = ReplayConfig(variation=VariationConfig(posterior=(draw,)))
+    start = scene()
+    varied = draw_variation(sample_rng(0, "s", 0), start, config).scene(start)
+    assert set(varied.unseen) == {"block"}
+    assert varied.unseen["block"].edge_m == pytest.approx(0.25 * half.min())
+    np.testing.assert_allclose(varied.unseen["block"].centre_of_mass_m, half * [0.5, -0.25, 0.0])
+    assert start.unseen == {}
+    old = {key: value for key, value in draw.to_record().items() if key != "boxes"}
+    assert PosteriorDraw.from_record(old).boxes == (), "a file from before: as even as then"
+
+
 def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
     shares = [halving(index) for index in range(16)]
     np.testing.assert_allclose(np.diff(sorted(shares)), 1 / 17, atol=0.04)
@@ -314,7 +353,8 @@ def test_a_task_is_weighed_by_its_own_trials_alone(
     known = read_calibration(run)
     assert known is not None
     for task, mine in ((TASK, fell), (other, held)):
-        alone = weighed(draw_beforehand(16), mine, workers=1, output=QUIET)
+        movers = rigid_movers(task)
+        alone = weighed(draw_beforehand(16, movers), mine, workers=1, output=QUIET)
         assert posterior_of(known, task) == tuple(alone), "as from a run of this task alone"
     assert posterior_of(known, TASK) != posterior_of(known, other)
 
