@@ -48,7 +48,7 @@ def _pictures(name: str) -> Path | None:
 def clean_rows() -> list[Target]:
     """The tabletop without noise, and that it is neither trivial nor hopeless."""
     from splat.clean_tabletop import load
-    from splat.quality import mean_image_psnr_db, rebuild, score
+    from splat.quality import mean_image_psnr_db, median_depth_error_m, rebuild, score
 
     from twin.scene.settings import FitConfig, InitialiseConfig
 
@@ -81,6 +81,15 @@ def clean_rows() -> list[Target]:
         rows.append(_at_least(f"{name}: PSNR", found.psnr_db, least_db, "dB", said))
         least_ssim = 0.955 if budget_s > 60 else 0.945
         rows.append(_at_least(f"{name}: SSIM", found.ssim, least_ssim, "", said))
+        rows.append(
+            Target(
+                what=f"{name}: depth, median error",
+                measured=1e3 * median_depth_error_m(made.result.cloud, scene.held_out),
+                limit=0.5,
+                unit="mm",
+                reference=said,
+            )
+        )
     return rows
 
 

@@ -83,6 +83,17 @@ def score(cloud: GaussianCloud, frames: list[RgbdFrame], *, pictures: Path | Non
     return compare(drawn, frames)
 
 
+def median_depth_error_m(cloud: GaussianCloud, frames: list[RgbdFrame]) -> float:
+    """Over the pixels of held-out views where depth was recorded and the scene has some [m]."""
+    from splat.depth import depth_scores
+
+    rasteriser = Rasteriser(RasterConfig())
+    limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=0.03)
+    views = [training_view(FrameSurface(frame, limits)) for frame in frames]
+    drawn = {"scene": lambda camera, T: rasteriser.view(cloud, camera, T).depth_m}
+    return depth_scores(drawn, views)["scene"].median_abs_m
+
+
 def score_aligned(cloud: GaussianCloud, frames: list[RgbdFrame]) -> Scores:
     """After pose (6) and gain (3) were fitted to each held-out image: not strictly held out."""
     rasteriser = Rasteriser(RasterConfig())
