@@ -89,7 +89,6 @@ def answer(question: Question) -> Verdict:
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
     from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
-        calibrated,
         for_task,
         read_rebuilt_scene,
     )
@@ -108,8 +107,7 @@ def answer(question: Question) -> Verdict:
             f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
             f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
         )
-    known = calibrated(question.config, read_calibration(run), question.task)
-    config = for_task(known, question.task)
+    config = for_task(question.config, read_calibration(run), question.task)
     # Of a plan with impossible times the replay says what is wrong.
     end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
     steps = max(1, num_steps(end_ns, config))

@@ -35,7 +35,7 @@ from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.config import ReplayConfig
 from twin.replay.output import ReplayOrigin, write_replay
-from twin.replay.rebuilt_scene import calibrated, for_task
+from twin.replay.rebuilt_scene import for_task
 from twin.replay.run_job import cell_of, planned_grips, recorded_start
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
@@ -271,8 +271,7 @@ def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:
     path = run.plans_dir / f"{plan.id}{ending}"
     write_whole(path, plan.to_json())
     scene, episode = start.problem.scene, start.episode
-    known = calibrated(ReplayConfig(mode="dynamic"), read_calibration(run), scene.task)
-    config = for_task(known, scene.task)
+    config = for_task(ReplayConfig(mode="dynamic"), read_calibration(run), scene.task)
     result = replace(replay_plan(plan, scene, config), verdict=verdict)
     replay_path = run.plans_dir / f"{plan.id}{PLAN_REPLAY}"
     replay_path.unlink(missing_ok=True)

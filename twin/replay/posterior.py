@@ -32,7 +32,7 @@ from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
 from twin.replay.monte_carlo import with_draw
 from twin.replay.path import path_of_plan
-from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene
+from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
@@ -221,7 +221,7 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
         raise UsageError(f"at its start {scene.describe_missing()}")
-    config = for_task(calibrated(ReplayConfig(), _without_posterior(run), task), task)
+    config = for_task(ReplayConfig(), _without_posterior(run), task)
     return Trial(
         episode=episode.info.id,
         sha256=episode.sha256(),

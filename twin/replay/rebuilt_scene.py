@@ -199,18 +199,20 @@ def posterior_notes(calibration: Calibration | None, task: Task) -> tuple[str, .
     return (OTHER_TASKS if "tasks" in found else ALL_TASKS,)
 
 
-def for_task(config: ReplayConfig, task: Task) -> ReplayConfig:
-    """Press as hard as the task says the gripper is set, unless user or calibration said otherwise.
+def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) -> ReplayConfig:
+    """Settings of a task's replays: calibrated, and pressing as hard as its gripper is set.
 
-    A force that holds a wooden cube crushes a toy.
+    A force that holds a wooden cube crushes a toy. What user or calibration said of it counts.
 
     Args:
-        config: With calibrated physics, where there is a calibration.
+        config: As the user set it.
+        calibration: Of the run; None: there is none.
         task: May say how hard the gripper presses.
     """
-    if task.grip_force_N is None or config.physics.grip_force_N != PhysicsConfig().grip_force_N:
-        return config
-    return replace(config, physics=replace(config.physics, grip_force_N=task.grip_force_N))
+    known = calibrated(config, calibration, task)
+    if task.grip_force_N is None or known.physics.grip_force_N != PhysicsConfig().grip_force_N:
+        return known
+    return replace(known, physics=replace(known.physics, grip_force_N=task.grip_force_N))
 
 
 def physics_of(calibration: Mapping[str, Any]) -> dict[str, float]:

@@ -20,7 +20,7 @@ from twin.replay.config import ReplayRunConfig
 from twin.replay.imported import MotionReplay, motion_replays, run_motion_replay
 from twin.replay.job import ReplayJob
 from twin.replay.job_row import row_of_existing, row_of_failure
-from twin.replay.rebuilt_scene import calibrated, for_task, read_rebuilt_scene, shape_hashes
+from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene, shape_hashes
 from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts
 from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
@@ -110,7 +110,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
     )
     digest = episode.sha256()
     calibration = read_calibration(run)
-    replay = for_task(calibrated(config.replay, calibration, task), task)
+    replay = for_task(config.replay, calibration, task)
     jobs, events = [], streams.events(episode)
     for index, (stamp_ns, plan) in enumerate(plans):
         execution = execution_of(events, plan.id)

@@ -156,12 +156,12 @@ def test_the_gripper_presses_as_the_task_is_set_unless_somebody_knows_better() -
     toys, cube = load_task("sloth_into_basket"), load_task("cube_into_box")
     assert toys.grip_force_N == 9.0, "what holds a wooden cube crushes a toy"
     assert cube.grip_force_N is None
-    assert for_task(ReplayConfig(), toys).physics.grip_force_N == 9.0
-    assert for_task(ReplayConfig(), cube) == ReplayConfig()
+    assert for_task(ReplayConfig(), None, toys).physics.grip_force_N == 9.0
+    assert for_task(ReplayConfig(), None, cube) == ReplayConfig()
     mine = ReplayConfig(physics=PhysicsConfig(grip_force_N=15.0))
-    assert for_task(mine, toys) == mine
+    assert for_task(mine, None, toys) == mine
     found = calibration(identified={"grip_force_N": {"value": 7.5}})
-    assert for_task(calibrated(ReplayConfig(), found, toys), toys).physics.grip_force_N == 7.5
+    assert for_task(ReplayConfig(), found, toys).physics.grip_force_N == 7.5
 
 
 def test_distances_are_found_where_the_robot_finds_them(tmp_path: Path) -> None:
