@@ -115,7 +115,7 @@ def draw_picture(scene: TrialScene, t_s: float) -> bytes:
             clouds.append(moved_cloud(item.cloud, item.T_base_object))
     clouds += [moved_cloud(parts.links[k], Ts[at]) for k, Ts in scene.Ts_root_link.items()]
     drawn = open_rasteriser().view(concatenate(clouds), camera, view.T_root_camera)
-    return encode_jpeg(drawn.image_u8())
+    return encode_jpeg(parts.behind(drawn, camera, view.T_root_camera).image_u8())
 
 
 @dataclass

@@ -62,7 +62,7 @@ class PosteriorDraw:
         """The inverse of ``to_record``.
 
         Raises:
-            KeyError, TypeError, ValueError: When something lacks or is no number.
+            KeyError, TypeError, ValueError: When something lacks or is not a number.
         """
         x, y = record["bias_m"]
         boxes = []

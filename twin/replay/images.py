@@ -119,6 +119,7 @@ def render_replay(
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
             view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
+            view = stage.parts.behind(view, info.camera, T)
             yield (
                 camera_id,
                 CompressedColor(

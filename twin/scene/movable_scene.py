@@ -8,9 +8,12 @@ from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
+from bridge.geometry.camera import Camera
 from twin.robot.posture import Posture
+from twin.scene.backdrop import Backdrop, read_backdrop
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose
+from twin.scene.raster.rasteriser import View
 from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
 from twin.scene.robot.splats import posed, read_links
 from twin.scene.store.folder import SCENE_FILE, Scene
@@ -32,6 +35,20 @@ class MovableScene:
     """The robot's base in the scene's frame."""
     lighting: Lighting = EVEN
     """On the links."""
+    backdrop: Backdrop | None = None
+    """What stands behind everything; None: black."""
+
+    def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
+        """A view of one state, with the backdrop where nothing was drawn.
+
+        Args:
+            view: Of a cloud from ``at``.
+            camera: It was drawn through.
+            T_base_camera: Where that was, in the scene's frame.
+        """
+        if self.backdrop is None:
+            return view
+        return self.backdrop.behind(view, camera, T_base_camera)
 
     def at(
         self,
@@ -110,4 +127,5 @@ def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
         links=read_links(run, scene.record),
         T_root_base=se3.invert(T_base_root),
         lighting=read_lighting(scene.record),
+        backdrop=read_backdrop(run, scene.record),
     )

@@ -21,7 +21,7 @@ from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
-from twin.scene.movable_scene import read_movable_scene
+from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.other_viewers import for_other_viewers
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -46,6 +46,7 @@ class Composed:
     """How the robot stands, or why it is not drawn."""
     posture: Posture | None
     """None: no robot is drawn."""
+    parts: MovableScene
 
 
 def compose(
@@ -72,16 +73,18 @@ def compose(
         if config.joints is not None:
             message = f"--joints cannot be followed: {reason}."
             raise UsageError(message)
-        return Composed(cloud=parts.at(places), robot=f"not drawn: {reason}", posture=None)
+        robot = f"not drawn: {reason}"
+        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
     try:
         urdf, posture = _posture(episode, stamp_ns, config)
     except GstError as error:
         if config.joints is not None:
             raise
-        return Composed(cloud=parts.at(places), robot=f"not drawn: {error}", posture=None)
+        robot = f"not drawn: {error}"
+        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
     source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
     cloud = parts.at(places, posture, urdf)
-    return Composed(cloud=cloud, robot=f"joints {source}", posture=posture)
+    return Composed(cloud=cloud, robot=f"joints {source}", posture=posture, parts=parts)
 
 
 def why_no_robot(scene: Scene) -> str:
@@ -235,7 +238,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     if path.suffix.lower() == ".ply":
         write_ply(path, for_other_viewers(composed.cloud, camera, T_base_camera))
     else:
-        path.write_bytes(encode_png(view.image_u8()))
+        whole = composed.parts.behind(view, camera, T_base_camera)
+        path.write_bytes(encode_png(whole.image_u8()))
     written = [str(path)]
     if config.depth:
         depth_path = path.with_name(f"{path.stem}_depth.png")

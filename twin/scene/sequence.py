@@ -365,7 +365,8 @@ class Artist:
         cloud = self.parts.at(frame.Ts_base_object, frame.posture, self.urdf)
         view = self.rasteriser.view(cloud, self.camera, frame.T_base_camera)
         seen = seen_mask(self.rasteriser, view.alpha, cloud)
-        return Drawn(image_u8=view.image_u8(), depth_m=view.depth_m, seen_mask=seen)
+        image_u8 = self.parts.behind(view, self.camera, frame.T_base_camera).image_u8()
+        return Drawn(image_u8=image_u8, depth_m=view.depth_m, seen_mask=seen)
 
 
 @dataclass(frozen=True, kw_only=True)

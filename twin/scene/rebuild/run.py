@@ -18,6 +18,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
 from bridge.terminal import Output
+from twin.scene.backdrop import Backdrop, backdrop_of
 from twin.scene.dataset.training_set import (
     TrainingSet,
     limits_of,
@@ -41,7 +42,7 @@ from twin.scene.gaussians import (
     write_ply,
 )
 from twin.scene.objects.decompose import Decomposition, decompose, scanned_tasks
-from twin.scene.raster.rasteriser import RasterConfig, load_native
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
@@ -144,7 +145,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     links = training.robot.frames.links(config.initialise)
     clock.end("take_apart")
     drawn = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
-    views = _hold_out(run, training, drawn, decomposed, links, config, clock, output)
+    rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
+    backdrop = backdrop_of(drawn.cloud, training.views, rasteriser)
+    views = _hold_out(run, training, drawn, backdrop, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     output.say("write objects, robot links and the distances to what is static")
     extras = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
@@ -172,7 +175,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
-    record |= extras | guesses
+    record |= extras | guesses | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)
     kept.path.unlink(missing_ok=True)
     return record
@@ -219,6 +222,7 @@ def _hold_out(
     run: RunFolder,
     training: TrainingSet,
     fitted: FitResult,
+    backdrop: Backdrop,
     decomposed: Decomposition,
     links: LitLinks,
     config: RebuildConfig,
@@ -240,6 +244,7 @@ def _hold_out(
             (choices[index].episode.path, choices[index].camera_id): mask
             for index, mask in training.ego_masks.items()
         },
+        backdrop=backdrop,
         align=config.frames.align_holdout,
     )
     total = sum(len(choice.holdout_ns) for choice in choices)

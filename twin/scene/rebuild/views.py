@@ -28,6 +28,7 @@ from bridge.errors import UndefinedStatisticError
 from bridge.media.color import encode_png
 from bridge.media.image_quality import aligned, as_float, psnr_db, ssim
 from bridge.terminal import Advance
+from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
 from twin.scene.fit.camera_correction import align_view
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
@@ -206,6 +207,8 @@ class ViewsJob:
     """Drawn where it stood at each frame; the cloud holds only what is static."""
     ego_masks: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
     """By episode and camera: what moves with the camera and is not part of the scene."""
+    backdrop: Backdrop | None = None
+    """Stands behind everything; None: black."""
     align: bool = False
     """Also draw each view where it fits the recorded image best."""
 
@@ -291,6 +294,8 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
         view = rasteriser.view(cloud, camera, T)
         seen = seen_mask(rasteriser, view.alpha, cloud)
+        if job.backdrop is not None:
+            view = job.backdrop.behind(view, camera, T)
         masks = {"static": recorded.full.static_mask}
         if job.marked is not None:
             planes = rasteriser.draw_planes(job.marked, camera, T)

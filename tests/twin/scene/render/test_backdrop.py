@@ -1,0 +1,223 @@
+"""The far shell: each direction in its place, what is drawn untouched, unseen corners not black."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
+from bridge.media.color import decode_color
+from twin.scene.backdrop import (
+    BACKDROP,
+    OPAQUE,
+    Backdrop,
+    backdrop_of,
+    directions_on_sphere,
+    read_backdrop,
+)
+from twin.scene.frames.rgbd import Target, TrainingView
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
+from twin.scene.render import render
+from twin.scene.settings import RenderConfig
+from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene
+
+CAMERA = Camera(width=64, height=48, fx=40.0, fy=40.0, cx=32.0, cy=24.0)
+RNG = np.random.default_rng(5)
+HEADINGS = (-3.1, -1.5, 0.0, 1.0, 3.1)
+
+
+def looking(heading_rad: float, tilt_rad: float = 0.0) -> np.ndarray:
+    """A level camera (z forwards, y down) turned about the vertical, then tilted down."""
+    R = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    T = np.eye(4)
+    T[:3, :3] = (
+        se3.rotation_from_vector(np.array([0, 0, heading_rad]))
+        @ se3.rotation_from_vector(np.array([0, tilt_rad, 0]))
+        @ R
+    )
+    return T
+
+
+def painted(directions: np.ndarray) -> np.ndarray:
+    """A colour for each direction, another one for each."""
+    return (directions + 1) / 2
+
+
+def shell() -> Backdrop:
+    rows, columns = 90, 180
+    down = (np.arange(rows)[:, None] + 0.5) / rows * np.pi
+    heading = ((np.arange(columns) + 0.5) / columns - 0.5) * 2 * np.pi
+    directions = np.stack(
+        np.broadcast_arrays(
+            np.sin(down) * np.cos(heading), np.sin(down) * np.sin(heading), np.cos(down)
+        ),
+        axis=-1,
+    )
+    colors = painted(directions).astype(np.float32)
+    return Backdrop(colors=colors, centre_m=np.zeros(3), radius_m=2.0)
+
+
+def nothing(alpha: float = 0.0) -> View:
+    shape = (CAMERA.height, CAMERA.width)
+    return View(
+        image=np.full((*shape, 3), 0.25, dtype=np.float32),
+        depth_m=np.zeros(shape, dtype=np.float32),
+        alpha=np.full(shape, alpha, dtype=np.float32),
+    )
+
+
+def test_rays_end_on_the_sphere_and_on_themselves() -> None:
+    rays, eye, centre = RNG.normal(size=(50, 3)), np.array([0.3, -0.2, 0.4]), np.array([0.1, 0, 0])
+    p = centre + 2.0 * directions_on_sphere(rays, eye, centre, 2.0)
+    np.testing.assert_allclose(np.linalg.norm(p - centre, axis=1), 2.0)
+    away = p - eye
+    cosines = np.sum(away * rays, axis=1) / np.linalg.norm(away, axis=1)
+    np.testing.assert_allclose(cosines, np.linalg.norm(rays, axis=1))
+    outside = directions_on_sphere(rays, np.array([5.0, 0, 0]), centre, 2.0)
+    np.testing.assert_allclose(outside, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("heading", HEADINGS)
+@pytest.mark.parametrize("tilt", [-1.2, 0.0, 0.7])
+def test_each_pixel_shows_the_shell_in_its_own_direction(heading: float, tilt: float) -> None:
+    T = looking(heading, tilt)
+    drawn = shell().behind(replace(nothing(), image=np.zeros((48, 64, 3), np.float32)), CAMERA, T)
+    rays = CAMERA.rays() @ T[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    np.testing.assert_allclose(drawn.image, painted(rays), atol=0.02)
+
+
+def test_a_nearer_eye_sees_the_same_place_of_the_shell() -> None:
+    """Two eyes that look at one point of the shell see one colour."""
+    target = np.array([0.0, 2.0, 0.0])
+    colors = []
+    for eye in (np.zeros(3), np.array([0.8, 0.5, 0.1])):
+        ray = target - eye
+        T = looking(
+            float(np.arctan2(ray[1], ray[0])), -float(np.arcsin(ray[2] / np.linalg.norm(ray)))
+        )
+        T[:3, 3] = eye
+        black = replace(nothing(), image=np.zeros((48, 64, 3), np.float32))
+        colors.append(shell().behind(black, CAMERA, T).image[23:25, 31:33].mean(axis=(0, 1)))
+    np.testing.assert_allclose(colors[0], painted(target / 2), atol=0.02)
+    np.testing.assert_allclose(colors[1], colors[0], atol=0.02)
+
+
+def test_what_is_drawn_keeps_its_bits_and_less_of_it_shows_more_of_the_shell() -> None:
+    for alpha in (OPAQUE, 0.99, 1.0):
+        view = nothing(alpha)
+        assert shell().behind(view, CAMERA, looking(0.0)).image is view.image
+    added = [
+        (shell().behind(nothing(alpha), CAMERA, looking(0.0)).image - 0.25).mean()
+        for alpha in (0.0, 0.3, 0.6, 0.8)
+    ]
+    assert (np.diff(added) < 0).all()
+    assert min(added) > 0
+    before = nothing(0.2)
+    after = shell().behind(before, CAMERA, looking(0.0))
+    assert after.depth_m is before.depth_m
+    assert after.alpha is before.alpha
+
+
+def seen_views(headings: tuple[float, ...]) -> list[TrainingView]:
+    views = []
+    for heading in headings:
+        T = looking(heading)
+        rays = CAMERA.rays() @ T[:3, :3].T
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        planes = np.rint(255 * np.moveaxis(painted(rays), -1, 0)).astype(np.uint8)
+        shape = planes.shape[1:]
+        target = Target(
+            camera=CAMERA,
+            planes_u8=planes,
+            depth_m=np.zeros(shape, dtype=np.float32),
+            static_mask=np.ones(shape, dtype=bool),
+        )
+        views.append(
+            TrainingView(camera_id="c", stamp_ns=0, T_base_color=T, half=target, full=target)
+        )
+    return views
+
+
+def empty_cloud() -> GaussianCloud:
+    return GaussianCloud(
+        means_m=np.zeros((0, 3), np.float32),
+        quats_wxyz=np.zeros((0, 4), np.float32),
+        scales_log=np.zeros((0, 3), np.float32),
+        opacities_logit=np.zeros(0, np.float32),
+        colors=np.zeros((0, 3), np.float32),
+    )
+
+
+def test_the_shell_shows_what_views_saw_and_goes_on_smoothly_where_none_looked() -> None:
+    views = seen_views((-3.0, -2.2, -1.4))
+    made = backdrop_of(empty_cloud(), views, Rasteriser(RasterConfig(threads=1)))
+    black = replace(nothing(), image=np.zeros((48, 64, 3), np.float32))
+    for view in views:
+        drawn = made.behind(black, CAMERA, view.T_base_color).image
+        np.testing.assert_allclose(
+            drawn, np.moveaxis(view.half.image(), 0, -1), atol=0.12
+        )  # a picture of 3.75 degrees a pixel
+    behind = made.behind(black, CAMERA, looking(1.0)).image
+    seen = np.concatenate([view.half.image().reshape(3, -1) for view in views], axis=1)
+    assert (behind >= seen.min(axis=1) - 0.01).all()
+    assert (behind <= seen.max(axis=1) + 0.01).all()
+    edge_rad = -1.4 + np.arctan(32 / 40)  # of the last view
+    beside = made.behind(black, CAMERA, looking(edge_rad + 0.1)).image[24, 32]
+    edge = painted(np.array([np.cos(edge_rad), np.sin(edge_rad), 0.0]))
+    np.testing.assert_allclose(beside, edge, atol=0.12)
+    assert np.abs(np.diff(behind, axis=1)).max() < 0.05
+
+
+def test_pixels_that_moved_say_nothing() -> None:
+    (view,) = seen_views((0.0,))
+    masked = view.half.planes_u8.copy()
+    masked[:, :, :32] = 255
+    static = np.ones(masked.shape[1:], dtype=bool)
+    static[:, :32] = False
+    target = replace(view.half, planes_u8=masked, static_mask=static)
+    made = backdrop_of(
+        empty_cloud(),
+        [replace(view, half=target, full=target)],
+        Rasteriser(RasterConfig(threads=1)),
+    )
+    assert made.colors.max() <= view.half.image()[:, :, 32:].max() + 0.01
+
+
+def test_it_comes_back_as_it_was_written_and_is_missing_without_harm(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    run.scene_dir.mkdir(parents=True)
+    about = shell().write(run.scene_dir)
+    back = read_backdrop(run, {"backdrop": about})
+    assert back is not None
+    np.testing.assert_allclose(back.colors, shell().colors, atol=0.5 / 255 + 1e-6)
+    assert back.radius_m == 2.0
+    assert read_backdrop(run, {}) is None
+    with pytest.raises(UnreadableSceneError, match="centre"):
+        read_backdrop(run, {"backdrop": {"radius_m": 1.0}})
+    (run.scene_dir / BACKDROP).unlink()
+    assert read_backdrop(run, {"backdrop": about}) is None
+
+
+def test_a_corner_that_nobody_saw_is_drawn_and_counts_as_unseen(room: RunFolder) -> None:
+    record = read_record(room)
+    assert record is not None
+    assert record["backdrop"]["radius_m"] > 0
+    away = read_scene(room).background.means_m.max(axis=0) + 0.05
+    out = room.results_dir / "corner.png"
+    config = RenderConfig(
+        eye=tuple(float(v) for v in away),
+        target=tuple(float(v) for v in 2 * away),
+        out=out,
+        depth=True,
+    )
+    render(room, config)
+    assert decode_color(out.read_bytes()).min() > 5
+    seen = decode_color(out.with_name("corner_seen.png").read_bytes())
+    depth = decode_color(out.with_name("corner_depth.png").read_bytes())
+    assert seen.max() == 0
+    assert depth.max() == 0
