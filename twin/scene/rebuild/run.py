@@ -128,19 +128,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     completed, guesses = _close_holes(training, fitted, config, models, output)
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    decomposed = decompose(
-        sources,
-        fitted.cloud,
-        training.choices,
-        training.views,
-        complete,
-        output,
-        config.initialise,
-    )
-    if decomposed.remark:
-        output.say(decomposed.remark)
-    decomposed = replace(decomposed, background=concatenate([decomposed.background, completed]))
+    decomposed = _take_apart(run, sources, training, fitted.cloud, completed, config, output)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("take_apart")
@@ -197,6 +185,25 @@ def _fit(
             checkpoint=kept,
             spent_s=time.monotonic() - began_s,
         )
+
+
+def _take_apart(
+    run: RunFolder,
+    sources: Sources,
+    training: TrainingSet,
+    cloud: GaussianCloud,
+    completed: GaussianCloud,
+    config: RebuildConfig,
+    output: Output,
+) -> Decomposition:
+    """Objects and background of what was fitted; what closes holes belongs to the background."""
+    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
+    found = decompose(
+        sources, cloud, training.choices, training.views, complete, output, config.initialise
+    )
+    if found.remark:
+        output.say(found.remark)
+    return replace(found, background=concatenate([found.background, completed]))
 
 
 def _close_holes(
