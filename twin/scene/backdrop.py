@@ -35,7 +35,7 @@ looks most like what stands before it where nothing else is known."""
 NEAR_RAD = 0.06
 """Colours of directions nearer than this are averaged; farther ones lose weight with the fourth
 power of the angle (Shepard 1968)."""
-OPAQUE = 0.9
+OPAQUE = 0.7
 """Pixels with this much drawn are left alone, however little is missing: the fit saw black there
 and has made up for it."""
 FADES = 0.4
