@@ -1,7 +1,7 @@
 """What cameras do not show of a solid box: steps along its edges, and where its weight lies.
 
 Stacks and crooked grasps depend on both. Of 40 stacks in laboratories that hide them 23 stay;
-with true edges as published 37 do, with true centres of mass 29 (docs/decisions/0018).
+with edges as published 37 do, with centres of mass as published 29 (docs/planning.md).
 """
 
 from dataclasses import dataclass
