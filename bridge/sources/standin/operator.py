@@ -203,7 +203,7 @@ PROBE_STREAM = 505
 PROBE_TRIES = 100
 """The object is put elsewhere until there is space for the probe."""
 LOOK_S = 0.9
-"""The arm waits at home before a plan, so that the start is seen at rest."""
+"""The arm waits at home before a plan at least this long, so that the start is seen at rest."""
 BETWEEN_S = 8.0
 """Putting the objects back takes a person about this long; nothing is published meanwhile."""
 STILL_S = 0.16
@@ -211,6 +211,18 @@ STILL_S = 0.16
 CONTROL_TIMEOUT_S = 300.0
 LISTED = 1000
 """As many episodes as a recorder lists at once."""
+
+
+def look_s(rate_hz: float) -> float:
+    """How long the arm waits before a plan: each camera sees all that lies still at least once.
+
+    An image counts only with some rest before and after it. A gate that has none waits for one,
+    and the cell's clock stands still meanwhile, so none would come.
+
+    Args:
+        rate_hz: Images per second of each camera; 0: none, and nobody looks.
+    """
+    return LOOK_S if rate_hz <= 0 else max(LOOK_S, 1 / rate_hz + 2 * STILL_S)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -403,7 +415,7 @@ class Operator:
         cell.reset(self.start_poses(info.start_seed or 0, treatment.name, retry=retry))
         self._begin(info)
         cell.cameras_running = True
-        cell.wait(LOOK_S)
+        cell.wait(look_s(cell.config.rate_hz))
         decision = self._decider.decide(info, seed)
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
@@ -443,7 +455,7 @@ class Operator:
         )
         self._begin(info)
         cell.cameras_running = True
-        cell.wait(LOOK_S)
+        cell.wait(look_s(cell.config.rate_hz))
         said = f"recorded from seed {config.seed}"
         try:
             if self._decider.sees_by_gate:  # the start was chosen by where things were declared

@@ -398,3 +398,29 @@ def test_a_session_that_fails_leaves_no_half_episode(
         ("start", None),
         ("stop", True),
     ]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 1.7, 5.0])
+def test_each_camera_sees_the_start_at_rest_before_a_plan_is_made(
+    make_session: Callable[..., Any], rate_hz: float
+) -> None:
+    """The cell's clock stands still while a gate looks: an image must be there by then."""
+    rest_ns = 40_000_000  # before and after an image that counts
+    session, _ = with_replanning(
+        make_session, lambda plan: verdict_record(plan, False), rounds=1, trials=4, rate_hz=rate_hz
+    )
+    stamps: dict[str, np.ndarray] = {
+        topic: np.array([item.source_ns for item in session.sent if item.topic == topic])
+        for topic in ("/standin/plan", "/standin/joint_states")
+    }
+    joints = stamps["/standin/joint_states"]
+    begins = joints[np.flatnonzero(np.diff(joints, prepend=0) > 1_000_000_000)]
+    plans = stamps["/standin/plan"]
+    assert len(plans) == 4
+    for camera in ("side", "wrist"):
+        topic = f"/standin/cam/{camera}/color/image"
+        images = np.array([item.source_ns for item in session.sent if item.topic == topic])
+        for plan_ns in plans:
+            begin_ns = begins[begins < plan_ns].max()
+            at_rest = (images >= begin_ns + rest_ns) & (images <= plan_ns - rest_ns)
+            assert at_rest.any(), (camera, rate_hz)
