@@ -137,11 +137,11 @@ def backdrop_of(
         views: At least one.
         rasteriser: How to draw.
     """
-    eyes = np.array([view.T_base_color[:3, 3] for view in views])
-    centre = np.median(eyes, axis=0)
+    centres = np.array([view.T_base_color[:3, 3] for view in views])
+    centre = np.median(centres, axis=0)
     away = np.linalg.norm(cloud.means_m - centre, axis=1)
     reach = max(float(np.quantile(away, 0.995)) if len(away) else 1.0, 1e-3)
-    radius = MARGIN * max(reach, float(np.linalg.norm(eyes - centre, axis=1).max()))
+    radius = MARGIN * max(reach, float(np.linalg.norm(centres - centre, axis=1).max()))
     total, weights = np.zeros((ROWS * COLUMNS, 3)), np.zeros(ROWS * COLUMNS)
     for view in views:
         target, T = view.half, view.T_base_color

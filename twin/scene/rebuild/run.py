@@ -128,7 +128,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     completed, guesses = _close_holes(training, fitted, config, models, output)
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    decomposed = _take_apart(run, sources, training, fitted.cloud, completed, config, output)
+    decomposed = _decompose(run, sources, training, fitted.cloud, completed, config, output)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("take_apart")
@@ -187,7 +187,7 @@ def _fit(
         )
 
 
-def _take_apart(
+def _decompose(
     run: RunFolder,
     sources: Sources,
     training: TrainingSet,
