@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-from cyclopts import App
+from cyclopts import App, Parameter
 from cyclopts.config import Toml
 from rich.console import Console
 
@@ -28,6 +28,9 @@ RESUMED = ("demo", "trials", "rebuild", "replay", "evaluate")
 EPISODES, PUBLISH = "bridge.cli.episodes", "bridge.cli.publish"
 TASKS = "bridge.cli.tasks"
 RECORDING, EXCHANGE = "bridge.cli.recording", "bridge.cli.exchange"
+
+LISTS = Parameter(consume_multiple=True, negative_iterable="")
+"""``--policies nominal loose`` and ``--policies nominal --policies loose`` say the same."""
 
 Command = tuple[str, str, str, str]
 """Name, function, what it does, and an example of what follows its name."""
@@ -308,6 +311,7 @@ def build_app() -> App:
         suppress_keyboard_interrupt=False,
         console=Console(),
         error_console=Console(stderr=True),
+        default_parameter=LISTS,
     )
     for name, target, text, example in COMMANDS:
         app.command(target, name=name, help=_help(text, f"{name} {example}"))

@@ -66,7 +66,7 @@ def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTP
 
     Example: robot-gst trials runs/study --task cube_into_box --trials 20
     With a coin in the gate's place too:
-    robot-gst trials runs/study --arms without --arms with --arms control --coin 0.4
+    robot-gst trials runs/study --arms without with control --coin 0.4
 
     Args:
         run: Run folder; made where needed. The same command again goes on where it was stopped.

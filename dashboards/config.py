@@ -53,7 +53,7 @@ SHARE_LIMITS = {"max_mb": (0.01, 20.0), "before_s": (0.0, 30.0), "after_s": (0.0
 class ShareConfig:
     """Which trials go into one file, and how large it may be."""
 
-    trials: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    trials: tuple[str, ...] = ()
     """Ids of trials; without any the worst disagreements, else the worst failures."""
     out: Path | None = None
     """File to write; RUN/results/shared/trials.html, which the report then names, without it."""

@@ -44,6 +44,15 @@ def test_an_unknown_command_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> 
     assert "fly" in capsys.readouterr().err
 
 
+def test_a_list_of_an_option_is_one_option_or_several() -> None:
+    once = ["trials", "r", "--policies", "nominal", "loose", "--arms", "without", "--trials", "2"]
+    each = ["trials", "r", "--arms", "without", "--policies", "nominal", "--policies", "loose"]
+    _, together, _ = robot_gst.build_app().parse_args(once)
+    _, repeated, _ = robot_gst.build_app().parse_args([*each, "--trials", "2"])
+    assert together.arguments == repeated.arguments
+    assert together.arguments["config"].policies == ("nominal", "loose")
+
+
 def test_a_broken_episode_fails_the_check(run_path: Path) -> None:
     (run_path / "episodes" / "bad.mcap").write_bytes(b"\x89MCAP0\r\nrest")
     assert robot_gst.run(["check", str(run_path)]) == 1

@@ -305,7 +305,7 @@ class RenderConfig:
     """Stand here instead, in metres in the scene's frame; needs --target."""
     target: tuple[float, float, float] | None = None
     """Look at this point, in metres in the scene's frame."""
-    joints: Annotated[tuple[float, ...] | None, Parameter(consume_multiple=True)] = None
+    joints: tuple[float, ...] | None = None
     """Put the arm into this posture, one angle in rad for each joint from base to flange; a camera
     in its hand comes along. Default: as recorded at --at-s."""
     width_m: float | None = None

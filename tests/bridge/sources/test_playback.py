@@ -254,7 +254,7 @@ def test_a_loop_goes_on_until_it_is_stopped_and_counts_on(path: Path, heard: Hea
 
 
 def test_a_paused_playback_begins_when_it_is_told_to(path: Path, heard: Heard) -> None:
-    # Slow, 2.4 s in all: its session ends with the last message, and the answer has to leave before.
+    # Slow, 2.4 s: its session ends with the last message, and the answer has to leave before.
     config = PlaybackConfig(rate=0.05, topics=("/lab/joint_states",), paused=True, name="p1")
     source = EpisodeSource(path, config)
     player = threading.Thread(target=lambda: play(source, heard))
