@@ -128,8 +128,25 @@ def _above(
     return bool(over.any())
 
 
+STILL_S = 0.16
+"""The arm rests this long at a viewpoint before the picture."""
+
+
+def wait_s(least_s: float, rate_hz: float) -> float:
+    """How long the arm waits: each camera sees all that lies still at least once.
+
+    An image counts only with some rest before and after it. A gate that has none waits for one,
+    and the cell's clock stands still meanwhile, so none would come.
+
+    Args:
+        least_s: At least this long.
+        rate_hz: Images per second of each camera; 0: none, and nobody looks.
+    """
+    return least_s if rate_hz <= 0 else max(least_s, 1 / rate_hz + 2 * STILL_S)
+
+
 SETTLE_S = 0.8
-"""The arm waits after a plan, so that the final state is seen at rest."""
+"""The arm waits after a plan at least this long, so that the final state is seen at rest."""
 
 
 def execute_plan(cell: StandinCell, plan: Plan) -> None:
@@ -165,7 +182,7 @@ def execute_plan(cell: StandinCell, plan: Plan) -> None:
         cell.follow(times[first : last + 1] - times[first], joints[first : last + 1])
     _end_stage(cell, plan, stage_id)
     streams.event("execution_ended", cell.now_ns, plan_id=plan.id)
-    cell.wait(SETTLE_S)
+    cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
 
 
 def _end_stage(cell: StandinCell, plan: Plan, stage_id: str | None) -> None:
@@ -206,23 +223,9 @@ LOOK_S = 0.9
 """The arm waits at home before a plan at least this long, so that the start is seen at rest."""
 BETWEEN_S = 8.0
 """Putting the objects back takes a person about this long; nothing is published meanwhile."""
-STILL_S = 0.16
-"""The arm rests this long at a viewpoint before the picture."""
 CONTROL_TIMEOUT_S = 300.0
 LISTED = 1000
 """As many episodes as a recorder lists at once."""
-
-
-def look_s(rate_hz: float) -> float:
-    """How long the arm waits before a plan: each camera sees all that lies still at least once.
-
-    An image counts only with some rest before and after it. A gate that has none waits for one,
-    and the cell's clock stands still meanwhile, so none would come.
-
-    Args:
-        rate_hz: Images per second of each camera; 0: none, and nobody looks.
-    """
-    return LOOK_S if rate_hz <= 0 else max(LOOK_S, 1 / rate_hz + 2 * STILL_S)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -415,12 +418,12 @@ class Operator:
         cell.reset(self.start_poses(info.start_seed or 0, treatment.name, retry=retry))
         self._begin(info)
         cell.cameras_running = True
-        cell.wait(look_s(cell.config.rate_hz))
+        cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
         decision = self._decider.decide(info, seed)
         if decision.plan is not None:
             execute_plan(cell, decision.plan)
         else:
-            cell.wait(LOOK_S)
+            cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
         if decision.void and not treatment.study_arm:
             outcome = void_trial(cell.task, decision.remark)
         else:
@@ -455,7 +458,7 @@ class Operator:
         )
         self._begin(info)
         cell.cameras_running = True
-        cell.wait(look_s(cell.config.rate_hz))
+        cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
         said = f"recorded from seed {config.seed}"
         try:
             if self._decider.sees_by_gate:  # the start was chosen by where things were declared

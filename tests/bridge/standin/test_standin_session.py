@@ -424,3 +424,25 @@ def test_each_camera_sees_the_start_at_rest_before_a_plan_is_made(
             begin_ns = begins[begins < plan_ns].max()
             at_rest = (images >= begin_ns + rest_ns) & (images <= plan_ns - rest_ns)
             assert at_rest.any(), (camera, rate_hz)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 1.7, 5.0])
+def test_each_camera_sees_what_an_execution_left_at_rest(
+    make_session: Callable[..., Any], rate_hz: float
+) -> None:
+    rest_ns = 40_000_000
+    session, _ = with_replanning(
+        make_session, lambda plan: verdict_record(plan, True), trials=2, rate_hz=rate_hz
+    )
+    ends = [
+        (event["stamp_ns"], event["type"])
+        for event in session.events()
+        if event["type"] in ("execution_ended", "label")
+    ]
+    assert [kind for _, kind in ends] == ["execution_ended", "label"] * 2
+    for camera in ("side", "wrist"):
+        topic = f"/standin/cam/{camera}/color/image"
+        images = np.array([item.source_ns for item in session.sent if item.topic == topic])
+        for (still_ns, _), (over_ns, _) in zip(ends[::2], ends[1::2], strict=True):
+            at_rest = (images >= still_ns + rest_ns) & (images <= over_ns - rest_ns)
+            assert at_rest.any(), (camera, rate_hz)
