@@ -195,6 +195,27 @@ def test_a_yes_that_knows_less_than_a_scene_could_tell_says_what_is_missing(
     assert said.reason == said.warnings[0]
 
 
+@pytest.mark.parametrize("now", ["abc", None])
+def test_a_plan_of_a_scene_that_was_rebuilt_since_gets_no_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now: str | None
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    if now is not None:
+        run.scene_dir.mkdir(exist_ok=True)
+        record = {"schema_version": 1, "key": "k", "scene_hash": now, "background": {},
+                  "sources": [], "views": []}  # fmt: skip
+        (run.scene_dir / "scene.json").write_text(json.dumps(record))
+    asked = accepting(monkeypatch)
+    question = question_of(run)
+    stale = replace(question, plan=replace(question.plan, scene_hash="0ld5cene"))
+    said = f"plan p was made in scene 0ld5cene; the run now has {now or 'none'}. Start its planner"
+    with pytest.raises(UndecidedError, match=said):
+        answer(stale)
+    assert not asked
+    fresh = replace(question, plan=replace(question.plan, scene_hash=now))
+    assert answer(fresh).accepted is True
+
+
 def test_a_yes_that_the_audit_does_not_confirm_is_null_with_both_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
