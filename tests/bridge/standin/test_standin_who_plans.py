@@ -160,7 +160,7 @@ def stale(answer: Answer) -> Answer:
     ("bad", "words", "result"),
     [
         (lambda good: None, "no planner answers on standin/plan: nobody answered", "unknown"),
-        (lambda good: lambda request: b"nonsense", "no planner answers", "unknown"),
+        (lambda good: lambda request: b"nonsense", "with a plan or a reason", "unknown"),
         (stale, "another scene: it has cube 20.000 mm", "failure"),
         (
             lambda good: lambda request: PlanAnswer(reason="out of reach").to_json(),
