@@ -138,7 +138,8 @@ class Goals:
             )
             raise GroundingError("impossible", message, candidates=[support])
         if not things[object_id].movable:
-            message = f"{told} is fixed: nothing can move it."
+            movable = ", ".join(self.vocabulary.movable()) or "nothing here"
+            message = f"{told} is fixed: nothing can move it. What can be moved: {movable}."
             raise GroundingError("fixed_object", message, candidates=[object_id])
 
     def merged(self) -> list[dict[str, Any]]:
@@ -177,7 +178,7 @@ class Goals:
             or any(len(found - {""}) > 1 for found in sides.values())
         ):
             told = "; ".join(describe_predicate(goal) for goal in goals)
-            message = f"{key} cannot end as asked, all at once: {told}."
+            message = f"{key} cannot end as asked, all at once: {told}. Leave one of them out."
             raise GroundingError("contradiction", message, candidates=[key])
 
     def _joined(self, key: str, ways: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -218,7 +219,10 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
     relations = {key: set(values) for key, values in before.items()}
     if _sorted(names, relations) is None:
         circle = _circle(names, relations)
-        message = f"{', '.join(circle)} each wait for another to be in place first."
+        message = (
+            f"{', '.join(circle)} each wait for another to be in place first. Let one of them stay "
+            "where it is."
+        )
         raise GroundingError("cyclic", message, candidates=circle)
     for first, second in goals.edges:
         for later in goals.steps[second]:

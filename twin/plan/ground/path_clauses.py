@@ -171,7 +171,10 @@ class PathReader:
         key, behind = named
         if meaning == "not over":
             if key == destination:
-                message = f"{', '.join(themes)} cannot get to {key} without passing over it."
+                message = (
+                    f"{', '.join(themes)} cannot get to {key} without passing over it. Leave that "
+                    "out."
+                )
                 raise GroundingError("contradiction", message, candidates=[key])
             over = {"kind": "keepout", "region": {"over": key}}
             return self._limits(over, f"not over {key}", behind, themes, until=False)

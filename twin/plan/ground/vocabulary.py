@@ -43,6 +43,8 @@ KINDS = (
     "unsupported_verb",
 )
 """Why an instruction is not planned."""
+AT_FAULT = ("contradiction", "cyclic", "fixed_object")
+"""Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
 PARTS_OF_KIND = {
     "container": ("rim", "floor", "walls"),
     "animal": ("body", "head", "limbs"),
@@ -57,11 +59,12 @@ class GroundingError(TwinError):
     exit_code = 2
 
     def __init__(self, kind: str, message: str, *, candidates: Iterable[str] = ()) -> None:
-        """Remember the kind, one of ``KINDS``, and the ids of what could be meant."""
+        """Remember the kind, one of ``KINDS``, and ids of what could be meant, or is at fault."""
         self.kind = kind
         self.candidates = tuple(candidates)
         self.found = message
-        listed = f" There is: {', '.join(self.candidates)}." if self.candidates else ""
+        choices = () if kind in AT_FAULT else self.candidates
+        listed = f" There is: {', '.join(choices)}." if choices else ""
         super().__init__(f"{message}{listed}")
 
 

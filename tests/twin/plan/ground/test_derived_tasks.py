@@ -268,6 +268,8 @@ def test_objects_that_only_another_task_shows_are_no_part_of_the_derived_one(
     [
         ("put the green cube into the box", "no green cube here. There is: cube"),
         ("   ", "the instruction is empty"),
+        ("put the box onto the cube", "nothing can move it. What can be moved: cube.\n"),
+        ("put the cube into the box and take it out of the box", "Leave one of them out.\n"),
         ("juggle the cube", "nothing this robot can do"),
         ("put the cube into the box; $(reboot)", "not understood"),
         ("no_such_task", "no task named"),
