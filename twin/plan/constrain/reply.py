@@ -94,9 +94,7 @@ def parse_strictly(text: str | bytes) -> Any:
             plain,
             parse_constant=Unreadable,
             parse_float=_float,
-            parse_int=lambda digits: (
-                int(digits) if len(digits) <= _MOST_DIGITS else Unreadable(digits)
-            ),
+            parse_int=_int,
             object_pairs_hook=_object,
         )
     except ValueError as error:
