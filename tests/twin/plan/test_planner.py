@@ -15,8 +15,9 @@ from bridge.task.verdict import Factor, Verdict
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.loop.nominal import LOOSE, NOMINAL, SINGLE, PlanProposer, Policy
 from twin.plan.loop.places import places_on_table
-from twin.plan.loop.propose import NoPlanError, choose
+from twin.plan.loop.propose import NoPlanError, Proposer, choose
 from twin.plan.loop.steer import tried_in
+from twin.plan.loop.straight import GeometricProposer
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import shapes_of
 from twin.replay.config import ReplayConfig
@@ -141,6 +142,46 @@ def test_what_was_not_localised_is_not_planned(problem: Problem) -> None:
     lost = replace(problem, scene=replace(problem.scene, Ts_base_object=Ts))
     with pytest.raises(NoPlanError, match="cube of task cube_into_box was not localised"):
         PlanProposer().propose(lost, plan_id="p", seed=0, count=1, steer=None)
+
+
+@pytest.mark.parametrize("verb", ["grasp", "release"])
+@pytest.mark.parametrize("proposer", [PlanProposer(SINGLE), GeometricProposer()])
+def test_an_object_without_its_stages_is_named_with_what_to_add(
+    problem: Problem, proposer: Proposer, verb: str
+) -> None:
+    """The task file check lets it pass: whoever only records needs no such stage."""
+    task = problem.scene.task
+    stages = tuple({k: v for k, v in table.items() if k != verb} for table in task.stages)
+    odd = replace(problem, scene=replace(problem.scene, task=replace(task, stages=stages)))
+    with pytest.raises(NoPlanError, match=f'moves cube, and no stage says {verb} = "cube". Add'):
+        proposer.propose(odd, plan_id="p", seed=0, count=1, steer=None)
+
+
+@pytest.mark.parametrize(
+    ("name", "p_m", "said", "to_do"),
+    [
+        ("cube", (0.42, 0.19, 0.02), "no path for 'lift': refused: cube and box", "Move apart"),
+        ("box", (0.75, 0.75, 0.0), "no joints reach the release pose", "nearer to the arm"),
+    ],
+)
+def test_where_nothing_moves_the_message_says_what_to_do(
+    problem: Problem, name: str, p_m: tuple[float, float, float], said: str, to_do: str
+) -> None:
+    T = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array(p_m))
+    Ts = {**problem.scene.Ts_base_object, name: T}
+    odd = replace(problem, scene=replace(problem.scene, Ts_base_object=Ts))
+    with pytest.raises(NoPlanError, match=said) as caught:
+        PlanProposer(SINGLE).propose(odd, plan_id="p", seed=0, count=1, steer=None)
+    assert to_do in str(caught.value)
+
+
+def test_a_hand_that_is_closed_at_the_start_is_told_to_open_at_once(problem: Problem) -> None:
+    """Nobody tells the planner how wide the hand stands: it is open all the way to the grasp."""
+    plan = chosen(problem, 0)
+    closing = next(i for i, waypoint in enumerate(plan.tau) if waypoint.g == 1)
+    (grasp,) = (each for each in plan.grasps if each.chosen)
+    assert plan.tau[0].t_ns == 0
+    assert all(w.g == 0 and (w.width_m or 0.0) > grasp.width_m for w in plan.tau[:closing])
 
 
 def test_places_on_the_table_satisfy_what_is_asked(problem: Problem) -> None:

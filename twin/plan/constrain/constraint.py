@@ -17,7 +17,8 @@ Measure = Callable[[State], Array]
 """A number of each state, ``(num_states,)``."""
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
 """How much of a unit weighs as much as 1 cm."""
-_SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "m/s": (1e3, "mm/s")}
+SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "m/s": (1e3, "mm/s")}
+"""By unit: what a number of it is multiplied by for a person, and what it then is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ class Term:
 
     def sentence(self, state: State) -> str:
         """What is measured in the first state, what is wanted, and by how much it misses."""
-        factor, unit = _SHOWN[self.unit]
+        factor, unit = SHOWN[self.unit]
         value = float(self.measure(state)[0]) * factor
         low, high = self.low * factor + 0.0, self.high * factor + 0.0  # never -0
         if np.isneginf(low):

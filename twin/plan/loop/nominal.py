@@ -17,19 +17,39 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.check import TABLE, nearest
 from bridge.task.plan import Plan
-from twin.plan.constrain.constraint import Constraint, flattened, violated, worst_along
+from twin.plan.constrain.constraint import (
+    SHOWN,
+    Constraint,
+    flattened,
+    violated,
+    worst_along,
+)
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import lying_there, places_on_table
-from twin.plan.loop.propose import Candidate, NoPlanError
+from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.steer import Steer
 from twin.plan.loop.straight import GeometricProposer
-from twin.plan.loop.tau import Trajectory, candidate_grasp, goals_of, plan_stage, stages_of
-from twin.plan.path.planner import START_TOUCHES, NoPathError, PathConfig, plan_move
+from twin.plan.loop.tau import (
+    Trajectory,
+    candidate_grasp,
+    goals_of,
+    plan_stage,
+    refuse_without_stages,
+    stages_of,
+)
+from twin.plan.path.planner import (
+    BUDGET_SPENT,
+    START_TOUCHES,
+    NoPathError,
+    PathConfig,
+    plan_move,
+)
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
 from twin.plan.release.resting import NoFinalStateError
+from twin.replay.clearance.bodies import SCENE
 from twin.replay.config import ReplayConfig
 from twin.robot.config import IkConfig
 
@@ -139,9 +159,8 @@ class PlanProposer:
             NoPlanError: There is none; the message says what is in the way.
         """
         task = problem.scene.task
-        if lost := problem.scene.missing():
-            message = f"{', '.join(lost)} of task {task.name} was not localised."
-            raise NoPlanError(f"{message} {problem.scene.describe_missing()}")
+        refuse_lost(problem.scene)
+        refuse_without_stages(task)
         if any(table.get("push") for table in task.stages):
             return self._pushed(problem, plan_id=plan_id, seed=seed, count=count, steer=steer)
         search = _Search(problem, self._policy, seed, steer)
@@ -150,7 +169,7 @@ class PlanProposer:
             try:
                 plan, remarks = _plan_of(problem, transfers, self._policy, plan_id, seed)
             except NoPathError as error:
-                search.why = str(error)
+                search.why = f"{error}."
                 continue
             cost = sum(each.cost for each in transfers)
             found.append(Candidate(plan=plan, rank=len(found), cost=cost, remarks=remarks))
@@ -238,12 +257,7 @@ class _Search:
                 try:
                     transfer = self._moved(problem, grasp, release, start_rad, options)
                 except NoPathError as error:
-                    self.why = f"{key}: {error}"
-                    if error.reason == START_TOUCHES and error.leg == "around":
-                        self.why = (
-                            f"the arm starts in collision: {' touches '.join(error.bodies)}. Move "
-                            "it clear, and record the start again: robot-gst record RUN."
-                        )
+                    self.why = _explained(problem, key, error)
                     if error.leg in _OF_GRASP:
                         options.give_up(grasp)
                     continue
@@ -303,6 +317,27 @@ class _Search:
         if failure is None:
             raise NoPathError(reason="unreachable", detail="no way is tried")
         raise failure
+
+
+def _explained(problem: Problem, key: str, error: NoPathError) -> str:
+    """Why an object cannot be moved so, and what would help."""
+    if error.reason == START_TOUCHES and error.leg == "around":
+        return (
+            f"the arm starts in collision: {' touches '.join(error.bodies)}. Move it clear, and "
+            "record the start again: robot-gst record RUN."
+        )
+    around = {*problem.scene.task.objects, TABLE, SCENE}
+    if error.reason == NOT_KEPT:
+        hint = "Ask less of the way, or put the objects elsewhere."
+    elif error.reason == BUDGET_SPENT:
+        hint = "Clear the way from where it lies to where it goes."
+    elif not error.bodies:
+        hint = "Move the object, or where it goes, nearer to the arm."
+    elif around.isdisjoint(error.bodies):
+        hint = "The arm is in its own way: move the object, or where it goes."
+    else:
+        hint = "Move apart what touches, or put the objects elsewhere."
+    return f"{key}: {error}. {hint}"
 
 
 def _miss_probability(margin: float) -> float:
@@ -524,7 +559,8 @@ def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...
             for constraint, worst in asked:
                 f = float(worst[0])
                 if f > 0:
-                    detail = f"{constraint.kind} is violated by {f:.3g} {constraint.unit}"
+                    factor, unit = SHOWN[constraint.unit]
+                    detail = f"{constraint.kind} is violated by {f * factor:.3g} {unit}"
                     error = NoPathError(reason=NOT_KEPT, detail=detail)
                     error.leg = leg.name
                     raise error

@@ -83,7 +83,10 @@ def places_on_table(
             T_base_tcp=Ts[best : best + 1],
             width_m=np.zeros(1),
         )
-        message = f"no free place on the table fits {key}. In the best one {worst.explain(one)}."
+        message = (
+            f"no free place on the table fits {key}. In the best one {worst.explain(one)}. Clear "
+            "the table there, or ask for less."
+        )
         raise NoFinalStateError(cause="no_free_pose", message=message)
     fits = np.flatnonzero(total <= 0)
     slack = np.minimum(-excess[:, fits].max(axis=0), 1.0)

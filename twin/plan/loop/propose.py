@@ -10,6 +10,7 @@ from bridge.task.verdict import Verdict
 from twin.errors import TwinError
 from twin.plan.loop.steer import Steer, steer_by
 from twin.plan.problem import Problem
+from twin.replay.scene import ReplayScene
 
 
 class NoPlanError(TwinError):
@@ -50,6 +51,24 @@ class Proposer(Protocol):
         """
 
 
+def refuse_lost(scene: ReplayScene) -> None:
+    """Refuse to plan around objects that nobody knows the place of.
+
+    Args:
+        scene: With the reasons, where they are known.
+
+    Raises:
+        NoPlanError: Naming them.
+    """
+    if lost := scene.missing():
+        reasons = [f"{name}: {scene.reasons[name]}" for name in lost if name in scene.reasons]
+        why = f" ({'; '.join(reasons)})" if reasons else ""
+        raise NoPlanError(
+            f"{', '.join(lost)} of task {scene.task.name} was not localised{why}. Show it to the "
+            "cameras and look again."
+        )
+
+
 def choose(
     proposer: Proposer,
     problem: Problem,
@@ -77,7 +96,10 @@ def choose(
     if not refused:
         ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
         if round_ >= len(ranked):
-            raise NoPlanError(f"there are {len(ranked)} candidates, and {round_} were tried.")
+            raise NoPlanError(
+                f"there are {len(ranked)} candidates, and {round_} were tried. Ask for fewer "
+                "rounds, or begin from another start."
+            )
         return named(ranked[round_], problem, seed=seed)
     steer = steer_by(refused, problem.scene.task, fingers_of(problem))
     known = [refusal.plan.tau for refusal in refused]
@@ -100,7 +122,9 @@ def choose(
     if fresh := fresh_of(None, (len(refused) + 1, most + len(refused))):
         remark = f"nothing else answers {steer.clause}: the next by rank"
         return named(replace(fresh, remarks=(*fresh.remarks, remark)), problem, seed=seed)
-    raise NoPlanError(f"every candidate was refused, the last by {steer.clause}.")
+    raise NoPlanError(
+        f"every candidate was refused, the last by {steer.clause}. Begin from another start."
+    )
 
 
 def _fresh(candidates: Iterable[Candidate], known: Collection[object]) -> Candidate | None:

@@ -15,9 +15,9 @@ from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import ObjectModel, Task
-from twin.plan.loop.propose import Candidate, NoPlanError
+from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.steer import Steer
-from twin.plan.loop.tau import plan_stage, stages_of
+from twin.plan.loop.tau import plan_stage, refuse_without_stages, stages_of
 from twin.plan.problem import Problem
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -42,6 +42,7 @@ PUSH_SPEED_M_S, RAMP_S, PUSH_STEP_S = 0.1, 0.12, 0.02
 """Of a push whose task says no speed; time to reach it and to stop; between its waypoints."""
 ASIDE_M = (0.0, 0.012, -0.012)
 """Along the pads, where a grasp may be elsewhere than the task says."""
+_OTHER_POLICY = "Take another policy, such as nominal."
 RELEASES_M = ((0.0, 0.0), (0.015, 0.0), (-0.015, 0.0), (0.0, 0.015), (0.0, -0.015))
 
 
@@ -139,8 +140,8 @@ def _was_refused(problem: Problem, choice: _Choice, steer: Steer) -> bool:
 def _plan(problem: Problem, choice: _Choice, plan_id: str) -> Plan:
     scene, robot = problem.scene, problem.robot
     task, record = scene.task, robot.record
-    if lost := scene.missing():
-        raise NoPlanError(f"{', '.join(lost)} of task {task.name} was not localised.")
+    refuse_lost(scene)
+    refuse_without_stages(task)
     start_rad = robot.home_rad if scene.start_rad is None else scene.start_rad
     T_home = robot.T_base_tcp(start_rad)
     there = dict(scene.Ts_base_object)
@@ -204,10 +205,16 @@ def _release(
     task = problem.scene.task
     goal = task.goal_of(key)
     if goal is None:
-        raise NoPlanError(f"no predicate of task {task.name} says what {key} belongs in or on.")
+        raise NoPlanError(
+            f"no predicate of task {task.name} says what {key} belongs in or on, and the policy "
+            f"{POLICY} knows no other place. {_OTHER_POLICY}"
+        )
     relation, target_id = goal
     if relation not in ("inside", "on") or target_id not in task.objects:
-        raise NoPlanError(f"the policy {POLICY} puts things into or onto others, not {relation!r}.")
+        raise NoPlanError(
+            f"the policy {POLICY} puts things into or onto others, and task {task.name} wants "
+            f"{key} {relation} {target_id}. {_OTHER_POLICY}"
+        )
     target, T_target = task.objects[target_id], there[target_id]
     model = task.objects[key]
     top_m = float(T_target[2, 3]) + target.size_m[2] - target.rest_height_m
@@ -230,8 +237,6 @@ def _legs(
     """The movements for one object; ``there`` then has it where it comes to lie."""
     task = problem.scene.task
     ids = stages_of(task, key)
-    if not {"grasp", "release"} <= ids.keys():
-        raise NoPlanError(f"no stage of task {task.name} grasps {key}, or none releases it.")
     grasp = _grasp(task.objects[key], there[key], choice)
     lies, low = _release(problem, key, there[key], grasp, choice, there)
     there[key] = lies
@@ -258,14 +263,20 @@ def _push_legs(
     task, T = problem.scene.task, there[key]
     mark = task.mark_of(key)
     if mark is None:
-        raise NoPlanError(f"nothing in task {task.name} says where {key} is to be pushed.")
+        raise NoPlanError(
+            f"nothing in task {task.name} says where {key} is to be pushed. Add a success "
+            "predicate moved with target_m to the task file (docs/tasks.md)."
+        )
     stage = stages_of(task, key)["push"]
     table = next(each for each in task.stages if each["id"] == stage)
     to = np.array(mark) + np.array(choice.release_m)
     way = to - T[:2, 3]
     far_m = float(np.linalg.norm(way))
     if far_m < PUSH_GAP_M:
-        raise NoPlanError(f"{key} lies {far_m * 1e3:.0f} mm from its mark: too near to be pushed.")
+        raise NoPlanError(
+            f"{key} lies {far_m * 1e3:.0f} mm from its mark, too near to be pushed: at least "
+            f"{PUSH_GAP_M * 1e3:.0f} mm are needed. Put it farther away."
+        )
     along = way / far_m
     half = np.array(task.objects[key].size_m[:2]) / 2
     local = np.abs(T[:2, :2].T @ along)
@@ -325,7 +336,8 @@ def _followed(
             if not solution.reached or np.abs(solution.joints_rad - joints).max() > 0.3:
                 x, y, z = pose[:3, 3]
                 raise NoPlanError(
-                    f"the arm cannot follow to ({x:.3f}, {y:.3f}, {z:.3f}) m in stage {leg.stage}."
+                    f"the arm cannot follow to ({x:.3f}, {y:.3f}, {z:.3f}) m in stage "
+                    f"{leg.stage}. Move the object, or where it goes, nearer to the arm."
                 )
             joints = solution.joints_rad
             tau.append(_waypoint(t_s + float(share) * seconds, pose, leg.g, joints))

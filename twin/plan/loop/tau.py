@@ -11,6 +11,7 @@ from bridge.geometry import se3
 from bridge.task.plan import CandidateGrasp, Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.relations import constraint_of
+from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import waypoints_of
 from twin.plan.path.transfer import Leg
 from twin.plan.problem import Grasp
@@ -100,6 +101,25 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
         for verb in ("grasp", "carry", "release", "push")
         if table.get(verb) == key
     }
+
+
+def refuse_without_stages(task: Task) -> None:
+    """Refuse a task that moves something without saying in which stages.
+
+    Args:
+        task: Each object that it moves is pushed, or grasped and released.
+
+    Raises:
+        NoPlanError: Naming the object and what is missing.
+    """
+    for key in task.manipulated:
+        verbs = stages_of(task, key).keys()
+        lacking = [verb for verb in ("grasp", "release") if verb not in verbs]
+        if "push" not in verbs and lacking:
+            raise NoPlanError(
+                f"task {task.name} moves {key}, and no stage says {' or '.join(lacking)} = "
+                f'"{key}". Add it to the task file (docs/tasks.md).'
+            )
 
 
 def plan_stage(

@@ -25,11 +25,11 @@ from twin.replay.config import ReplayConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
-START_TOUCHES = "start touches"
+START_TOUCHES, BUDGET_SPENT = "start touches", "budget spent"
 REASONS = {
     1: START_TOUCHES,
     2: "goal touches",
-    3: "budget spent",
+    3: BUDGET_SPENT,
     4: "outside the joint limits",
 }
 """Why a search ends without a path, by the native search's number."""

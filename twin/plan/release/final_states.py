@@ -22,7 +22,7 @@ from bridge.errors import refuse_outside
 from bridge.geometry import se3
 from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.bodies import surface_points
-from twin.plan.constrain.constraint import Constraint
+from twin.plan.constrain.constraint import SHOWN, Constraint
 from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.obstacles import (
     allowed_with,
@@ -297,7 +297,7 @@ class ReleaseSearch:
         return [
             Term(name=f"{name} within {target.name}", violation=beyond),
             Term(name=f"{name} a little above {target.name}", violation=off_height),
-            Term(name=f"{name} level", violation=leaning, scale=ANGLE_RAD),
+            Term(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
         ]
 
     def answer(
@@ -316,15 +316,15 @@ class ReleaseSearch:
         config = self._config
         settings = config.solver()
         solved: list[tuple[StageProblem, StageCandidate]] = []
-        nearest: list[StageCandidate] = []
+        nearest: list[tuple[StageProblem, StageCandidate]] = []
         states = 0
         for stage in stages:
             solution = solve(stage, settings, seed=seed)
             solved += [(stage, candidate) for candidate in solution.candidates]
-            nearest.append(solution.nearest)
+            nearest.append((stage, solution.nearest))
             states += solution.work["states"]
         if not solved:
-            raise self._nothing(min(nearest, key=lambda candidate: candidate.cost))
+            raise self._nothing(*min(nearest, key=lambda pair: pair[1].cost))
         solved.sort(key=lambda pair: pair[1].cost)
         Ts = [candidate.T_base_tcp[None] for _, candidate in solved]
         costs = [np.array([candidate.cost]) for _, candidate in solved]
@@ -401,15 +401,31 @@ class ReleaseSearch:
             *([gripper, name] for name, allowed in touched if allowed),
         ]
 
-    def _nothing(self, nearest: StageCandidate) -> NoFinalStateError:
+    def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
         """Say what was in the way where the least was."""
-        wrong = {name: f for name, f in nearest.violations.items() if f > 0}
-        told = "; ".join(f"{name}: by {f * 1e3:.1f} mm" for name, f in wrong.items())
-        return NoFinalStateError(
-            cause="no_free_pose",
-            message=f"no final state of {self._grasp.object_id} was found. In the best one this "
-            f"does not hold: {told or 'nothing stands out'}.",
+        told = "; ".join(
+            f"{name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
+            for (name, f), term in zip(nearest.violations.items(), stage.terms, strict=True)
+            if f > 0
         )
+        near = ", ".join(self._in_the_way(nearest.T_base_tcp))
+        message = (
+            f"no final state of {self._grasp.object_id} was found. In the best one this does not "
+            f"hold: {told or 'nothing stands out'}{f' (too near: {near})' if near else ''}. Clear "
+            "the place, or name another one."
+        )
+        return NoFinalStateError(cause="no_free_pose", message=message)
+
+    def _in_the_way(self, T_base_tcp: Float[np.ndarray, "4 4"]) -> list[str]:
+        """What the object or the open hand would be too near to."""
+        bodies = (
+            (self._points_m, T_base_tcp @ self._T_tcp_object, self._allowed),
+            (self._hand_m, T_base_tcp, self._hand_allowed),
+        )
+        short = np.zeros(len(self._obstacles.names), dtype=np.bool_)
+        for points_m, T, allowed in bodies:
+            short |= self._obstacles.distances(points_m, T[None])[0] < self._keep_m(allowed)
+        return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
 
 
 def _release_contacts(

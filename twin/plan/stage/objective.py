@@ -47,6 +47,8 @@ class Term:
     """w, above zero."""
     penalty: Penalty = "squared"
     """phi."""
+    unit: str = "m"
+    """Of the violation, see ``SCALES``."""
 
     def __post_init__(self) -> None:
         """Refuse weights and scales that are none."""
@@ -72,6 +74,7 @@ class Term:
             scale=constraint.scale,
             weight=weight,
             penalty=penalty,
+            unit=constraint.unit,
         )
 
     @staticmethod
@@ -91,6 +94,7 @@ class Term:
             scale=constraint.scale,
             weight=weight,
             penalty=penalty,
+            unit=constraint.unit,
         )
 
 

@@ -377,6 +377,9 @@ def test_where_nothing_can_be_let_go_the_cause_is_named(change: str, cause: str)
         final_states(problem, grasp, config=replace(QUICK, max_drop_m=0.005))
     assert caught.value.cause == cause
     assert str(caught.value).endswith(".")
+    if cause == "no_free_pose":
+        assert "clear of what is around: by 5.0 mm" in str(caught.value)
+        assert "cube level: by 1.9 degrees (too near: lid). Clear the place" in str(caught.value)
 
 
 def test_the_mark_of_a_pushed_object_is_a_target_too() -> None:
