@@ -78,10 +78,10 @@ def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
     """The surface of every object of a task, in its own frame.
 
     Args:
-        scene_dir: The rebuilt scene; None: there is none.
+        scene_dir: The rebuilt scene; None, or no such folder: there is none.
         task: Its nominal shapes stand in for what the scene lacks.
     """
-    if scene_dir is None:
+    if scene_dir is None or not scene_dir.is_dir():
         return {
             key: _task_shape(model, "task file: there is no scene")
             for key, model in task.objects.items()
