@@ -97,6 +97,11 @@ def plan(
     from bridge.errors import UsageError
     from twin.plan.ground.run_tasks import keep, understand
 
+    if live and (task is not None or dry):
+        message = (
+            "--live answers a cell, whose requests name their task: leave --task and --dry out."
+        )
+        raise UsageError(message)
     if live:
         from twin.plan.live import run_planner
 

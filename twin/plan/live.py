@@ -31,6 +31,7 @@ from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import NoPlanError, Proposer, choose
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
 
@@ -67,6 +68,8 @@ class LivePlanner:
         """
         self._run, self._config, self._urdf = run, config, urdf
         self._proposers = proposers
+        self._fitting: set[tuple[str, str]] = set()
+        """Scenes, by their hash, that were recorded with a robot."""
 
     def answer(self, payload: bytes) -> PlanAnswer:
         """Plan as asked, or say why not.
@@ -136,11 +139,22 @@ class LivePlanner:
             task, urdf, poses, covariances=covariances
         )
         start_rad = np.array(request.joints_rad, dtype=np.float64)
-        return Problem(
+        problem = Problem(
             scene=replace(scene, start_rad=start_rad),
             robot=robot,
             shapes=shapes_of(self._run.scene_dir, task),
         )
+        self._refuse_other_robot(problem)
+        refuse_unusable(problem)
+        return problem
+
+    def _refuse_other_robot(self, problem: Problem) -> None:
+        """Look once for each scene: its source episodes have to be opened."""
+        scene_hash, robot = problem.scene.scene_hash, problem.robot.record
+        if scene_hash is None or self._config.robot or (scene_hash, robot.name) in self._fitting:
+            return
+        refuse_other_robot(self._run, robot)
+        self._fitting.add((scene_hash, robot.name))
 
 
 def claim_planner(session: Any, cell: str) -> None:

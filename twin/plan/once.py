@@ -32,11 +32,11 @@ from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_veri
 from twin.plan.model_stages import Asked, ask_about
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
-from twin.plan.usable_start import refuse_other_robot, refuse_unusable
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import for_task
-from twin.replay.run_job import cell_of, planned_grips, recorded_start
+from twin.replay.run_job import cell_of, planned_grips
 from twin.replay.verdict import replay_plan
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
@@ -56,6 +56,14 @@ class Start:
     localised: Mapping[str, LocalisedObject]
     problem: Problem
     urdf: str
+    from_home: str = ""
+    """Why nobody knows where the arm stood, so that plans begin at its home posture; empty: it was
+    recorded."""
+
+    @property
+    def arm(self) -> str:
+        """Where plans begin, in words."""
+        return f"its home posture, for {self.from_home}" if self.from_home else "as recorded"
 
     def lines(self) -> list[str]:
         """Where each object is, how sure, and by what."""
@@ -72,6 +80,7 @@ class Start:
             found.append(
                 f"  {key}: ({x:.0f}, {y:.0f}, {z:.0f}) mm {sure}, by {item.method}; shape: {shape}"
             )
+        found.append(f"  arm: {self.arm}")
         scene = self.problem.scene.scene_hash
         found.append(f"  scene: {'none was rebuilt' if scene is None else scene[:12]}")
         return found
@@ -92,6 +101,7 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
             can be planned from what was found.
         EpisodeError: The robot was not described.
     """
+    run.refuse_empty()
     paths = run.episodes()
     if config.episode:
         names = {path.stem: path for path in paths}
@@ -102,7 +112,6 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
             )
             raise UsageError(message)
         paths = [names[config.episode]]
-    run.refuse_empty()
     lacking = ""
     episodes = [Episode.open(path) for path in paths]
     for episode in sorted(episodes, key=lambda each: streams.first_stamp_ns(each) or 0)[::-1]:
@@ -148,12 +157,19 @@ def _start(
             hint=f"Record {ROBOT_DESCRIPTION}, or name the robot file: --robot.",
         )
     seen_ns = max(item.stamp_ns for item in found.values())
-    start_rad = recorded_start(episode, seen_ns, robot_of(urdf).joints)
+    start_rad, unknown = start_posture(episode, seen_ns, robot_of(urdf).joints)
     problem = problem_of(run, task, found, urdf, start_rad)
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
-    return Start(episode=episode, seen_ns=seen_ns, localised=found, problem=problem, urdf=urdf)
+    return Start(
+        episode=episode,
+        seen_ns=seen_ns,
+        localised=found,
+        problem=problem,
+        urdf=urdf,
+        from_home=unknown,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +214,7 @@ class Planned:
         """The same as data."""
         return {
             **self.understood.to_json(),
-            "start": {"episode": self.start.episode.path.stem},
+            "start": {"episode": self.start.episode.path.stem, "arm": self.start.arm},
             "model": None if self.asked is None else self.asked.to_json(),
             "plan": None if self.path is None else str(self.path),
             "attempts": [

@@ -1,24 +1,34 @@
 """What of a start makes planning pointless, said before anything is searched."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
+from bridge.geometry import se3
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
 from twin.plan.constrain.kinds import outer_reach
 from twin.plan.grasp.search import GraspConfig
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
+from twin.replay.run_job import START_KNOWN_NS, recorded_start
 from twin.scene.store.folder import read_record
 
-_AGAIN = "Record the start again: robot-gst record RUN."
+_AGAIN = "Record the start again: robot-gst record RUN; a live cell asks again."
 _RIGID = 1e-3
 """By how much a rotation may differ from one."""
+_ON_TOP_M = 0.006
+"""What lies on something begins so little under its top, or higher."""
+_PLACES = 25
+"""On a top, along each side, where it is asked whether there is room."""
 _LIMIT_RAD = 0.01
 """Beyond a joint's limit by so much an encoder may read."""
 
@@ -52,6 +62,42 @@ def refuse_unusable(problem: Problem) -> None:
             )
     for name in _handled(problem):
         _refuse_far(problem, name)
+    for name in scene.task.manipulated:
+        _refuse_far_mark(problem, name)
+        _refuse_covered(problem, name)
+
+
+def start_posture(
+    episode: Episode, stamp_ns: int, joints: Sequence[str]
+) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
+    """Where the arm was recorded to stand at the start [rad], or why nobody knows.
+
+    Args:
+        episode: Shows the start.
+        stamp_ns: When that was [ns].
+        joints: The arm's, base to hand.
+
+    Returns:
+        None with the reason in words, or the joints and nothing.
+
+    Raises:
+        NoPlanError: What was recorded then is not made of numbers.
+    """
+    found = recorded_start(episode, stamp_ns, joints)
+    if found is not None:
+        return found, ""
+    try:
+        track = streams.joint_track(episode, JOINT_STATES)
+    except BridgeError:
+        return None, "no joint states were recorded"
+    if lacking := [name for name in joints if name not in track.names]:
+        return None, f"the recorded joint states lack {', '.join(lacking)}"
+    away_ns = int(np.abs(track.stamps_ns - stamp_ns).min())
+    if away_ns > START_KNOWN_NS:
+        return None, f"the nearest joint states are {away_ns * 1e-9:.1f} s away from it"
+    raise NoPlanError(
+        f"the arm's joints at the start of {episode.path.stem} are not made of numbers. {_AGAIN}"
+    )
 
 
 def refuse_other_robot(run: RunFolder, robot: Robot) -> None:
@@ -118,16 +164,83 @@ def _handled(problem: Problem) -> list[str]:
 
 
 def _refuse_far(problem: Problem, name: str) -> None:
-    """Beyond what the links laid out straight reach, with the object's own size to spare."""
     T = problem.scene.Ts_base_object.get(name)
-    if T is None:
-        return
+    if T is not None:
+        _refuse_far_place(problem, name, name, T[:3, 3], f"Move it nearer. {_AGAIN}")
+
+
+def _refuse_far_mark(problem: Problem, name: str) -> None:
+    task = problem.scene.task
+    mark = task.mark_of(name)
+    if mark is not None:
+        p = np.array([*mark, problem.scene.table_height_m])
+        hint = f"Give task {task.name} another target_m."
+        _refuse_far_place(problem, f"the mark of {name}", name, p, hint)
+
+
+def _refuse_far_place(
+    problem: Problem, what: str, name: str, p_m: Float[np.ndarray, "3"], hint: str
+) -> None:
+    """Beyond what the links laid out straight reach, with the object's own size to spare."""
     p_shoulder, length_m = outer_reach(problem)
-    away_m = float(np.linalg.norm(T[:3, 3] - p_shoulder))
+    away_m = float(np.linalg.norm(p_m - p_shoulder))
     if away_m - float(np.linalg.norm(problem.model(name).size_m)) > length_m:
-        x, y, z = T[:3, 3] * 1e3
+        x, y, z = p_m * 1e3
         _refuse(
-            f"{name} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is out of reach: {away_m:.2f} m from the "
+            f"{what} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is out of reach: {away_m:.2f} m from the "
             f"first joint of {problem.robot.record.name}, which reaches {length_m:.2f} m",
-            f"Move it nearer. {_AGAIN}",
+            hint,
         )
+
+
+def _refuse_covered(problem: Problem, key: str) -> None:
+    """What an object is to be put onto is under others that leave no room, however it is turned."""
+    scene = problem.scene
+    task, goal = scene.task, scene.task.goal_of(key)
+    if goal is None or goal[0] != "on" or goal[1] not in scene.Ts_base_object:
+        return
+    support = goal[1]
+    moved_before = task.manipulated[: task.manipulated.index(key)]
+    others = set(scene.movable()) - {key, support, *moved_before}
+    places, step_m = _places_on(problem, support)
+    least_m = min(problem.model(key).size_m) / 2 - step_m
+    highest_m = places[0, 2] + max(problem.model(key).size_m)
+    is_taken: Bool[np.ndarray, " num_places"] = np.zeros(len(places), dtype=np.bool_)
+    lying = []
+    for name in sorted(others):
+        points = se3.apply(scene.Ts_base_object[name], problem.shapes[name].vertices_m)
+        if places[0, 2] - _ON_TOP_M <= points[:, 2].min() <= highest_m:
+            near = _gaps_m(places[:, :2], points[:, :2]) < least_m
+            is_taken |= near
+            lying += [name] if near.any() else []
+    if is_taken.all():
+        _refuse(
+            f"{', '.join(lying)} on {support} leaves no room for {key}, which is to be put there",
+            f"Move it away first. {_AGAIN}",
+        )
+
+
+def _places_on(problem: Problem, name: str) -> tuple[Float[np.ndarray, "num_places 3"], float]:
+    """Points all over the top of an object, and how far the nearest may be from any place there."""
+    model = problem.model(name)
+    x_m, y_m, z_m = model.size_m
+    top_m = z_m / 2 if model.origin_at_centre else z_m
+    sides = [np.linspace(-half, half, _PLACES) for half in (x_m / 2, y_m / 2)]
+    x, y = (grid.ravel() for grid in np.meshgrid(*sides))
+    local = np.stack([x, y, np.full_like(x, top_m)], axis=1)
+    step_m = float(np.hypot(x_m, y_m)) / (_PLACES - 1) / 2
+    return se3.apply(problem.scene.Ts_base_object[name], local), step_m
+
+
+def _gaps_m(
+    places_m: Float[np.ndarray, "num_places 2"], points_m: Float[np.ndarray, "num_points 2"]
+) -> Float[np.ndarray, " num_places"]:
+    """How far places are from the outline around points, seen from above; 0 inside."""
+    hull = ConvexHull(points_m)
+    begin = points_m[hull.vertices]
+    way = np.roll(begin, -1, axis=0) - begin
+    off = places_m[:, None] - begin
+    share = np.clip((off * way).sum(axis=-1) / (way * way).sum(axis=-1), 0.0, 1.0)
+    gaps = np.linalg.norm(off - share[..., None] * way, axis=-1).min(axis=1)
+    beyond = (places_m @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
+    return np.where(beyond <= 0, 0.0, gaps)

@@ -1,5 +1,6 @@
 """A planner on the wire: what it answers, that it remembers nothing, and that there is one."""
 
+import json
 import subprocess
 import sys
 import threading
@@ -15,10 +16,14 @@ from loopback import free_endpoint
 from own_process import ROOT
 from scripted_plans import scene_of_test
 
+import robot_gst
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT, ROBOT_NAME
+from bridge.robots.robot import read_robot
 from bridge.sources.standin.decisions import WirePlanner
 from bridge.task.find import chosen_task_file
 from bridge.task.plan_request import PlanRequest, Refusal
@@ -29,6 +34,7 @@ from bridge.wire.session import WireSession, open_session
 from twin.plan.config import LivePlanConfig
 from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
 from twin.plan.loop.straight import GeometricProposer
+from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
 FILE = chosen_task_file("cube_into_box")
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -118,6 +124,49 @@ def test_what_cannot_be_planned_has_a_reason(
     answer = planner.answer(request(**changes).to_json())
     assert answer.plan is None
     assert words in answer.reason
+
+
+def test_a_start_that_cannot_be_used_is_refused_whatever_the_policy(planner: LivePlanner) -> None:
+    """As for a plan from words: what was found, where, and what to do."""
+
+    def reason(**changes: Any) -> str:
+        answer = planner.answer(request(**changes).to_json())
+        assert answer.plan is None
+        return answer.reason
+
+    cube, box = request().objects
+    vague = {**box, "covariance": (9e-4 * np.eye(6)).ravel().tolist()}
+    assert "position of box is known to 30 mm" in reason(objects=(cube, vague))
+    away = {**box, "T_base_object": {**box["T_base_object"], "p_m": [0.5, 2.5, 0.0]}}
+    assert "box at (500, 2500, 0) mm is out of reach" in reason(objects=(cube, away))
+    assert "beyond its limits" in reason(joints_rad=(9.0, *HOME[1:]))
+
+
+def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    other = read_robot("ur10_parallel_gripper")
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+        data = other.description().encode()
+        writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
+    run.scene_dir.mkdir()
+    record: dict[str, Any] = {**dict.fromkeys(NEEDED, ""), "schema_version": SCENE_VERSION}
+    record |= {"scene_hash": "abc", "sources": [{"id": "scan"}]}
+    (run.scene_dir / SCENE_FILE).write_text(json.dumps(record))
+    asked = request().to_json()
+    for _ in range(2):
+        answer = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text).answer(asked)
+        assert answer.plan is None
+        assert f"recorded with robot {other.name} (scan)" in answer.reason
+    named = LivePlanConfig(robot=ROBOT_NAME)  # the user says that it fits
+    assert LivePlanner(run, named, ROBOT.urdf_text).answer(asked).plan is not None
+
+
+def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    for option in (["--task", "cube_into_box"], ["--dry"]):
+        assert robot_gst.run(["plan", str(run.path), "--live", *option]) == 2
+        assert "leave --task and --dry out" in capsys.readouterr().err
 
 
 def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.errors import UsageError
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
@@ -21,7 +22,7 @@ from dashboards.rerun_view import export_rrd, run_of
 from dashboards.rerun_viewer import episode_of
 from twin.plan.config import PlanConfig
 from twin.plan.ground.run_tasks import UnderstoodTask
-from twin.plan.once import Planned, Start, plan_once
+from twin.plan.once import Planned, Start, plan_once, start_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
@@ -107,6 +108,22 @@ def test_the_view_shows_what_was_refused_too(
     shown = export_rrd(path, out, run_of(path))
     assert shown.sides == ("replayed/planned/dynamic",)
     assert not [note for note in shown.notes if "plan" in note]
+
+
+def test_where_plans_begin_is_said(steered: tuple[RunFolder, Planned]) -> None:
+    _, done = steered
+    assert "  arm: as recorded" in done.lines()
+    assert done.to_json()["start"]["arm"] == "as recorded"
+    home = replace(done, start=replace(done.start, from_home="no joint states were recorded"))
+    assert "  arm: its home posture, for no joint states were recorded" in home.lines()
+
+
+def test_an_episode_of_an_empty_run_is_not_looked_up_in_an_empty_list(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    run = RunFolder.create(tmp_path_factory.mktemp("empty") / "run")
+    with pytest.raises(UsageError, match=r"no episodes in .*\. Record some"):
+        start_of(run, FILE.task(), PlanConfig(episode="trial_0001"))
 
 
 def test_where_nothing_is_accepted_only_refused_plans_are_kept(

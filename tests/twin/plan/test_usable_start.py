@@ -10,22 +10,28 @@ import numpy as np
 import pytest
 from scripted_plans import scene_of_test
 
+from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.schema import JOINT_STATE
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
+from bridge.task.task_file import load_task
 from twin.plan.loop.nominal import SINGLE, PlanProposer
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
-from twin.plan.usable_start import refuse_other_robot, refuse_unusable
+from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
+from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
 HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 SURE = np.eye(6) * 1e-6
+S = 1_000_000_000
 Change = Callable[[Problem], Problem]
 
 
@@ -39,6 +45,14 @@ def placed(name: str, *p_m: float, scale: float = 1.0) -> Change:
 
     def change(problem: Problem) -> Problem:
         return scene_with(Ts_base_object={**problem.scene.Ts_base_object, name: T})(problem)
+
+    return change
+
+
+def marked(x_m: float, y_m: float) -> Change:
+    def change(problem: Problem) -> Problem:
+        mark = {"kind": "moved", "object": "cube", "target_m": [x_m, y_m], "tolerance_m": 0.02}
+        return scene_with(task=replace(problem.scene.task, success=(mark,)))(problem)
 
     return change
 
@@ -71,6 +85,7 @@ def problem() -> Problem:
         (placed("cube", 0.5, 0, 0.02, scale=2.0), "pose of cube has a rotation", "Localise"),
         (placed("cube", 2.0, 0, 0.02), r"cube at \(2000, 0, 20\) mm is out of reach", "nearer"),
         (placed("box", 0.5, 2.5, 0.0), r"box at \(500, 2500, 0\) mm is out of reach", "nearer"),
+        (marked(3.0, 0.0), r"the mark of cube at \(3000, 0, 0\) mm is out of reach", "target_m"),
         (scene_with(start_rad=HOME * np.nan), "joints at the start are not", "Record"),
         (scene_with(start_rad=HOME[:4]), "gives 4 joints, and ur5", "--robot"),
         (scene_with(start_rad=HOME + 20), "rad, beyond its limits", "Move it back"),
@@ -102,6 +117,75 @@ def test_a_start_that_cannot_be_used_is_refused_in_one_sentence(
 
 def test_a_good_start_is_not_refused(problem: Problem) -> None:
     refuse_unusable(scene_with(covariances={"cube": SURE, "box": SURE})(problem))
+
+
+def cubes(x_blue_m: float, *order: str) -> Problem:
+    """Red is to go onto green; blue stands on green, so far from its middle."""
+    task = load_task("stack_and_pack")
+    places = {"red": (0.45, -0.2, 0.0175), "green": (0.5, 0.0, 0.0225),
+              "blue": (0.5 + x_blue_m, 0.0, 0.0625), "box": (0.5, 0.25, 0.0)}  # fmt: skip
+    q = np.array([1.0, 0, 0, 0])
+    Ts = {name: se3.transform_from(q, np.array(p)) for name, p in places.items()}
+    task = replace(task, manipulated=order or task.manipulated)
+    scene = ReplayScene(task=task, Ts_base_object=Ts, urdf=ROBOT.urdf_text(), start_rad=HOME)
+    return Problem(scene=scene, robot=load_robot(scene.urdf), shapes=shapes_of(None, task))
+
+
+def test_a_top_on_which_something_leaves_no_room_is_refused() -> None:
+    with pytest.raises(NoPlanError, match=r"blue on green leaves no room for red.*\. Move it away"):
+        refuse_unusable(cubes(0.0))
+    with pytest.raises(NoPlanError, match="blue on green leaves no room"):
+        refuse_unusable(cubes(0.008))
+    refuse_unusable(cubes(0.035))  # beside it there is
+    refuse_unusable(cubes(0.0, "blue", "red"))  # it goes away first
+
+
+def recorded(path: Path, names: tuple[str, ...], *values_rad: float) -> Episode:
+    """One joint state, at 5 s; none without values."""
+    with EpisodeWriter(path) as writer:
+        writer.describe(EpisodeInfo(id=path.stem, kind="trial"))
+        if values_rad:
+            none = np.zeros(0)
+            position = np.array(values_rad)
+            sample = JointSample(
+                stamp_ns=5 * S, names=names, position=position, velocity=none, effort=none
+            )
+            writer.write(
+                "/lab/joint_states", sample.to_cdr(), type_name=JOINT_STATE, log_time_ns=5 * S
+            )
+    return Episode.open(path)
+
+
+def test_where_the_arm_stood_is_what_was_recorded(tmp_path: Path) -> None:
+    episode = recorded(tmp_path / "a.mcap", ROBOT.joints, *HOME)
+    found, why = start_posture(episode, 5 * S, ROBOT.joints)
+    np.testing.assert_array_equal(found, HOME)
+    assert why == ""
+
+
+@pytest.mark.parametrize(
+    ("names", "values_rad", "stamp_ns", "said"),
+    [
+        (ROBOT.joints, (), 5 * S, "no joint states were recorded"),
+        (("panda_joint1",), (0.1,), 5 * S, "the recorded joint states lack shoulder_pan_joint, "),
+        (ROBOT.joints, tuple(HOME), 8 * S, "the nearest joint states are 3.0 s away from it"),
+    ],
+)
+def test_where_nobody_knows_where_the_arm_stood_the_reason_is_said(
+    tmp_path: Path, names: tuple[str, ...], values_rad: tuple[float, ...], stamp_ns: int, said: str
+) -> None:
+    episode = recorded(tmp_path / "a.mcap", names, *values_rad)
+    found, why = start_posture(episode, stamp_ns, ROBOT.joints)
+    assert found is None
+    assert said in why
+
+
+def test_joints_that_were_recorded_and_are_no_numbers_are_not_taken_for_the_home_posture(
+    tmp_path: Path,
+) -> None:
+    episode = recorded(tmp_path / "odd.mcap", ROBOT.joints, *(HOME * np.nan))
+    with pytest.raises(NoPlanError, match=r"start of odd are not made of numbers\. Record"):
+        start_posture(episode, 5 * S, ROBOT.joints)
 
 
 def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:
