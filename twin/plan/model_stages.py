@@ -38,6 +38,8 @@ from twin.scene.store.folder import read_record
 
 REPLIES = "model_replies"
 """Folder of the run's ``derived/`` with replies that were taken."""
+LOG = "log.jsonl"
+"""In it: every request with what came of it."""
 _PLACES = ("inside", "on", "outside", "beside", "between", "moved")
 """Kinds that say where an object ends: those are the task file's."""
 
@@ -118,6 +120,7 @@ def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
         model=config.model_name,
         send_images=config.send_images,
         cache=run.derived_dir / REPLIES,
+        log=run.derived_dir / REPLIES / LOG,
     )
 
 

@@ -14,7 +14,7 @@ sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / 
 
 from hostile_replies import TASK, valid_reply
 from scripted_plans import scene_of_test
-from test_model_client import Server, images_in, says, serving
+from test_model_client import SECRET, Server, images_in, says, serving
 
 import robot_gst
 from bridge.data_files import datasets_folder
@@ -100,10 +100,12 @@ def planned(
 
 
 def test_what_the_model_adds_joins_the_stages_and_nothing_else(
-    run: RunFolder, capsys: pytest.CaptureFixture[str]
+    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("GST_MODEL_KEY", SECRET)
     with serving(says(json.dumps(reply(LOW)))) as server:
         data, plan = planned(run, server, capsys)
+    assert SECRET in server.headers[0]["Authorization"]
     assert (data["model"]["answered_by"], data["model"]["address"]) == ("model", server.url)
     assert data["model"]["images_sent"] is False
     assert plan.grounding_source == "model"
@@ -115,6 +117,10 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
     assert [{frozenset(pair) for pair in stage.allowed_contacts} for stage in plan.stages] == [
         {frozenset(pair) for pair in table["allowed_contacts"]} for table in task.stages
     ]
+    log = (run.derived_dir / model_stages.REPLIES / model_stages.LOG).read_text()
+    (sent,) = (json.loads(line) for line in log.splitlines())
+    assert (sent["status"], sent["request"]) == (200, server.asked[0])
+    assert SECRET not in log
     assert images_in(server.asked[0]) == []
     assert "image" not in json.dumps(server.asked[0]["messages"][1])
 
