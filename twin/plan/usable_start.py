@@ -197,10 +197,12 @@ def _refuse_covered(problem: Problem, key: str) -> None:
     """What an object is to be put onto is under others that leave no room, however it is turned."""
     scene = problem.scene
     task, goal = scene.task, scene.task.goal_of(key)
-    if goal is None or goal[0] != "on" or goal[1] not in scene.Ts_base_object:
+    moved_before = task.manipulated[: task.manipulated.index(key)]
+    if goal is None or goal[0] != "on" or goal[1] in moved_before:
         return
     support = goal[1]
-    moved_before = task.manipulated[: task.manipulated.index(key)]
+    if support not in scene.Ts_base_object:  # the table
+        return
     others = set(scene.movable()) - {key, support, *moved_before}
     places, step_m = _places_on(problem, support)
     least_m = min(problem.model(key).size_m) / 2 - step_m

@@ -257,7 +257,7 @@ class _Search:
                 try:
                     transfer = self._moved(problem, grasp, release, start_rad, options)
                 except NoPathError as error:
-                    self.why = _explained(problem, key, error)
+                    self.why = _why_not_moved(problem, key, error)
                     if error.leg in _OF_GRASP:
                         options.give_up(grasp)
                     continue
@@ -319,7 +319,7 @@ class _Search:
         raise failure
 
 
-def _explained(problem: Problem, key: str, error: NoPathError) -> str:
+def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
     """Why an object cannot be moved so, and what would help."""
     if error.reason == START_TOUCHES and error.leg == "around":
         return (
