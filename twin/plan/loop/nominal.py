@@ -519,7 +519,10 @@ def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]
     violations = [violated(asked, state) for state in states]
     kept = [grasp for grasp, wrong in zip(grasps, violations, strict=True) if not wrong]
     if not kept:
-        message = f"no grasp of {grasps[0].object_id} keeps what is asked: {violations[0][0]}"
+        message = (
+            f"no grasp of {grasps[0].object_id} keeps what is asked: {violations[0][0]}. Ask for "
+            "less of the grasp."
+        )
         raise NoPlanError(message)
     return kept
 

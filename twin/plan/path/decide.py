@@ -28,7 +28,7 @@ AUDIT_STEP_M = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refusal:
+class PathRefusal:
     """Two bodies that come too near on a movement."""
 
     bodies: tuple[str, str]
@@ -44,7 +44,7 @@ class Refusal:
 class Decision:
     """What the exact checks say of a movement."""
 
-    refusals: tuple[Refusal, ...]
+    refusals: tuple[PathRefusal, ...]
     clearance_m: Float[np.ndarray, " num_points"]
     """Smallest distance over the pairs that may not touch, at and before each knot."""
     audit: Factor | None = None
@@ -105,7 +105,7 @@ def decide(
     monitor = ClearanceMonitor(scene, plan, hulls, config)
     poses = object_poses(problem, timed.joints_rad, carried)
     stamps = np.round(timed.times_s * 1e9).astype(np.int64)
-    refusals: list[Refusal] = []
+    refusals: list[PathRefusal] = []
     clearance = np.empty(len(stamps))
     for index, joints in enumerate(timed.joints_rad):
         Ts = {name: rows[index] for name, rows in poses.items()}
@@ -113,7 +113,7 @@ def decide(
         if links.touch():
             closest = hulls.self_distance()
             refusals.append(
-                Refusal(
+                PathRefusal(
                     bodies=closest.links,
                     lacking_m=-closest.distance_m,
                     t_ns=int(stamps[index]),
@@ -124,7 +124,7 @@ def decide(
             break
     limits = {"deep_contact": -config.max_contact_depth_m}
     refusals += [
-        Refusal(
+        PathRefusal(
             bodies=(failure.bodies[0], failure.bodies[1]),
             lacking_m=limits.get(failure.cause, config.eps_col_m) - _least(monitor, failure.bodies),
             t_ns=failure.t_ns,
@@ -166,11 +166,11 @@ def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
     )
 
 
-def _by_audit(factor: Factor) -> Refusal:
+def _by_audit(factor: Factor) -> PathRefusal:
     """What python-fcl found nearer than the monitor said."""
     first, second = factor.bodies[:2]
     detail = factor.detail or ""
-    return Refusal(
+    return PathRefusal(
         bodies=(first, second), lacking_m=AUDIT_STEP_M, t_ns=0, by="audit", detail=detail
     )
 

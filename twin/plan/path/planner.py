@@ -17,7 +17,7 @@ from bridge.errors import refuse_outside
 from bridge.geometry import se3
 from bridge.task.plan import Waypoint
 from twin.errors import TwinError
-from twin.plan.path.decide import Decision, Refusal, decide
+from twin.plan.path.decide import Decision, PathRefusal, decide
 from twin.plan.path.world import SPARE_M, Carried, World, build_world
 from twin.plan.problem import Problem, TimedPath
 from twin.replay.clearance.monitor import Allowed
@@ -202,7 +202,7 @@ def plan_move(
     )
     wider: dict[frozenset[str], float] = {}
     work: dict[str, float] = {}
-    refusals: tuple[Refusal, ...] = ()
+    refusals: tuple[PathRefusal, ...] = ()
     for turn in range(config.rounds):
         world = asked.world(wider)
         _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
@@ -230,7 +230,7 @@ def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
         raise NoPathError(reason="not a posture", detail="joints that are not finite")
 
 
-def _widen(wider: dict[frozenset[str], float], refusals: tuple[Refusal, ...]) -> None:
+def _widen(wider: dict[frozenset[str], float], refusals: tuple[PathRefusal, ...]) -> None:
     for refusal in refusals:
         pair = frozenset(refusal.bodies)
         wider[pair] = wider.get(pair, 0.0) + max(refusal.lacking_m, 0.0) + _WIDER_M
@@ -257,7 +257,7 @@ def _searched(
     config: PathConfig,
     turn: int,
     work: dict[str, float],
-    refusals: tuple[Refusal, ...],
+    refusals: tuple[PathRefusal, ...],
 ) -> tuple[Float[np.ndarray, "num_knots num_joints"], int]:
     """One native search; adds its work."""
     outcome, pair, goal, knots, spent = world.motion.find(

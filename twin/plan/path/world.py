@@ -256,14 +256,14 @@ def build_world(
     )
 
 
-Obstacle = tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
+PlacedBox = tuple[str, Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]
 """Its name, ``T_base_box`` and extents [m]."""
 
 
-def _obstacles(problem: Problem, carried: Carried | None) -> list[Obstacle]:
+def _obstacles(problem: Problem, carried: Carried | None) -> list[PlacedBox]:
     """Panels of what stands still, and a box for each other object."""
     scene = problem.scene
-    found: list[Obstacle] = [
+    found: list[PlacedBox] = [
         (name, T_base_panel, extents)
         for name, T in scene.containers().items()
         for T_base_panel, extents in placed_panels(scene.task.objects[name], T)

@@ -37,7 +37,7 @@ from twin.plan.release.resting import (
     target_of,
 )
 from twin.plan.release.sampling import perturbed, sampling_record
-from twin.plan.stage.objective import ANGLE_RAD, StageProblem, Term, Zeta
+from twin.plan.stage.objective import ANGLE_RAD, CostTerm, StageProblem, Zeta
 from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
 from twin.robot.collision import hulls_of
 
@@ -232,13 +232,13 @@ class ReleaseSearch:
         """
         name, scene = self._grasp.object_id, self._problem.scene
         terms = [
-            Term(name=f"{name} clear of what is around", violation=self._object_too_near),
-            Term(name="the open hand clear of what is around", violation=self._hand_too_near),
-            Term(name="the hand opens", violation=self._not_open),
+            CostTerm(name=f"{name} clear of what is around", violation=self._object_too_near),
+            CostTerm(name="the open hand clear of what is around", violation=self._hand_too_near),
+            CostTerm(name="the hand opens", violation=self._not_open),
         ]
         if target is not None:
             terms += self._placed(T_rest, target)
-        terms += [Term.of(constraint) for constraint in self._constraints]
+        terms += [CostTerm.of(constraint) for constraint in self._constraints]
         return StageProblem(
             nominal_T_base_tcp=T_rest @ self._grasp.T_object_tcp,
             nominal_width_m=self._width_m,
@@ -262,7 +262,7 @@ class ReleaseSearch:
     def _not_open(self, state: State) -> Array:
         return self._grasp.width_m + self._config.open_more_m / 2 - state.width_m
 
-    def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[Term]:
+    def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[CostTerm]:
         """Inside of the area, at a small height, level."""
         config, name = self._config, self._grasp.object_id
         margin = config.sigmas * float(np.hypot(target.sigma_m, self._sigma_m))
@@ -295,9 +295,9 @@ class ReleaseSearch:
             return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2]) - config.max_tilt_rad
 
         return [
-            Term(name=f"{name} within {target.name}", violation=beyond),
-            Term(name=f"{name} a little above {target.name}", violation=off_height),
-            Term(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
+            CostTerm(name=f"{name} within {target.name}", violation=beyond),
+            CostTerm(name=f"{name} a little above {target.name}", violation=off_height),
+            CostTerm(name=f"{name} level", violation=leaning, scale=ANGLE_RAD, unit="rad"),
         ]
 
     def answer(

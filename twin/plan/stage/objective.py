@@ -33,7 +33,7 @@ NUM_VARIABLES = 7
 
 
 @dataclass(frozen=True, kw_only=True)
-class Term:
+class CostTerm:
     """One constraint in the sum."""
 
     name: str
@@ -60,7 +60,9 @@ class Term:
             raise ValueError(message)
 
     @staticmethod
-    def of(constraint: Constraint, *, weight: float = 1.0, penalty: Penalty = "squared") -> "Term":
+    def of(
+        constraint: Constraint, *, weight: float = 1.0, penalty: Penalty = "squared"
+    ) -> "CostTerm":
         """Weigh a compiled constraint that must hold where the stage ends.
 
         Args:
@@ -68,7 +70,7 @@ class Term:
             weight: w.
             penalty: phi.
         """
-        return Term(
+        return CostTerm(
             name=constraint.kind,
             violation=constraint.parts,
             scale=constraint.scale,
@@ -80,7 +82,7 @@ class Term:
     @staticmethod
     def along(
         constraint: Constraint, *, weight: float = 1.0, penalty: Penalty = "squared"
-    ) -> "Term":
+    ) -> "CostTerm":
         """Weigh a compiled constraint that must hold all the way.
 
         Args:
@@ -88,7 +90,7 @@ class Term:
             weight: w.
             penalty: phi.
         """
-        return Term(
+        return CostTerm(
             name=f"{constraint.kind} on the way",
             violation=lambda states: worst_along(constraint, states),
             scale=constraint.scale,
@@ -143,9 +145,9 @@ class StageProblem:
     """Where the regulariser draws the tool."""
     nominal_width_m: float
     """And the width."""
-    subgoal: tuple[Term, ...] = ()
+    subgoal: tuple[CostTerm, ...] = ()
     """What must hold where the stage ends."""
-    path: tuple[Term, ...] = ()
+    path: tuple[CostTerm, ...] = ()
     """What must hold all the way there."""
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Objects that stay where they are during the stage."""
@@ -175,7 +177,7 @@ class StageProblem:
             raise ValueError(message)
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[CostTerm, ...]:
         """Those at the end, then those along the way."""
         return (*self.subgoal, *self.path)
 
@@ -243,7 +245,7 @@ def _columns(values: Array) -> Array:
     return values[:, None] if len(values.shape) == 1 else values
 
 
-def _residual(term: Term, violation: Array, margin: float) -> Array:
+def _residual(term: CostTerm, violation: Array, margin: float) -> Array:
     """Square root of w phi, smooth above zero."""
     xp = namespace(violation)
     x = xp.clip(violation / term.scale + margin, 0.0, None)

@@ -9,7 +9,7 @@ from path_scene import EPS_M, WIDTH_M, Pairs, at, joints_at, tool_down
 
 from bridge.errors import UsageError
 from twin.plan.path import planner
-from twin.plan.path.decide import Refusal, decide
+from twin.plan.path.decide import PathRefusal, decide
 from twin.plan.path.planner import Movement, NoPathError, PathConfig, plan_move, waypoints_of
 from twin.plan.path.world import Carried, build_world
 from twin.plan.problem import Problem, TimedPath
@@ -153,7 +153,7 @@ def test_what_is_refused_is_searched_again_with_the_pair_farther_apart(
         asked.append(timed)
         if len(asked) > 1:
             return decision
-        pair = Refusal(bodies=bodies, lacking_m=wanted_m, t_ns=0, by="test", detail="")
+        pair = PathRefusal(bodies=bodies, lacking_m=wanted_m, t_ns=0, by="test", detail="")
         return replace(decision, refusals=(pair,))
 
     monkeypatch.setattr(planner, "decide", strict)
@@ -165,7 +165,7 @@ def test_what_is_refused_is_searched_again_with_the_pair_farther_apart(
 def test_what_stays_refused_is_not_handed_out(
     pairs: Pairs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refusal = Refusal(
+    refusal = PathRefusal(
         bodies=("forearm_link", "post"), lacking_m=0.001, t_ns=0, by="test", detail="too near"
     )
     real = planner.decide

@@ -14,8 +14,8 @@ from twin.plan.stage.motion import interpolated, moved, rotation_vector
 from twin.plan.stage.objective import (
     ANGLE_RAD,
     LENGTH_M,
+    CostTerm,
     StageProblem,
-    Term,
     Zeta,
     worst_of,
     zeta_of,
@@ -54,10 +54,10 @@ def wide(state: State) -> object:
 
 
 SUBGOAL = (
-    Term(name="height", violation=height),
-    Term(name="inside", violation=inside, weight=2.0),
-    Term(name="leaning", violation=leaning, scale=ANGLE_RAD),
-    Term(name="wide", violation=wide, penalty="huber"),
+    CostTerm(name="height", violation=height),
+    CostTerm(name="inside", violation=inside, weight=2.0),
+    CostTerm(name="leaning", violation=leaning, scale=ANGLE_RAD),
+    CostTerm(name="wide", violation=wide, penalty="huber"),
 )
 STAGE = StageProblem(nominal_T_base_tcp=DOWN, nominal_width_m=0.05, subgoal=SUBGOAL)
 
@@ -118,7 +118,7 @@ def test_j_is_the_sum_of_the_paper() -> None:
 
 
 def test_what_contradicts_itself_has_no_answer_and_says_what_is_wrong() -> None:
-    high = Term(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
+    high = CostTerm(name="high", violation=lambda state: 0.2 - state.T_base_tcp[:, 2, 3])
     solution = solve(replace(STAGE, subgoal=(*SUBGOAL, high)))
     assert solution.candidates == ()
     assert not solution.feasible.any()
@@ -136,7 +136,7 @@ def test_a_constraint_on_the_way_counts_at_its_worst() -> None:
     start = DOWN.copy()
     start[:3, 3] = (0.53, -0.1, 0.105)
     free = replace(STAGE, start_T_base_tcp=start, num_path_steps=20)
-    term = Term(name="around the ball", violation=worst_of(ball))
+    term = CostTerm(name="around the ball", violation=worst_of(ball))
     with_way = replace(free, path=(term,))
 
     def deepest(T_end: np.ndarray) -> float:
@@ -179,7 +179,7 @@ def test_what_is_carried_moves_with_the_tool() -> None:
     problem = StageProblem(
         nominal_T_base_tcp=DOWN,
         nominal_width_m=0.05,
-        subgoal=(Term(name="look", violation=look),),
+        subgoal=(CostTerm(name="look", violation=look),),
         Ts_base_object={"box": np.eye(4)},
         Ts_tcp_object={"cube": T_tcp_object},
     )
