@@ -7,7 +7,7 @@ camera measured is carried into them instead.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.errors import TwinError
+from twin.scene.dataset.masks import MovingRegion
 from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.frames.selection import FrameChoice, spread
@@ -323,6 +324,8 @@ FEW_FRAMES = 5
 """With fewer training frames of all cameras together, much was seen once or never."""
 SPARSE = 0.02
 """With a smaller share of trusted pixels a camera contributes next to nothing."""
+MOST_REGIONS = 10
+"""That ``scene.json`` names."""
 MUCH_MOVED = 0.3
 """More of the surface than this is rarely only a robot's arm."""
 
@@ -355,7 +358,9 @@ class ScanReport:
     found: tuple[str, ...]
     """What is wrong, one remark each."""
     moving_fraction: float = 0.0
-    """Share of the measured surface that other frames look through."""
+    """Share of the measured surface that moved."""
+    moving_regions: Sequence[MovingRegion] = ()
+    """Where that was, the largest place first; single voxels are left out."""
     ego_mask_shares: Mapping[str, float] = field(default_factory=dict)
     """By camera without joints: share of its image that moves with it."""
 
@@ -367,19 +372,27 @@ class ScanReport:
                 f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
                 "before it does, and was left out"
             )
-        if self.moving_fraction < MUCH_MOVED:
-            return found
-        return [
-            *found,
-            f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan and "
-            "was left out; scan while nothing but the camera moves, or check the poses",
-        ]
+        if self.moving_fraction >= MUCH_MOVED:
+            found.append(
+                f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan "
+                "and was left out; scan while nothing but the camera moves, or check the poses"
+            )
+        elif self.moving_regions:
+            places = len(self.moving_regions)
+            found.append(
+                f"{100 * self.moving_fraction:.2g} % of the measured surface moved during the "
+                "scan, or was measured where other frames find nothing, and was left out, in "
+                f"{places} place{'s' if places > 1 else ''}; the largest is "
+                f"{self.moving_regions[0].describe()}"
+            )
+        return found
 
     def to_record(self) -> dict[str, Any]:
         """What ``scene.json`` says."""
         return {
             "remarks": self.remarks(),
             "moving_fraction": self.moving_fraction,
+            "moving_regions": [asdict(region) for region in self.moving_regions[:MOST_REGIONS]],
             "carried_fraction": {
                 name: round(share, 4) for name, share in self.ego_mask_shares.items()
             },
