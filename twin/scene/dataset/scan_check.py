@@ -431,6 +431,11 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             raise PoseConventionError(message)
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
+    if any(_is_unexplained(camera, poses) for camera in usable):
+        found.append(
+            "poses that are off by millimetres: --align-poses, or --refine-poses where the images "
+            "say more; by centimetres: --poses odometry"
+        )
     stationary = [camera.name for camera in usable if camera.choice.stationary]
     if any(name in poses and not poses[name].fits for name in stationary):
         found.append("robot-gst calibrate RUN --cameras finds where cameras are that stand still")
@@ -442,6 +447,18 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             "longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
+
+
+def _is_unexplained(camera: CameraCheck, poses: Mapping[str, PoseReport]) -> bool:
+    """Whether the poses of a moving camera fit its depth under no convention."""
+    report = poses.get(camera.name)
+    return (
+        not camera.choice.stationary
+        and report is not None
+        and report.agreement is not None
+        and report.better is None
+        and not report.fits
+    )
 
 
 def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
@@ -491,7 +508,11 @@ def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:
     """Say why a camera's depth is not usable."""
     values = np.concatenate([image.depth_m[image.depth_m > 0] for image in camera.images])
     if len(values) == 0:
-        return f"{camera.name} measured no depth at all: every pixel is 0 or not a number"
+        return (
+            f"{camera.name} measured no depth at all, every pixel is 0 or not a number: check the "
+            "unit of depth and that the camera sends it; what was taken without depth is rebuilt "
+            "after robot-gst import images"
+        )
     median = float(np.median(values))
     if median > config.max_depth_m:
         return (

@@ -71,6 +71,17 @@ def test_one_blind_camera_of_two_is_a_remark(choice: FrameChoice) -> None:
     blind = camera(choice, depth_times=0.0)
     (remark,) = check_scan([camera(choice), blind], CONFIG).remarks()
     assert "camera wrist of episode scan measured no depth" in remark
+    assert "check the unit of depth" in remark
+    assert "import images" in remark
+
+
+def test_what_helps_noisy_poses_is_said(choice: FrameChoice) -> None:
+    noisy, rng = camera(choice), np.random.default_rng(1)
+    for thumb in noisy.images:
+        thumb.T_base_depth[:3, 3] += rng.uniform(-0.2, 0.2, 3)
+    unexplained, advice = check_scan([noisy], CONFIG).remarks()
+    assert "no known convention" in unexplained
+    assert all(way in advice for way in ("--align-poses", "--refine-poses", "--poses odometry"))
 
 
 def test_poses_in_a_wrong_convention_are_refused_unless_told_not_to(choice: FrameChoice) -> None:
