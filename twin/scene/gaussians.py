@@ -285,6 +285,9 @@ def _harmonics(names: list[str], table: np.ndarray) -> np.ndarray:
 
 
 def _header(path: Path, lines: list[str]) -> tuple[list[str], int]:
+    if any(line.split()[2:] == ["packed_position"] for line in lines):
+        found = "a compressed splat file; export it uncompressed (in SuperSplat: PLY)"
+        raise UnreadablePlyError(path=path, found=found)
     if "format binary_little_endian 1.0" not in lines:
         raise UnreadablePlyError(path=path, found="another PLY format")
     counts = [line.split()[2] for line in lines if line.startswith("element vertex ")]

@@ -122,7 +122,9 @@ def read_color(path: Path) -> StoredColor:
         return StoredColor(stored=stored, image_u8=decode_color(stored))
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path, found=str(error), hint="Restore the file or remove the frame."
+            path=path,
+            found=str(error).rstrip("."),
+            hint="Restore the file or remove the frame.",
         ) from error
 
 
@@ -155,7 +157,9 @@ def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
         return decode_depth_png(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
         raise FolderError(
-            path=path, found=str(error), hint="Restore the file or remove the frame."
+            path=path,
+            found=str(error).rstrip("."),
+            hint="Restore the file or remove the frame.",
         ) from error
 
 

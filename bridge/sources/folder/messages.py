@@ -86,7 +86,8 @@ def _unknown(folder: Path) -> FolderError | PathNotFoundError:
         what="index",
         hint=(
             "Known layouts: scene.json; TUM (rgb.txt, depth.txt, groundtruth.txt); 7-Scenes "
-            "(frame-000000.color.png, .depth.png, .pose.txt). docs/rgbd_folder.md describes them."
+            "(frame-000000.color.png, .depth.png, .pose.txt); images without depth: robot-gst "
+            "import images. docs/rgbd_folder.md describes them."
         ),
     )
 
@@ -281,9 +282,18 @@ def _color_camera(index: FolderIndex, shape: tuple[int, ...]) -> Camera:
 def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:
     stored = read_stored_depth(frame.depth_path)
     check_size(frame.depth_path, stored.shape, index.depth_camera)
-    return to_millimetres(
+    depth_mm = to_millimetres(
         stored,
         unit_m=index.depth_unit_m,
         invalid_values=index.depth_invalid_values,
         encoding=index.depth_encoding,
     )
+    was_measured = ~np.isin(stored, [0, *index.depth_invalid_values])
+    if was_measured.any() and not depth_mm.any():
+        raise FolderError(
+            path=frame.depth_path,
+            found=f"with {index.depth_unit_m:g} m for each stored number no pixel lies between "
+            "0.5 mm and 65.5 m",
+            hint="Correct the unit: depth_unit_m in scene.json, else --depth-unit-m.",
+        )
+    return depth_mm

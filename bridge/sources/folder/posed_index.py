@@ -37,6 +37,8 @@ PARAMETERS = {
 """COLMAP's models that are read, with the names of their numbers."""
 LENS_KEYS = ("k1", "k2", "p1", "p2")
 REFUSED_KEYS = ("k3", "k4", "k5", "k6")
+MOST_PX = 65_500
+"""Of a JPEG's side."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
 """Sparse points nearer or farther than these percentiles are taken for outliers."""
@@ -207,9 +209,12 @@ def _image_below(folder: Path, candidates: Sequence[str], index: Path) -> Path:
     """
     root = folder.resolve()
     for name in candidates:
-        found = (folder / name).resolve()
-        if found.is_file() and found.is_relative_to(root):
-            return found
+        try:
+            found = (folder / name).resolve()
+            if found.is_file() and found.is_relative_to(root):
+                return found
+        except (OSError, ValueError):  # too long for a name, or with a NUL in it
+            continue
     raise PathNotFoundError(
         path=folder / candidates[0],
         what="color image",
@@ -225,6 +230,9 @@ def _sparse_depths(path: Path) -> Float[np.ndarray, "num_points 3"]:
         for line in path.read_text(errors="replace").splitlines()
         if line.strip() and line[0] != "#"
     ]
+    if any(len(row) < 3 for row in rows):
+        found = "a point has fewer than three coordinates"
+        raise FolderError(path=path, found=found, hint="Restore the file.")
     return np.array(rows).reshape(-1, 3)
 
 
@@ -246,8 +254,8 @@ def _read_transforms(folder: Path) -> PosedIndex:
     path = folder / TRANSFORMS
     try:
         record = json.loads(path.read_text())
-        frames = record["frames"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        frames = list(record["frames"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise FolderError(
             path=path, found=f"no list of frames ({error})", hint="Restore the file."
         ) from error
@@ -296,6 +304,9 @@ def _frame_lens(path: Path, number: int, record: dict[str, Any]) -> tuple[Lens, 
 
     width, height = number_of("w", 0.0), number_of("h", 0.0)
     angle_rad = number_of("camera_angle_x", 1.0)
+    if not 0 < angle_rad < math.pi:
+        found = f"{what}: a camera_angle_x of {angle_rad:g}"
+        raise FolderError(path=path, found=found, hint="It is in radians, above 0 and below pi.")
     fx = number_of("fl_x", 0.5 * width / math.tan(0.5 * angle_rad))
     of = {"fx": fx, "fy": number_of("fl_y", fx)}
     of |= {"cx": number_of("cx", width / 2), "cy": number_of("cy", height / 2)}
@@ -331,6 +342,9 @@ def _lens(path: Path, width: int, height: int, of: dict[str, float]) -> Lens:
     if min(fx, fy, width, height) <= 0:
         found = f"a camera of {width} x {height} pixels and focal lengths {fx:g}, {fy:g}"
         raise FolderError(path=path, found=found, hint="All of them are above zero.")
+    if max(width, height) > MOST_PX:
+        found = f"a camera of {width} x {height} pixels"
+        raise FolderError(path=path, found=found, hint=f"At most {MOST_PX} a side are read.")
     camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=of["cx"], cy=of["cy"])
     return Lens(camera=camera, **{key: of.get(key, 0.0) for key in LENS_KEYS})
 
@@ -338,7 +352,7 @@ def _lens(path: Path, width: int, height: int, of: dict[str, float]) -> Lens:
 def _numbers(path: Path, words: list[Any], what: str) -> list[float]:
     try:
         numbers = [float(word) for word in words]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FolderError(
             path=path, found=f"{what}: no number ({error})", hint="Restore the file."
         ) from error

@@ -149,6 +149,13 @@ def _frames(path: Path, record: dict[str, Any]) -> tuple[tuple[FolderFrame, ...]
 def _frame(path: Path, entry: Any, where: str) -> FolderFrame | None:
     if not isinstance(entry, dict):
         raise FolderError(path=path, found=f"{where} is not an object", hint=_KEYS_HINT)
+    if "depth" not in entry:
+        raise FolderError(
+            path=path,
+            found="a frame has no depth image",
+            hint="Images without depth: robot-gst import images, with transforms.json or COLMAP's "
+            "poses (docs/rgbd_folder.md).",
+        )
     files = {name: path.parent / str(_value(path, entry, name)) for name in ("color", "depth")}
     for name, file in files.items():
         require_image(file, what=name, named_by=f"{path} names it in {where}")

@@ -168,6 +168,12 @@ STRETCHED = {"file_path": "images/000.jpg", "transform_matrix": np.diag([2.0, 2,
         ({"frames": [{"file_path": "images/000.jpg"}]}, "transform_matrix"),
         ({"frames": [OUTSIDE]}, "secret"),
         ({"frames": [STRETCHED]}, "rotation"),
+        ({"frames": None}, "no list of frames"),
+        ({"frames": [{"file_path": "a\0b", "transform_matrix": TURNED}]}, "image not found"),
+        ({"frames": [{"file_path": "a" * 5000, "transform_matrix": TURNED}]}, "image not found"),
+        ({"fl_x": 10**400}, "fl_x"),
+        ({"w": 1e12}, "At most 65500"),
+        ({"camera_angle_x": 0}, "camera_angle_x of 0"),
     ],
 )
 def test_a_wrong_transforms_file_is_refused_by_name(
@@ -185,11 +191,43 @@ def test_a_wrong_transforms_file_is_refused_by_name(
         ("FISHEYE 32 24 30 15 12 0 0", "image_undistorter"),
         ("PINHOLE 32 24 30 30 15", "3 numbers"),
         ("PINHOLE 32 24 nan 30 15 12", "not finite"),
+        ("PINHOLE 32 24 -30 30 15 12", "focal lengths -30"),
+        ("PINHOLE 99999999999 24 30 30 15 12", "At most 65500"),
     ],
 )
 def test_a_wrong_colmap_camera_is_refused(camera: str, found: str, tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "folder", camera)
     with pytest.raises(FolderError, match=found):
+        read_posed_index(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "found"),
+    [
+        ("images.txt", "1 ", "1 nan ", "not finite"),
+        ("images.txt", "000.jpg", "../../../secret.jpg", "image not found"),
+        ("points3D.txt", "1 0.3 -0.2 4.0 9 9 9 0.5 1 0", "1 2", "fewer than three"),
+    ],
+)
+def test_a_broken_colmap_line_ends_the_import_as_wrong_use(
+    name: str, old: str, new: str, found: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_colmap(tmp_path / "folder")
+    (tmp_path / "secret.jpg").write_bytes(encode_jpeg(np.zeros((HEIGHT, WIDTH, 3), np.uint8)))
+    path = folder / "sparse" / "0" / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    run = tmp_path / "run"
+    assert robot_gst.run(["import", "images", str(folder), str(run), "--quiet"]) == 2
+    assert found in capsys.readouterr().err
+    assert not list(run.rglob("*.mcap"))
+
+
+def test_an_index_nested_beyond_reading_is_refused(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path / "folder")
+    (folder / "transforms.json").write_text("[" * 100_000)
+    with pytest.raises(FolderError, match="no list of frames"):
         read_posed_index(folder)
 
 

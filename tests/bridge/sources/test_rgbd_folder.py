@@ -133,6 +133,30 @@ def test_invalid_codes_become_zero(folder: Path, stored: np.ndarray) -> None:
     np.testing.assert_array_equal(depth_of(messages_of(folder)[0]), expected)
 
 
+@pytest.mark.parametrize("unit_m", [1000.0, 1e-9])
+def test_a_unit_that_leaves_no_depth_is_refused(
+    unit_m: float, folder: Path, index_record: dict[str, Any]
+) -> None:
+    """Sixteen bits of millimetres end at 65.5 m; all zeros would say that nothing was measured."""
+    rewrite(folder, {**index_record, "depth_unit_m": unit_m})
+    with pytest.raises(FolderError, match=r"with .* m for each stored number .*depth_unit_m"):
+        messages_of(folder)
+
+
+def test_an_image_in_which_nothing_was_measured_is_no_wrong_unit(folder: Path) -> None:
+    (folder / "d.png").write_bytes(png16(np.full((HEIGHT, WIDTH), 65535)))
+    assert not depth_of(messages_of(folder)[0]).any()
+
+
+def test_frames_without_depth_are_sent_to_the_import_of_images(
+    folder: Path, index_record: dict[str, Any]
+) -> None:
+    frames = [{k: v for k, v in f.items() if k != "depth"} for f in index_record["frames"]]
+    rewrite(folder, {**index_record, "frames": frames})
+    with pytest.raises(FolderError, match=r"no depth image.*import images"):
+        read_index(folder)
+
+
 def test_tenths_of_millimetres_are_rounded(
     folder: Path, stored: np.ndarray, index_record: dict[str, Any]
 ) -> None:

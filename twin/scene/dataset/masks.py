@@ -18,6 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from twin.scene.frames.camera_poses import same_pose
@@ -32,6 +35,11 @@ MARGIN_FRACTION = 0.02
 MAX_REFERENCE_VIEWS = 40
 """Frames that are asked; more only cost time."""
 MIN_THROUGH = 2
+MIN_THROUGH_IN_TURN = 4
+"""What some frames of a scan confirm and at least so many look through, all later or all earlier,
+came or went, however long it stood there."""
+MIN_REGION_VOXELS = 8
+"""Fewer connected ones are noise, or too small to say."""
 OUTLINE_PX = 3
 """Poses and depth are noisy: closer to a nearer surface than this, at half size, nobody knows."""
 MOVING_GROW_PX = 2
@@ -40,10 +48,39 @@ INDEX_BITS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
+class MovingRegion:
+    """A place where something came, went or passed."""
+
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    """Along the axes of the root frame, to a voxel."""
+
+    def describe(self) -> str:
+        """Its size and where it is."""
+        size = " x ".join(f"{100 * side:.0f}" for side in self.size_m)
+        return f"{size} cm around ({', '.join(f'{side:.2f}' for side in self.center_m)}) m"
+
+
+@dataclass(frozen=True, kw_only=True)
 class MovingVoxels:
     """Where something was that is not part of the static scene."""
 
     keys: Int64[np.ndarray, " num_voxels"]
+
+    def regions(self) -> list[MovingRegion]:
+        """Connected groups of these voxels, the largest first."""
+        cells = _cells(self.keys)
+        if not len(cells):
+            return []
+        pairs = cKDTree(cells).query_pairs(1.8, output_type="ndarray")  # corners touch, too
+        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+        _, labels = connected_components(links, directed=False)
+        sizes = np.bincount(labels)
+        largest = np.argsort(-sizes, kind="stable")
+        return [
+            _region(cells[labels == label])
+            for label in largest[sizes[largest] >= MIN_REGION_VOXELS]
+        ]
 
     def contains(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Say which points (root frame, metres) belong to something that moved."""
@@ -71,6 +108,8 @@ class ReferenceView:
 
     view: TrainingView
     nearest_m: Float32[np.ndarray, "height width"]
+    scan: int = 0
+    """Frames of one scan are compared in the order of their time, those of several are not."""
 
     def look_through(
         self, p_base: Float[np.ndarray, "num_points 3"]
@@ -92,17 +131,25 @@ class ReferenceView:
         return known & (nearest > z + margin), known & (np.abs(measured - z) <= margin)
 
 
-def choose_reference_views(views: Sequence[TrainingView]) -> list[ReferenceView]:
-    """Take training frames spread evenly; their depth images are compared with."""
+def choose_reference_views(
+    views: Sequence[TrainingView], scans: Sequence[int] | None = None
+) -> list[ReferenceView]:
+    """Take training frames spread evenly; their depth images are compared with.
+
+    Args:
+        views: All training frames.
+        scans: Which scan each is of; all of one without it.
+    """
     step = max(1, -(-len(views) // MAX_REFERENCE_VIEWS))
+    of_scan = [0] * len(views) if scans is None else scans
     return [
-        ReferenceView(view=view, nearest_m=nearest_around(view.half.depth_m))
-        for view in views[::step]
+        ReferenceView(view=view, nearest_m=nearest_around(view.half.depth_m), scan=scan)
+        for view, scan in zip(views[::step], of_scan[::step], strict=True)
     ]
 
 
 def find_moving(points: Sequence[PointSet], references: Sequence[ReferenceView]) -> MovingVoxels:
-    """Find voxels that more frames look through than confirm.
+    """Find voxels that more frames look through than confirm, or first the one and then the other.
 
     Args:
         points: Surface points of all training frames, or of one held-out frame.
@@ -113,11 +160,41 @@ def find_moving(points: Sequence[PointSet], references: Sequence[ReferenceView])
     means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)
     through = np.zeros(len(keys), dtype=np.int32)
     confirmed = np.zeros(len(keys), dtype=np.int32)
-    for reference in references:
-        passed, met = reference.look_through(means)
-        through += passed
-        confirmed += met
-    return MovingVoxels(keys=keys[(through >= MIN_THROUGH) & (through > confirmed)])
+    in_turn = np.zeros(len(keys), dtype=bool)
+    for scan in sorted({reference.scan for reference in references}):
+        votes = _Votes(len(keys))
+        mine = [reference for reference in references if reference.scan == scan]
+        for reference in sorted(mine, key=lambda reference: reference.view.stamp_ns):
+            votes.add(*reference.look_through(means))
+        through += votes.through
+        confirmed += votes.confirmed
+        in_turn |= votes.in_turn()
+    return MovingVoxels(keys=keys[((through >= MIN_THROUGH) & (through > confirmed)) | in_turn])
+
+
+class _Votes:
+    """How often voxels were looked through and confirmed, and in which order."""
+
+    def __init__(self, count: int) -> None:
+        self.through, self.confirmed = (np.zeros(count, dtype=np.int32) for _ in range(2))
+        self._asked = 0
+        self._first = np.full((2, count), np.iinfo(np.int32).max, dtype=np.int32)
+        self._last = np.full((2, count), -1, dtype=np.int32)
+
+    def add(self, passed: np.ndarray, met: np.ndarray) -> None:
+        """What the next frame says of each."""
+        self.through += passed
+        self.confirmed += met
+        for row, voted in enumerate((passed, met)):
+            self._first[row, voted] = np.minimum(self._first[row, voted], self._asked)
+            self._last[row, voted] = self._asked
+        self._asked += 1
+
+    def in_turn(self) -> Bool[np.ndarray, " num_voxels"]:
+        """Which were there only until others looked through them, or only afterwards."""
+        left, came = self._last[1] < self._first[0], self._last[0] < self._first[1]
+        both = (self.through >= MIN_THROUGH_IN_TURN) & (self.confirmed > 0)
+        return np.asarray(both & (left | came))
 
 
 def nearest_around(depth_m: np.ndarray) -> np.ndarray:
@@ -138,6 +215,19 @@ def _keys(p_m: np.ndarray) -> np.ndarray:
     cell = np.clip(cell, 0, (1 << INDEX_BITS) - 1)
     packed = (cell[:, 0] << (2 * INDEX_BITS)) | (cell[:, 1] << INDEX_BITS) | cell[:, 2]
     return np.asarray(packed)
+
+
+def _cells(keys: np.ndarray) -> np.ndarray:
+    shifts = (2 * INDEX_BITS, INDEX_BITS, 0)
+    packed = np.stack([(keys >> shift) & ((1 << INDEX_BITS) - 1) for shift in shifts], axis=1)
+    return np.asarray(packed - (1 << (INDEX_BITS - 1)))
+
+
+def _region(cells: np.ndarray) -> MovingRegion:
+    low, high = cells.min(axis=0) * VOXEL_M, (cells.max(axis=0) + 1) * VOXEL_M
+    x, y, z = ((low + high) / 2).round(3).tolist()
+    width, depth, height = (high - low).round(3).tolist()
+    return MovingRegion(center_m=(x, y, z), size_m=(width, depth, height))
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ camera measured is carried into them instead.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.errors import TwinError
+from twin.scene.dataset.masks import MovingRegion
 from twin.scene.frames.downscaled import DownscaledDepth, Meeting, meet
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.frames.selection import FrameChoice, spread
@@ -323,6 +324,8 @@ FEW_FRAMES = 5
 """With fewer training frames of all cameras together, much was seen once or never."""
 SPARSE = 0.02
 """With a smaller share of trusted pixels a camera contributes next to nothing."""
+MOST_REGIONS = 10
+"""That ``scene.json`` names."""
 MUCH_MOVED = 0.3
 """More of the surface than this is rarely only a robot's arm."""
 
@@ -355,7 +358,9 @@ class ScanReport:
     found: tuple[str, ...]
     """What is wrong, one remark each."""
     moving_fraction: float = 0.0
-    """Share of the measured surface that other frames look through."""
+    """Share of the measured surface that moved."""
+    moving_regions: Sequence[MovingRegion] = ()
+    """Where that was, the largest place first; single voxels are left out."""
     ego_mask_shares: Mapping[str, float] = field(default_factory=dict)
     """By camera without joints: share of its image that moves with it."""
 
@@ -367,19 +372,27 @@ class ScanReport:
                 f"{100 * share:.0f} % of the image of {name} moves with the camera, as a gripper "
                 "before it does, and was left out"
             )
-        if self.moving_fraction < MUCH_MOVED:
-            return found
-        return [
-            *found,
-            f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan and "
-            "was left out; scan while nothing but the camera moves, or check the poses",
-        ]
+        if self.moving_fraction >= MUCH_MOVED:
+            found.append(
+                f"{100 * self.moving_fraction:.0f} % of the measured surface moved during the scan "
+                "and was left out; scan while nothing but the camera moves, or check the poses"
+            )
+        elif self.moving_regions:
+            places = len(self.moving_regions)
+            found.append(
+                f"{100 * self.moving_fraction:.2g} % of the measured surface moved during the "
+                "scan, or was measured where other frames find nothing, and was left out, in "
+                f"{places} place{'s' if places > 1 else ''}; the largest is "
+                f"{self.moving_regions[0].describe()}"
+            )
+        return found
 
     def to_record(self) -> dict[str, Any]:
         """What ``scene.json`` says."""
         return {
             "remarks": self.remarks(),
             "moving_fraction": self.moving_fraction,
+            "moving_regions": [asdict(region) for region in self.moving_regions[:MOST_REGIONS]],
             "carried_fraction": {
                 name: round(share, 4) for name, share in self.ego_mask_shares.items()
             },
@@ -418,6 +431,11 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             raise PoseConventionError(message)
     found = [_no_depth(camera, config) for camera in blind] + moved
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
+    if any(_is_unexplained(camera, poses) for camera in usable):
+        found.append(
+            "poses that are off by millimetres: --align-poses, or --refine-poses where the images "
+            "say more; by centimetres: --poses odometry"
+        )
     stationary = [camera.name for camera in usable if camera.choice.stationary]
     if any(name in poses and not poses[name].fits for name in stationary):
         found.append("robot-gst calibrate RUN --cameras finds where cameras are that stand still")
@@ -429,6 +447,18 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
             "longer"
         )
     return ScanReport(poses=poses, found=tuple(found))
+
+
+def _is_unexplained(camera: CameraCheck, poses: Mapping[str, PoseReport]) -> bool:
+    """Whether the poses of a moving camera fit its depth under no convention."""
+    report = poses.get(camera.name)
+    return (
+        not camera.choice.stationary
+        and report is not None
+        and report.agreement is not None
+        and report.better is None
+        and not report.fits
+    )
 
 
 def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
@@ -478,7 +508,11 @@ def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:
     """Say why a camera's depth is not usable."""
     values = np.concatenate([image.depth_m[image.depth_m > 0] for image in camera.images])
     if len(values) == 0:
-        return f"{camera.name} measured no depth at all: every pixel is 0 or not a number"
+        return (
+            f"{camera.name} measured no depth at all, every pixel is 0 or not a number: check the "
+            "unit of depth and that the camera sends it; what was taken without depth is rebuilt "
+            "after robot-gst import images"
+        )
     median = float(np.median(values))
     if median > config.max_depth_m:
         return (

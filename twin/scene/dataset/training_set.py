@@ -105,13 +105,20 @@ def read_training_set(
         refined = refine_poses(points, views, output)
         points, views = refined.points, refined.views
         moved = with_corrections(choices, choice_of_view, views, refined.corrections)
-    reference_views = choose_reference_views(views)
+    paths = [choice.episode.path for choice in choices]
+    scans = [paths.index(paths[index]) for index in choice_of_view]
+    reference_views = choose_reference_views(views, scans)
     moving = find_moving(points, reference_views)
     num_points = sum(len(item.p_m) for item in points)
     for place in range(len(points)):  # one by one, so that memory holds the frames once
         points[place], views[place] = moving.drop_from(points[place]), moving.mask_in(views[place])
     gone = (num_points - sum(len(item.p_m) for item in points)) / max(num_points, 1)
-    report = replace(report, moving_fraction=round(gone, 4), ego_mask_shares=shares)
+    report = replace(
+        report,
+        moving_fraction=round(gone, 4),
+        moving_regions=moving.regions(),
+        ego_mask_shares=shares,
+    )
     for remark in report.remarks():
         output.say(remark)
     return TrainingSet(

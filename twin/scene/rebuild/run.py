@@ -131,24 +131,13 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     decomposed = _decompose(run, sources, training, fitted.cloud, completed, config, output)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
-    clock.end("take_apart")
+    clock.end("decompose")
     drawn = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
     rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
     backdrop = backdrop_of(drawn.cloud, training.views, rasteriser)
     views = _hold_out(run, training, drawn, backdrop, decomposed, links, config, clock, output)
     clock.end("held_out_views")
-    output.say("write objects, robot links and the distances to what is static")
-    extras = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
-    extras |= write_scene_semantics(
-        run.scene_dir,
-        decomposed,
-        training.views,
-        config.fit.threads,
-        output,
-        models=config.models,
-        choices=training.choices,
-        task=scanned_tasks(sources).task,
-    )
+    extras = _write_parts(run, sources, training, decomposed, links, config, output)
     clock.end("objects_and_semantics")
     record = make_record(
         key=key,
@@ -258,6 +247,30 @@ def _hold_out(
     with output.progress("render held-out views", total) as advance:
         numbers = write_views(run, choices, job, advance)
     return summarise_views(numbers, _remove_stale_views(run, choices, job.scene_hash))
+
+
+def _write_parts(
+    run: RunFolder,
+    sources: Sources,
+    training: TrainingSet,
+    decomposed: Decomposition,
+    links: LitLinks,
+    config: RebuildConfig,
+    output: Output,
+) -> dict[str, Any]:
+    """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
+    output.say("write objects, robot links and the distances to what is static")
+    written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
+    return written | write_scene_semantics(
+        run.scene_dir,
+        decomposed,
+        training.views,
+        config.fit.threads,
+        output,
+        models=config.models,
+        choices=training.choices,
+        task=scanned_tasks(sources).task,
+    )
 
 
 def _marked_objects(decomposed: Decomposition) -> GaussianCloud | None:

@@ -1,5 +1,6 @@
 """One wrong number of a camera's geometry is found, said, and corrected where that is asked for."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -79,6 +80,23 @@ def test_the_wrong_number_is_found_and_no_other(kind: str, wrong: float) -> None
         assert ("focal length is" if kind == "focal" else "depth reads") in found.describe()
 
 
+def test_a_factor_is_found_alike_whatever_the_error_where_poses_are_noisy() -> None:
+    """The peak is then wide and flat, and its highest place is chance."""
+    rng = np.random.default_rng(4)
+    shifts = rng.normal(0.0, 0.006, (NUM_FRAMES, 3))
+    off = []
+    for wrong in (0.5, 0.6, 0.7, 1.4, 1.6, 2.0):
+        images = [image(k, depth=wrong) for k in range(NUM_FRAMES)]
+        for each, shift in zip(images, shifts, strict=True):
+            each.T_base_depth[:3, 3] += shift
+        found = search_geometry(images)
+        assert found is not None
+        assert found.kind == "depth"
+        assert found.after < 0.6
+        off.append(1 / (found.value * wrong) - 1)
+    assert np.ptp(off) < 0.003
+
+
 def test_nothing_is_found_in_a_noisy_scan_that_is_right() -> None:
     images = [image(k) for k in range(NUM_FRAMES)]
     assert search_geometry(images, pose_at, FRAME_NS) is None
@@ -105,11 +123,13 @@ def test_a_wrong_number_is_refused_and_the_way_out_is_named(choice: FrameChoice)
     wrong = camera(choice, 0.6)
     insist = FrameConfig(check_poses=False)
     report = check_scan([wrong], insist)
-    with pytest.raises(WrongGeometryError, match=r"depth reads 0\.60\d x .*--correct-geometry"):
+    with pytest.raises(WrongGeometryError, match=r"depth reads .* x .*--correct-geometry") as told:
         check_geometry([wrong], report, CONFIG)
-    told, choices = check_geometry([wrong], report, insist)
+    (factor,) = re.findall(r"depth reads (\d\.\d+) x", str(told.value))
+    assert float(factor) == pytest.approx(0.6, rel=0.01)
+    insisted, choices = check_geometry([wrong], report, insist)
     assert choices == [choice]
-    assert any("Correct it with --correct-geometry" in remark for remark in told.remarks())
+    assert any("Correct it with --correct-geometry" in remark for remark in insisted.remarks())
 
 
 def test_the_number_is_corrected_on_request(choice: FrameChoice) -> None:

@@ -5,6 +5,7 @@ import pytest
 import textured_room
 
 from bridge.episode.streams import RgbdFrame
+from bridge.geometry.camera import Camera
 from twin.scene.dataset.masks import MovingVoxels, choose_reference_views, find_moving
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import fit
@@ -114,3 +115,82 @@ def test_a_visitor_in_a_held_out_frame_is_found_by_the_training_frames(
     moving = find_moving([training[0][3]], reference_views)
     masked = moving.mask_in(training[1][3])
     assert 0.3 < (~masked.full.static_mask).mean() < 0.6
+
+
+CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+BOX_M = 0.12
+HERE, THERE = np.array([-0.15, 0.1, 0.0]), np.array([0.2, 0.2, 0.0])
+NUM_FRAMES = 16
+
+
+def frame_with_box(index: int, foot_m: np.ndarray | None) -> RgbdFrame:
+    """The room with 2 mm of noise and a box that stands there, if anywhere."""
+    T = textured_room.camera_pose(index, NUM_FRAMES)
+    depth_m, _ = textured_room.depth_and_points(CAMERA, T)
+    rays, eye = CAMERA.rays() @ T[:3, :3].T, T[:3, 3]
+    if foot_m is not None:
+        half = BOX_M / 2
+        low = foot_m - np.array([half, half, 0.0])
+        high = foot_m + np.array([half, half, BOX_M])
+        ways = np.sort(np.stack([(low - eye) / rays, (high - eye) / rays]), axis=0)
+        near, far = ways[0].max(axis=-1), ways[1].min(axis=-1)
+        depth_m = np.where(near <= far, np.minimum(near, depth_m), depth_m)
+    noise = np.random.default_rng(index).normal(0.0, 0.002, depth_m.shape)
+    p_m = eye + rays * depth_m[..., None]
+    return replace(
+        textured_room.frame(index, NUM_FRAMES),
+        image_u8=np.rint(textured_room.texture(p_m) * 255).clip(0, 255).astype(np.uint8),
+        depth_m=(depth_m + noise).astype(np.float32),
+        color_camera=CAMERA,
+        depth_camera=CAMERA,
+        T_base_depth=T,
+    )
+
+
+def what_stays(feet: list[np.ndarray | None]) -> tuple[float, float, MovingVoxels]:
+    """Of the box's points the share that stays, and of the room's that goes."""
+    surfaces = [FrameSurface(frame_with_box(k, foot), LIMITS) for k, foot in enumerate(feet)]
+    points = [surface.points() for surface in surfaces]
+    moving = find_moving(points, choose_reference_views([training_view(s) for s in surfaces]))
+    box, gone = [], []
+    for item, foot in zip(points, feet, strict=True):
+        where = item.p_m - (foot if foot is not None else np.full(3, np.inf))
+        inside = (np.abs(where[:, :2]) < BOX_M / 2 + 0.01).all(axis=1)
+        box.append(inside & (where[:, 2] > 0.01) & (where[:, 2] < BOX_M + 0.01))
+        gone.append(moving.contains(item.p_m))
+    of_box, out = np.concatenate(box), np.concatenate(gone)
+    return 1 - out[of_box].mean(), out[~of_box].mean(), moving
+
+
+@pytest.mark.parametrize(("moved_at", "to"), [(4, THERE), (12, THERE), (8, None)])
+def test_a_box_that_is_put_elsewhere_or_taken_away_goes_however_long_it_stood(
+    moved_at: int, to: np.ndarray | None
+) -> None:
+    stays, lost, moving = what_stays([HERE] * moved_at + [to] * (NUM_FRAMES - moved_at))
+    assert stays < 0.3  # its foot: within the margin of the table behind it
+    assert lost < 0.002
+    largest = moving.regions()[0]
+    assert largest.size_m[:2] == pytest.approx((BOX_M, BOX_M), abs=0.05)
+    places = [HERE] if to is None else [HERE, to]
+    assert len(moving.regions()) == len(places)
+    assert min(np.linalg.norm(largest.center_m[:2] - at[:2]) for at in places) < 0.03
+
+
+def test_a_box_that_slides_through_the_scan_goes_and_one_that_stands_stays() -> None:
+    slid = [HERE + (THERE - HERE) * k / (NUM_FRAMES - 1) for k in range(NUM_FRAMES)]
+    assert what_stays([*slid])[0] < 0.3
+    stays, lost, moving = what_stays([HERE] * NUM_FRAMES)
+    assert stays == 1
+    assert lost == 0
+    assert moving.regions() == []
+
+
+def test_what_was_elsewhere_in_another_scan_did_not_move() -> None:
+    """Between scans things are put elsewhere on purpose; each scan's are kept."""
+    feet = [HERE] * 8 + [THERE] * 8
+    surfaces = [FrameSurface(frame_with_box(k, foot), LIMITS) for k, foot in enumerate(feet)]
+    points = [surface.points() for surface in surfaces]
+    views = [training_view(surface) for surface in surfaces]
+    apart = find_moving(points, choose_reference_views(views, [0] * 8 + [1] * 8))
+    at_once = find_moving(points, choose_reference_views(views))
+    assert len(apart.keys) < 0.2 * len(at_once.keys)

@@ -12,6 +12,7 @@ from bridge.episode.cdr.messages import FrameTransform
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.terminal import Output
+from twin.scene.dataset.masks import MovingRegion
 from twin.scene.dataset.scan_check import (
     CameraCheck,
     MovedCameraError,
@@ -70,6 +71,17 @@ def test_one_blind_camera_of_two_is_a_remark(choice: FrameChoice) -> None:
     blind = camera(choice, depth_times=0.0)
     (remark,) = check_scan([camera(choice), blind], CONFIG).remarks()
     assert "camera wrist of episode scan measured no depth" in remark
+    assert "check the unit of depth" in remark
+    assert "import images" in remark
+
+
+def test_what_helps_noisy_poses_is_said(choice: FrameChoice) -> None:
+    noisy, rng = camera(choice), np.random.default_rng(1)
+    for thumb in noisy.images:
+        thumb.T_base_depth[:3, 3] += rng.uniform(-0.2, 0.2, 3)
+    unexplained, advice = check_scan([noisy], CONFIG).remarks()
+    assert "no known convention" in unexplained
+    assert all(way in advice for way in ("--align-poses", "--refine-poses", "--poses odometry"))
 
 
 def test_poses_in_a_wrong_convention_are_refused_unless_told_not_to(choice: FrameChoice) -> None:
@@ -117,6 +129,17 @@ def test_much_motion_is_said() -> None:
     report = ScanReport(poses={}, found=(), moving_fraction=0.4)
     assert "40 % of the measured surface moved" in report.remarks()[0]
     assert ScanReport(poses={}, found=(), moving_fraction=0.1).remarks() == []
+
+
+def test_a_thing_that_moved_is_said_with_its_place() -> None:
+    region = MovingRegion(center_m=(0.2, -0.1, 0.06), size_m=(0.12, 0.3, 0.1))
+    report = ScanReport(poses={}, found=(), moving_fraction=0.012, moving_regions=[region])
+    (remark,) = report.remarks()
+    assert "1.2 % of the measured surface moved during the scan" in remark
+    assert remark.endswith(
+        "left out, in 1 place; the largest is 12 x 30 x 10 cm around (0.20, -0.10, 0.06) m"
+    )
+    assert report.to_record()["moving_regions"][0]["center_m"] == (0.2, -0.1, 0.06)
 
 
 def spoilt_transforms(
