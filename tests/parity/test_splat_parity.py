@@ -112,7 +112,7 @@ def test_gradients_agree_with_finite_differences(num_harmonics: int) -> None:
     gradient = rasteriser.pull_back(planes, upstream)
     for name, rows in arrays(cloud):
         direction = rng.normal(size=rows.shape)
-        step = 5e-4
+        step = 2e-4
         values = []
         for sign in (1, -1):
             moved = as_float32(rows + sign * step * direction)
@@ -121,7 +121,7 @@ def test_gradients_agree_with_finite_differences(num_harmonics: int) -> None:
             values.append(scalar_of(drawn, upstream))
         numeric = (values[0] - values[1]) / (2 * step)
         analytic = float((getattr(gradient, name) * direction).sum())
-        # float32 images differenced over 1e-3: about three digits remain
+        # float32 images differenced over 4e-4: about three digits remain
         assert numeric == pytest.approx(analytic, rel=2e-2, abs=2e-2), name
 
 
