@@ -1,5 +1,5 @@
 // Draws Gaussians and lines with WebGL 2, by the equations of the twin's own rasteriser:
-// image covariance J W Sigma W^T J^T (Zwicker et al. 2001), a low-pass of 0.03 px^2 with the
+// image covariance J W Sigma W^T J^T (Zwicker et al. 2001), a low-pass of 0.1 px^2 with the
 // opacity it takes away, alpha cut at 1/255, farthest first with premultiplied alpha.
 
 const PER_ROW = 512; // Gaussians in a row of the texture; three texels each
@@ -55,10 +55,10 @@ void main() {
   vec3 A0 = (T0 * axes) * s, A1 = (T1 * axes) * s;
   float xx = dot(A0, A0), xy = dot(A0, A1), yy = dot(A1, A1);
   vec3 n = cross(A0, A1);
-  float raw = dot(n, n), full = raw + 0.03 * (xx + yy) + 0.0009;
+  float raw = dot(n, n), full = raw + 0.1 * (xx + yy) + 0.01;
   float opacity = b_opacity.y * sqrt(max(raw / full, 2.5e-5));
   if (opacity * 255.0 < 1.0) return;
-  xx += 0.03; yy += 0.03;
+  xx += 0.1; yy += 0.1;
   v_conic = vec3(yy, -xy, xx) / full;
 
   vec3 d = normalize(ray) * turn; // into the part's frame, in which its harmonics are

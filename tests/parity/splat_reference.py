@@ -11,7 +11,7 @@ from numpy.polynomial.legendre import Legendre
 
 from bridge.geometry.camera import Camera
 
-MIP_VARIANCE_PX2 = 0.03
+MIP_VARIANCE_PX2 = 0.1
 MAX_ALPHA = 0.999
 MIN_MIP_RATIO = 2.5e-5
 NEAR_M = 0.02

@@ -1,9 +1,9 @@
 """Gaussians that other viewers draw as we do: the anti-aliasing goes into sizes and opacities.
 
-We add 0.03 px^2 to the covariance on the image and lower the opacity by what that spreads (mip
+We add 0.1 px^2 to the covariance on the image and lower the opacity by what that spreads (mip
 compensation, Yu et al. 2024); viewers after Kerbl et al. 2023 add 0.3 px^2 and lower nothing, so
 thin and distant Gaussians come out wider and denser. Seen from about one distance this is taken
-back: 0.27 px^2 less along each axis, and an opacity that leaves what a Gaussian covers in total.
+back: 0.2 px^2 less along each axis, and an opacity that leaves what a Gaussian covers in total.
 """
 
 import numpy as np

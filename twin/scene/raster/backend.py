@@ -1,9 +1,9 @@
 """Choose what draws Gaussians: our own code on the CPU, or ``gsplat`` on a CUDA device.
 
 Of gsplat only the documented function ``gsplat.rasterization`` is used, in the mode ``antialiased``
-with ``eps2d = 0.03``, which is our mip compensation. Known differences: its Jacobian is held at
-15 % of the image beyond the border where ours is at 30 %, its cuts are fixed, and the depth of a
-view is the weighted mean, because gsplat does not say where half of the light is gone.
+with ``eps2d = 0.1``, which is our mip compensation. Known differences: its Jacobian is held at 15 %
+of the image beyond the border where ours is at 30 %, its cuts are fixed, and the depth of a view is
+the weighted mean, because gsplat does not say where half of the light is gone.
 """
 
 import importlib
@@ -26,7 +26,7 @@ from twin.scene.raster.rasteriser import (
     View,
 )
 
-MIP_VARIANCE_PX2 = 0.03
+MIP_VARIANCE_PX2 = 0.1
 NEAR_M = 0.02
 FIXED_ALPHA_CUT, FIXED_TRANSMITTANCE_STOP = 1.0 / 255.0, 1e-4
 """Constants inside gsplat's kernels."""

@@ -289,7 +289,7 @@ class Rasteriser:
     """Draws one camera after another, keeping its buffers.
 
     Paper Eq. 2 with the product transmittance of the errata. Pixel centres are at +0.5; the
-    image covariance gets 0.03 px^2 and the opacity sqrt(det/det') (mip compensation).
+    image covariance gets 0.1 px^2 and the opacity sqrt(det/det') (mip compensation).
     """
 
     def __init__(self, config: RasterConfig | None = None) -> None:
