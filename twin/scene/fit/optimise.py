@@ -86,9 +86,31 @@ class SurfacePrior:
         cloud.means_m[:] -= beyond_m[:, None] * self.normals
 
 
+@dataclass(kw_only=True)
+class RunningSum:
+    """Sums of the cloud's arrays over the last images of a fit, for their mean."""
+
+    sums: dict[str, Float32[np.ndarray, "num_splats ..."]] = field(default_factory=dict)
+    count: int = 0
+
+    def add(self, cloud: GaussianCloud) -> None:
+        """Count the cloud as it is now; always of the same Gaussians."""
+        for name, rows in arrays(cloud):
+            if self.count:
+                self.sums[name] += rows
+            else:
+                self.sums[name] = rows.copy()
+        self.count += 1
+
+    def put_mean_into(self, cloud: GaussianCloud) -> None:
+        """Replace the cloud by the mean, in place; nothing was added: leave it."""
+        for name, rows in arrays(cloud) if self.count else ():
+            rows[:] = self.sums[name] / np.float32(self.count)
+
+
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 4
+STATE_VERSION = 5
 SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
 CAMERA_ARRAYS = ("values", "first", "second", "counts")
 SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
@@ -106,6 +128,8 @@ class FitState:
     cameras: CameraCorrections
     surface: SurfacePrior
     """Where the Gaussians began."""
+    last: RunningSum = field(default_factory=RunningSum)
+    """Of the Gaussians from ``MEAN_FROM`` on."""
     seconds: float = 0.0
     """Time spent so far."""
     coarse_steps: int = 0
@@ -159,6 +183,7 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
         "size_m": np.array(state.size_m),
         "steps": np.array(state.session.steps),
         "errors": np.array(state.errors, dtype=np.float64),
+        "num_summed": np.array(state.last.count),
         "exposures": state.exposures,
     }
     content |= {name: np.array(getattr(state, name)) for name in SCALARS}
@@ -168,6 +193,7 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
     for name, rows in arrays(state.session.cloud):
         content[f"cloud.{name}"] = rows
         content[f"first.{name}"], content[f"second.{name}"] = moments[name]
+    content |= {f"sum.{name}": rows for name, rows in state.last.sums.items()}
     buffer = io.BytesIO()
     np.savez(buffer, **content)  # type: ignore[arg-type]  # numpy's stub takes the names for options
     write_whole(checkpoint.path, buffer.getvalue())
@@ -212,6 +238,7 @@ def _state_from(
         exposures=content["exposures"],
         cameras=CameraCorrections(**part("cameras.")),
         surface=SurfacePrior(**part("surface.")),
+        last=RunningSum(sums=part("sum."), count=int(content["num_summed"])),
         seconds=float(content["seconds"]),
         errors=content["errors"].tolist(),
         **{name: int(content[name]) for name in SCALARS},
@@ -382,6 +409,10 @@ HOLD_EVERY = 5
 """Images between two looks at whether Gaussians left the surface."""
 SPENT_AT_MOST = 0.5
 """Initialisation uses up this share of the budget at most, so that there always is a fit."""
+MEAN_FROM = 0.92
+"""From this share of the budget on, the Gaussians are summed at each of these looks; the fit ends
+with their mean, which is without the noise of single images. All events are behind by then, so
+the Gaussians stay the same."""
 POSES_FROM = 0.15
 """Cameras are moved only once the scene is good enough to say where to."""
 POSES_DEPTH = 0.05
@@ -463,6 +494,7 @@ def fit(
         if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
             state.seconds = last_saved = at.seconds
             save_state(checkpoint, state)
+    state.last.put_mean_into(state.session.cloud)
     learner.hold(state)
     return FitResult(
         cloud=state.session.cloud,
@@ -550,6 +582,8 @@ class _Learner:
         )
         if state.session.steps % HOLD_EVERY == 0:
             self.hold(state)
+            if at.fraction >= MEAN_FROM:
+                state.last.add(state.session.cloud)
         if self._config.refine_poses and at.fraction >= POSES_FROM:
             pulled = correction_gradient(report.T_camera_base, pose)
             state.cameras.update(index, pulled, decay)

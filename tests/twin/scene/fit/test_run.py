@@ -187,6 +187,7 @@ def test_higher_degrees_come_with_the_solved_colours_where_enough_views_show(
     [
         (FitConfig(iterations=14, threads=1, refine_poses=True), 9),
         (FitConfig(iterations=20, threads=1, harmonics=2, exposure="affine"), 20),
+        (FitConfig(iterations=150, threads=1), 147),  # among the images that the mean is over
     ],
 )
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
@@ -214,6 +215,25 @@ def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
     np.testing.assert_array_equal(whole.Ts_base_color, resumed.Ts_base_color)
     np.testing.assert_array_equal(whole.exposures, resumed.exposures)
     assert whole.train_psnr_db == resumed.train_psnr_db
+
+
+def test_a_fit_ends_with_the_mean_of_its_last_gaussians(
+    room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[GaussianCloud] = []
+    add = optimise.RunningSum.add
+
+    def noted(self: optimise.RunningSum, cloud: GaussianCloud) -> None:
+        seen.append(cloud.take(np.arange(len(cloud))))
+        add(self, cloud)
+
+    monkeypatch.setattr(optimise.RunningSum, "add", noted)
+    fitted = fit(*room, FitConfig(iterations=150, threads=1, slab=0.0), lambda *_: None)
+    assert len(seen) == 3  # every fifth image of the last twelve
+    assert np.abs(seen[0].colors - seen[-1].colors).max() > 1e-3
+    for name, rows in arrays(fitted.cloud):
+        mean = np.mean([getattr(cloud, name) for cloud in seen], axis=0, dtype=np.float64)
+        np.testing.assert_allclose(rows, mean, rtol=1e-5, atol=1e-6)
 
 
 def test_a_state_of_other_settings_or_a_damaged_one_is_not_used(
