@@ -52,6 +52,8 @@ class Question:
     """Where the arm stands; None: not asked."""
     max_audit_distances: int = 20_000
     """Distances that are asked again before a yes."""
+    any_robot: bool = False
+    """The scene may be another robot's, for somebody named the robot (``--robot``)."""
 
 
 def get_ready(_: None) -> None:
@@ -91,12 +93,19 @@ def answer(question: Question) -> Verdict:
     from twin.replay.rebuilt_scene import (  # noqa: PLC0415
         for_task,
         read_rebuilt_scene,
+        scene_of_other_robot,
     )
     from twin.replay.result import ReplayResult  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
+    other = "" if question.any_robot else scene_of_other_robot(run, plan.robot)
+    if other:
+        raise UndecidedError(
+            f"{other}, and plan {plan.id} is for {plan.robot}. Scan the cell with the robot that "
+            "is to act and rebuild it: robot-gst rebuild RUN, or name the robot: --robot"
+        )
     rebuilt = read_rebuilt_scene(run, question.task)
     scene = rebuilt.scene(
         question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
@@ -198,6 +207,7 @@ class TwinProcess:
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps
         self._max_audit_distances = config.max_audit_distances
+        self._any_robot = bool(config.robot)
         self._swapping = threading.Lock()
         self._closed = False
         self._worker: Worker | None = None
@@ -267,6 +277,7 @@ class TwinProcess:
             max_steps=self._max_steps,
             start_rad=start_rad,
             max_audit_distances=self._max_audit_distances,
+            any_robot=self._any_robot,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)
         return verdict

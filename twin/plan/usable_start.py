@@ -1,7 +1,6 @@
 """What of a start makes planning pointless, said before anything is searched."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,8 +18,8 @@ from twin.plan.constrain.kinds import outer_reach
 from twin.plan.grasp.search import GraspConfig
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
+from twin.replay.rebuilt_scene import scene_of_other_robot
 from twin.replay.run_job import START_KNOWN_NS, recorded_start
-from twin.scene.store.folder import read_record
 
 _AGAIN = "Record the start again: robot-gst record RUN; a live cell asks again."
 _RIGID = 1e-3
@@ -110,22 +109,12 @@ def refuse_other_robot(run: RunFolder, robot: Robot) -> None:
     Raises:
         NoPlanError: They differ.
     """
-    sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
-    names = {str(source.get("id", "")) for source in sources}
-    for path in run.episodes():
-        if path.stem not in names:
-            continue
-        try:
-            other = streams.recorded_robot(Episode.open(path)).name
-        except BridgeError:
-            continue
-        if other != robot.name:
-            _refuse(
-                f"the scene in {run.scene_dir} was recorded with robot {other} ({path.stem}), and "
-                f"the start with {robot.name}",
-                "Scan the cell with the robot that is to act and rebuild it: robot-gst rebuild "
-                "RUN, or name the robot: --robot.",
-            )
+    if other := scene_of_other_robot(run, robot.name):
+        _refuse(
+            f"{other}, and the start with {robot.name}",
+            "Scan the cell with the robot that is to act and rebuild it: robot-gst rebuild RUN, or "
+            "name the robot: --robot.",
+        )
 
 
 def _refuse(found: str, hint: str) -> None:

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bridge.episode import provenance
+from bridge.episode import provenance, streams
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from twin.calibrate.physics.parameters import BIAS, MASS_SCALE, shifted
@@ -366,6 +368,29 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
         },
         notes=tuple(notes),
     )
+
+
+def scene_of_other_robot(run: RunFolder, robot: str) -> str:
+    """Say which other robot recorded the scene of a run; empty: none that is known.
+
+    A scene stands where the robot that recorded it was calibrated.
+
+    Args:
+        run: Its ``scene.json`` names the episodes that the scene was made of.
+        robot: Name of the one that is to act.
+    """
+    sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
+    names = {str(source.get("id", "")) for source in sources}
+    for path in run.episodes():
+        if path.stem not in names:
+            continue
+        try:
+            other = streams.recorded_robot(Episode.open(path)).name
+        except BridgeError:
+            continue
+        if other != robot:
+            return f"the scene in {run.scene_dir} was recorded with robot {other} ({path.stem})"
+    return ""
 
 
 def shape_hashes(run: RunFolder) -> dict[str, str]:

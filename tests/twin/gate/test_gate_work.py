@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
+from bridge.robots.robot import read_robot
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
@@ -214,6 +217,30 @@ def test_a_plan_of_a_scene_that_was_rebuilt_since_gets_no_verdict(
     assert not asked
     fresh = replace(question, plan=replace(question.plan, scene_hash=now))
     assert answer(fresh).accepted is True
+
+
+def test_a_scene_that_another_robot_recorded_gives_no_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    other = read_robot("ur10_parallel_gripper")
+    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan", kind="scan"))
+        data = other.description().encode()
+        writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
+    run.scene_dir.mkdir()
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [{"id": "scan"}], "views": []}  # fmt: skip
+    (run.scene_dir / "scene.json").write_text(json.dumps(record))
+    asked = accepting(monkeypatch)
+    question = question_of(run)
+    said = f"with robot {other.name} .scan., and plan p is for {ROBOT_NAME}. Scan"
+    with pytest.raises(UndecidedError, match=said):
+        answer(question)
+    assert not asked
+    assert answer(replace(question, any_robot=True)).accepted is True
+    same = replace(question, plan=replace(question.plan, robot=other.name))
+    assert answer(same).accepted is True
 
 
 def test_a_yes_that_the_audit_does_not_confirm_is_null_with_both_numbers(
