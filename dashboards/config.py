@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from bridge.errors import UsageError, refuse_outside
 from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.wire.config import DEFAULT_ENDPOINT
+from twin.plan.config import MODEL_POLICY
 
 BUILT_IN_POLICY = "perturbed"
 """Of the cell's own planner; the others are asked on the wire."""
@@ -77,12 +78,18 @@ class TrialsConfig:
     task: tuple[str, ...] = ("cube_into_box",)
     """Tasks: names in datasets/tasks, files, or all, which is every one that ships."""
     policies: tuple[str, ...] = ("perturbed",)
-    """How plans are made: perturbed, the cell's own planner, or a policy of robot-gst plan --live.
+    """How plans are made: perturbed, the cell's own planner, or a policy of robot-gst plan --live,
+    of which model needs --model and --model-name.
     The first one is tried in --arms, the others in the arm without alone."""
     trials: int = 5
     """Starts of each task; each is tried once in each arm of each policy."""
     first_start: int = 0
     """Number of the first of them in the session; runs of other starts share none with this one."""
+    model: str = ""
+    """Policy model: address of an OpenAI-compatible server whose model adds constraints to its
+    stages; the key comes from GST_MODEL_KEY. Only the planners ask it, and no image is sent."""
+    model_name: str = ""
+    """The server's name for that model."""
     calibration: Path | None = None
     """A run of the same session and of other starts, after calibrate --posterior: gate and replays
     use what was learned there of each task."""
@@ -123,6 +130,13 @@ class TrialsConfig:
                 "samples": (0, 100_000),
             },
         )
+        named = {bool(self.model), bool(self.model_name), MODEL_POLICY in self.policies}
+        if len(named) > 1:
+            message = (
+                "policy model and the model it asks go together: --policies model --model URL "
+                "--model-name NAME."
+            )
+            raise UsageError(message)
 
 
 DEMO_TASKS = ("cube_into_box", "cube_on_block")
@@ -154,6 +168,12 @@ class DemoConfig:
     def __post_init__(self) -> None:
         """Refuse now what would end the demo after minutes."""
         refuse_outside(self, PORTS)
+        if MODEL_POLICY in self.policies:
+            message = (
+                "the demo asks no model: robot-gst trials RUN --policies model --model URL "
+                "--model-name NAME."
+            )
+            raise UsageError(message)
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -126,7 +126,8 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
     """What the study will do, and by name how each of its tasks was asked for.
 
     Raises:
-        UsageError: When a task or an arm is unknown, or the arm control has no coin.
+        UsageError: When a task or an arm is unknown, the arm control has no coin, or a model's
+            address is none or holds a secret.
     """
     names = list(config.task)
     if EVERY_TASK in names:
@@ -151,9 +152,15 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         PolicyArms(policy=first, arms=config.arms),
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
     )
+    if config.model:
+        from twin.plan.ground.model_client import ModelConfig  # noqa: PLC0415  # NumPy
+
+        ModelConfig(url=config.model, model=config.model_name)  # refuses secrets in the address
     protocol = Protocol(
         tasks=tasks,
         policies=policies,
+        model_name=config.model_name,
+        model_address=config.model,
         rounds=config.rounds,
         study_seed=config.study_seed,
         retry=config.retry,
@@ -382,7 +389,9 @@ def _laboratory(
         gate.wait_until(lambda: "gate ready" in gate_log.read_text(errors="replace"))
         there.append(gate)
         if any(job.policy != BUILT_IN_POLICY for job in jobs):
-            planner, log = start("plan", ["plan", str(run.path), "--live", *connect])
+            model = ["--model", config.model, "--model-name", config.model_name]
+            asking = model if config.model else []
+            planner, log = start("plan", ["plan", str(run.path), "--live", *connect, *asking])
             planner.wait_until(lambda: "planner ready" in log.read_text(errors="replace"))
             there.append(planner)
         yield endpoint, there

@@ -105,7 +105,7 @@ def plan(
     if live:
         from twin.plan.live import run_planner
 
-        return run_planner(run, config, output)
+        return run_planner(run, config, output, words)
     if task is None:
         message = (
             'say what to plan: robot-gst plan RUN --task "put the cube into the box", or --live to '

@@ -132,6 +132,8 @@ class PlanAnswer:
     reason: str = ""
     heard: bool = True
     """Whether a planner answered at all."""
+    remarks: tuple[str, ...] = ()
+    """For whoever looks after the planner; they are not sent."""
 
     def to_json(self) -> bytes:
         """The plan itself, or ``{"plan": null, "reason": ...}``."""

@@ -110,6 +110,10 @@ class Protocol:
     the study takes none over."""
     calibration_from: str = ""
     """Which run that is and what it learned from, in words."""
+    model_name: str = ""
+    """Of the vision-language model that policy ``model`` asks; empty: none is asked."""
+    model_address: str = ""
+    """Of its server, without user and query."""
     stopping: str = "fixed"
     """fixed: after all starts of every task; nobody looks before."""
     retry: bool = False
@@ -251,7 +255,7 @@ def read_protocol(run_path: Path) -> Protocol | None:
 
 CARRIED_OUT = (
     *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
-    *("calibration_sha256", "calibration_from"),
+    *("calibration_sha256", "calibration_from", "model_name", "model_address"),
 )
 """What whoever carries a study out decides, too; the rest is the design's alone."""
 

@@ -1,6 +1,8 @@
 """The study command: jobs, their order and numbers, what is kept, and what is begun anew."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.task.protocol import keep_protocol, read_protocol
 from bridge.terminal import Output
 from dashboards import trials
 from dashboards.config import TrialsConfig
@@ -143,6 +146,68 @@ def test_only_whole_starts_are_kept_and_the_others_are_begun_anew(tmp_path: Path
         path.name for path in [*part, *cut]
     }
     assert trials._clear(run, left, QUIET) == left
+
+
+URL = "http://127.0.0.1:9/v1"
+MODEL = replace(STUDY, policies=("perturbed", "model"), model=URL, model_name="stub")
+
+
+class Started:
+    """A command that seems to run."""
+
+    def wait_until(self, _: Any) -> None:
+        """It is ready at once."""
+
+
+@pytest.mark.parametrize("config", [MODEL, STUDY])
+def test_a_model_is_named_to_the_planner_and_to_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: TrialsConfig
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    made = jobs_of(*protocol_of(config))
+    started: list[list[str]] = []
+
+    @contextmanager
+    def running(arguments: list[str], _: Path) -> Iterator[Started]:
+        started.append(arguments)
+        yield Started()
+
+    monkeypatch.setattr(trials, "running", running)
+    with trials._laboratory(run, config, made, 0) as (endpoint, _):
+        commands = [*started, *(command_of(job, config, endpoint) for job in made)]
+    named = [words[0] for words in commands if "--model" in words or "stub" in " ".join(words)]
+    assert named == (["plan"] if config.model else [])
+    (plan,) = (words for words in commands if words[0] == "plan")
+    asked = ["--model", URL, "--model-name", "stub"] if config.model else []
+    assert plan[-len(asked) or len(plan) :] == asked
+
+
+def test_the_protocol_names_the_model_and_holds_to_it(tmp_path: Path) -> None:
+    protocol, _ = protocol_of(MODEL)
+    keep_protocol(tmp_path, protocol, has_trials=False)
+    there = read_protocol(tmp_path)
+    assert there is not None
+    assert (there.model_name, there.model_address) == ("stub", URL)
+    assert not there.edited
+    keep_protocol(tmp_path, protocol, has_trials=True)
+    for name, change in (("model_name", {"model_name": "other"}), ("address", {"model": URL[:-3]})):
+        other, _ = protocol_of(replace(MODEL, **change))
+        with pytest.raises(UsageError, match=name):
+            keep_protocol(tmp_path, other, has_trials=True)
+
+
+@pytest.mark.parametrize("url", ["http://user:secret@host/v1", "http://host/v1?key=secret", "host"])
+def test_a_models_address_with_a_secret_gets_into_no_protocol(tmp_path: Path, url: str) -> None:
+    with pytest.raises(UsageError, match="address must") as caught:
+        run_trials(tmp_path / "run", replace(MODEL, model=url), QUIET)
+    assert "secret" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("change", [{"policies": ("nominal",)}, {"model": ""}, {"model_name": ""}])
+def test_half_a_model_is_no_study(change: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="--policies model --model URL --model-name NAME"):
+        replace(MODEL, **change)
 
 
 @pytest.mark.slow

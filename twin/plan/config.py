@@ -9,6 +9,9 @@ from cyclopts import Parameter
 from bridge.errors import UsageError, refuse_outside
 from bridge.wire.config import DEFAULT_ENDPOINT
 
+MODEL_POLICY = "model"
+"""The policy of plans that keep what a vision-language model added to the stages."""
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +42,8 @@ class PlanConfig:
 
     policy: str = "nominal"
     """nominal, single (the first candidate alone), loose (no distances), geometric (nothing is
-    optimised)."""
+    optimised), model (nominal with what a model adds: --model). With --live each request names
+    its own."""
     rounds: int = 5
     """Candidates that the twin may judge; each is steered by what it said of the one before."""
     seed: int = 0
@@ -48,7 +52,8 @@ class PlanConfig:
     """Whose start is planned from; none: the newest that shows all objects."""
     model: str = ""
     """Address of an OpenAI-compatible server whose model may add constraints, such as
-    http://127.0.0.1:8000/v1; its key comes from GST_MODEL_KEY. None: nobody is asked."""
+    http://127.0.0.1:8000/v1; its key comes from GST_MODEL_KEY. None: nobody is asked. With --live
+    it is asked for requests of policy model alone."""
     model_name: str = ""
     """The server's name for that model."""
     send_images: bool = False
@@ -62,4 +67,7 @@ class PlanConfig:
                 "a model is asked by its address and its name: --model URL --model-name NAME; "
                 "--send-images needs both."
             )
+            raise UsageError(message)
+        if self.policy == MODEL_POLICY and not self.model:
+            message = "policy model keeps what a model adds: --model URL --model-name NAME."
             raise UsageError(message)

@@ -1,7 +1,8 @@
 """A planner on the wire: a cell asks how a task is done from here, a plan or a reason is answered.
 
-It remembers nothing between two requests: the same request has the same answer. It moves nothing
-and publishes nothing; the cell that asks publishes the plan, asks the gate, and executes it or not.
+It remembers nothing between two requests: the same request has the same answer. What a model said
+is kept by what it was asked, so that this holds of policy ``model`` too. It moves nothing and
+publishes nothing; the cell that asks publishes the plan, asks the gate, and executes it or not.
 """
 
 import traceback
@@ -25,10 +26,11 @@ from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
-from twin.plan.config import LivePlanConfig
+from twin.plan.config import MODEL_POLICY, LivePlanConfig, PlanConfig
 from twin.plan.loop import straight
 from twin.plan.loop.nominal import POLICIES, PlanProposer
-from twin.plan.loop.propose import NoPlanError, Proposer, choose
+from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
+from twin.plan.model_stages import Asked, ask_about, client_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
@@ -40,6 +42,7 @@ PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
     **{name: partial(PlanProposer, policy) for name, policy in POLICIES.items()},
 }
 """How a plan is made, by the policy it is called."""
+GROUNDING = "gst localisation v1 of the request"
 ALIVE = "/alive"
 """Behind the service's key: the liveliness token of the planner that answers there."""
 
@@ -57,6 +60,7 @@ class LivePlanner:
         config: LivePlanConfig,
         urdf: Callable[[], str | None],
         proposers: Mapping[str, Callable[[], Proposer]] = PROPOSERS,
+        words: PlanConfig | None = None,
     ) -> None:
         """Prepare.
 
@@ -65,9 +69,12 @@ class LivePlanner:
             config: How many candidates are made.
             urdf: The robot's description, None before any.
             proposers: How a plan is made, by the policy it is called.
+            words: Name the model that adds to plans of policy ``model``; None, or without a model:
+                that policy has none.
         """
         self._run, self._config, self._urdf = run, config, urdf
         self._proposers = proposers
+        self._words = words if words is not None and words.model else None
         self._fitting: set[tuple[str, str]] = set()
         """Scenes, by their hash, that were recorded with a robot."""
 
@@ -79,17 +86,27 @@ class LivePlanner:
         """
         request = PlanRequest.from_json(payload)
         try:
-            return PlanAnswer(plan=self._planned(request))
+            return self._planned(request)
         except GstError as error:
             return PlanAnswer(reason=str(error))
         except Exception as error:  # noqa: BLE001  # a bug must not leave a cell without an answer
             traceback.print_exc()
             return PlanAnswer(reason=f"internal error: {type(error).__name__}: {error}")
 
-    def _planned(self, request: PlanRequest) -> Any:
-        make = self._proposers.get(request.policy)
-        if make is None:
-            known = ", ".join(sorted(self._proposers))
+    @property
+    def policies(self) -> list[str]:
+        """Those whose requests are answered with plans."""
+        without = () if self._words else (MODEL_POLICY,)
+        return sorted(name for name in self._proposers if name not in without)
+
+    def _planned(self, request: PlanRequest) -> PlanAnswer:
+        if request.policy == MODEL_POLICY and self._words is None:
+            raise NoPlanError(
+                "policy 'model' keeps what a vision-language model adds, and this planner asks "
+                "none. Start it with one: robot-gst plan RUN --live --model URL --model-name NAME."
+            )
+        if request.policy not in self._proposers:
+            known = ", ".join(self.policies)
             raise NoPlanError(f"policy {request.policy!r} is unknown. There are: {known}.")
         task = find_task_file(
             request.task,
@@ -97,8 +114,25 @@ class LivePlanner:
             attached=Attached(sha256=request.task_sha256),
         ).task()
         problem = self._problem(request, task)
-        candidate = choose(
-            make(),
+        asked = None
+        if request.policy == MODEL_POLICY and self._words is not None:
+            candidate, asked = self._chosen_with_model(request, problem, self._words)
+        else:
+            candidate = self._chosen(request, problem)
+        plan = replace(
+            candidate.plan,
+            task_sha256=request.task_sha256,
+            start_id=request.start_id,
+            round=request.round,
+            entities={name: se3.pose_record(T) for name, T in request.Ts_base_object().items()},
+            grounding_source=GROUNDING if asked is None else f"{GROUNDING}; {asked.source}",
+        )
+        return PlanAnswer(plan=plan, remarks=() if asked is None else tuple(asked.lines()))
+
+    def _chosen(self, request: PlanRequest, problem: Problem) -> Candidate:
+        """The candidate of the request's round."""
+        return choose(
+            self._proposers[request.policy](),
             problem,
             plan_id=f"plan_{request.round}",
             seed=request.seed,
@@ -106,14 +140,25 @@ class LivePlanner:
             refused=request.refused,
             most=self._config.candidates,
         )
-        return replace(
-            candidate.plan,
-            task_sha256=request.task_sha256,
-            start_id=request.start_id,
-            round=request.round,
-            entities={name: se3.pose_record(T) for name, T in request.Ts_base_object().items()},
-            grounding_source="gst localisation v1 of the request",
-        )
+
+    def _chosen_with_model(
+        self, request: PlanRequest, problem: Problem, words: PlanConfig
+    ) -> tuple[Candidate, Asked]:
+        """The same, and what the model said; without it where not even one plan keeps it."""
+        asked = ask_about(self._run, None, problem, words)
+        try:
+            return self._chosen(request, asked.problem), asked
+        except NoPlanError:
+            if asked.problem is problem:
+                raise
+            first = replace(request, round=0, refused=())
+            try:
+                self._chosen(first, asked.problem)
+            except NoPlanError as error:
+                asked = asked.left_out(problem, error)
+            else:
+                raise
+        return self._chosen(request, problem), asked
 
     def _problem(self, request: PlanRequest, task: Task) -> Problem:
         urdf = self._urdf()
@@ -197,18 +242,26 @@ def serve_planner(session: Any, planner: LivePlanner, cell: str, output: Output)
             output.say(
                 printable(f"{plan.start_id}: plan of round {plan.round} by {plan.policy}{changed}")
             )
+            for line in found.remarks:
+                output.say(printable(f"  {line}"))
         return data
 
     session.serve(cell_topic(cell, PLAN)[1:], answer)
 
 
-def run_planner(path: Path, config: LivePlanConfig, output: Output) -> int:
+def run_planner(
+    path: Path, config: LivePlanConfig, output: Output, words: PlanConfig | None = None
+) -> int:
     """Answer a cell's requests until SIGINT or SIGTERM; both end with exit code 0.
 
     Args:
         path: The run whose scene, calibration and task files are used.
         config: Cell, connection and how many candidates are made.
         output: Told when the planner is ready, and each answer.
+        words: May name the model that is asked for policy ``model``.
+
+    Raises:
+        UsageError: Its address is none.
     """
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 
@@ -222,7 +275,9 @@ def run_planner(path: Path, config: LivePlanConfig, output: Output) -> int:
         if not config.robot:
             heard["urdf"] = string_from_cdr(sample.data)
 
-    planner = LivePlanner(run, config, lambda: heard.get("urdf"))
+    if words is not None and words.model:
+        client_of(run, words)
+    planner = LivePlanner(run, config, lambda: heard.get("urdf"), words=words)
     wire = WireConfig(connect=config.connect, config=config.zenoh_config)
     with stop_signals() as stopped, open_session(wire) as session:
         claim_planner(session, config.cell)
@@ -230,8 +285,10 @@ def run_planner(path: Path, config: LivePlanConfig, output: Output) -> int:
         serve_planner(session, planner, config.cell, output)
         output.say(
             f"planner ready: cell {config.cell}, service {config.cell}{PLAN}, policies "
-            f"{', '.join(sorted(PROPOSERS))}. Stop with Ctrl-C."
+            f"{', '.join(planner.policies)}. Stop with Ctrl-C."
         )
+        if words is not None and words.send_images:
+            output.say("--send-images: a cell's requests hold no image, so the model gets none")
         while not stopped.wait(0.2):
             pass
     output.say("planner stopped")

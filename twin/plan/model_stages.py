@@ -51,6 +51,8 @@ class Asked:
     problem: Problem
     """Its task has the constraints that were added; as it was where the grammar answered."""
     answered_by: str
+    model: str
+    """The server's name for it."""
     address: str
     images_sent: bool
     remarks: tuple[str, ...]
@@ -60,6 +62,23 @@ class Asked:
         sent = "one image was sent" if self.images_sent else "no image was sent"
         head = f"stages: answered by {self.answered_by}; asked {self.address}; {sent}"
         return [head, *(f"  {remark}" for remark in self.remarks)]
+
+    @property
+    def source(self) -> str:
+        """Who answered and who was asked, for a plan."""
+        return f"stages: answered by {self.answered_by}; asked {self.model} at {self.address}"
+
+    def left_out(self, problem: Problem, why: Exception) -> "Asked":
+        """The same without what the model added.
+
+        Args:
+            problem: Whose task is as it was.
+            why: What no plan keeps.
+        """
+        remark = f"no plan keeps what the model added, so its constraints were left out: {why}"
+        return replace(
+            self, problem=problem, answered_by=BY_GRAMMAR, remarks=(*self.remarks, remark)
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The same as data."""
@@ -71,19 +90,20 @@ class Asked:
         }
 
 
-def ask_about(run: RunFolder, episode: str, problem: Problem, config: PlanConfig) -> Asked:
+def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: PlanConfig) -> Asked:
     """Ask the model of the settings for constraints; the grammar's stages are the fallback.
 
     Args:
         run: Its scene says what the objects look like; replies that were taken are kept in it.
-        episode: Shows the start.
+        episode: Shows the start; None: no image of it is there, and what came of asking is kept
+            even where every reply was refused.
         problem: Whose task is planned.
         config: Names the model and says whether an image may leave.
     """
     task = problem.scene.task
     instances = ((read_record(run) or {}).get("semantics") or {}).get("instances", ())
     things = vocabulary_of(task, instances).things
-    image, marks = marked_view(run, episode, problem)
+    image, marks = (None, {}) if episode is None else marked_view(run, episode, problem)
     question = Question(
         task=task.instruction,
         vocabulary=Vocabulary.of_task(task),
@@ -91,7 +111,8 @@ def ask_about(run: RunFolder, episode: str, problem: Problem, config: PlanConfig
         image_u8=image,
         marks=marks,
     )
-    answer = ask_model(question, client_of(run, config), lambda: stages_in(task))
+    client = replace(client_of(run, config), keep_refused=episode is None)
+    answer = ask_model(question, client, lambda: stages_in(task))
     remarks = answer.remarks
     if answer.answered_by != BY_GRAMMAR:
         problem, left_out = with_added(problem, answer.stages)
@@ -99,6 +120,7 @@ def ask_about(run: RunFolder, episode: str, problem: Problem, config: PlanConfig
     return Asked(
         problem=problem,
         answered_by=answer.answered_by,
+        model=config.model_name,
         address=config.model,
         images_sent=config.send_images and image is not None,
         remarks=remarks,

@@ -25,7 +25,6 @@ from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.ground.model_client import BY_GRAMMAR
 from twin.plan.ground.run_tasks import UnderstoodTask
 from twin.plan.live import PROPOSERS
 from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
@@ -266,13 +265,7 @@ def plan_once(
     except NoPlanError as error:
         if asked is None or asked.problem is start.problem:
             raise
-        why = f"no plan keeps what the model added, so its constraints were left out: {error}"
-        asked = replace(
-            asked,
-            problem=start.problem,
-            answered_by=BY_GRAMMAR,
-            remarks=(*asked.remarks, why),
-        )
+        asked = asked.left_out(start.problem, error)
         attempts = _attempts(understood, start.problem, judge, config, asked)
     paths = [_kept(run, start, each) for each in attempts]
     path = paths[-1] if attempts[-1].verdict.accepted is True else None

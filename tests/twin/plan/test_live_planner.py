@@ -12,9 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / "constrain")]
+
+from hostile_replies import valid_reply
 from loopback import free_endpoint
 from own_process import ROOT
 from scripted_plans import scene_of_test
+from test_model_client import Server, says, serving
 
 import robot_gst
 from bridge.episode.metadata import EpisodeInfo
@@ -31,7 +36,7 @@ from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
-from twin.plan.config import LivePlanConfig
+from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
 from twin.plan.loop.straight import GeometricProposer
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
@@ -160,6 +165,88 @@ def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
         assert f"recorded with robot {other.name} (scan)" in answer.reason
     named = LivePlanConfig(robot=ROBOT_NAME)  # the user says that it fits
     assert LivePlanner(run, named, ROBOT.urdf_text).answer(asked).plan is not None
+
+
+LOW = {"kind": "height", "a": {"obj": "cube", "anchor": "top"}, "min": -0.01, "max": 0.5}
+NEVER = {"kind": "height", "a": {"obj": "cube", "anchor": "top"}, "min": 0.9}
+
+
+def adds(constraint: dict[str, Any]) -> str:
+    """A reply that wants this on the way to the box."""
+    record: dict[str, Any] = valid_reply() | {"task": FILE.task().instruction}
+    for stage in record["stages"]:
+        stage |= {"subgoal": [], "path": []}
+    record["stages"][1]["path"] = [constraint]
+    return json.dumps(record)
+
+
+def asking(run: RunFolder, server: Server) -> LivePlanner:
+    words = PlanConfig(model=server.url, model_name="stub")
+    return LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, words=words)
+
+
+def test_policy_model_keeps_what_the_model_adds_and_the_same_request_has_the_same_answer(
+    tmp_path: Path,
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    asked = request(policy="model")
+    with serving(says(adds(LOW))) as server:
+        first = asking(run, server).answer(asked.to_json())
+    assert first.plan is not None, first.reason
+    assert asked.why_unfit(first.plan) == ""
+    assert (first.plan.planner, first.plan.policy) == ("gst_planner", "model")
+    assert [LOW in stage.path for stage in first.plan.stages] == [False, True]
+    who = f"stages: answered by model; asked stub at {server.url}"
+    assert first.plan.grounding_source.endswith(who)
+    assert "no image was sent" in first.remarks[0]
+    again = asking(run, server).answer(asked.to_json())  # nobody listens there any more
+    assert again.to_json() == first.to_json()
+    assert "kept from an earlier request" in again.remarks[-1]
+    assert len(server.asked) == 1
+
+
+def test_two_refused_replies_leave_the_plan_of_nominal_for_good(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    asked = request(policy="model").to_json()
+    with serving(says("Sure!"), says("Here you go."), says(adds(LOW))) as server:
+        first, again = (asking(run, server).answer(asked) for _ in range(2))
+        nominal = asking(run, server).answer(request(policy="nominal").to_json())
+    assert first.plan is not None
+    assert nominal.plan is not None
+    assert "answered by grammar" in first.plan.grounding_source
+    assert "model" not in nominal.plan.grounding_source
+    assert first.plan.tau == nominal.plan.tau
+    assert again.to_json() == first.to_json()
+    assert len(server.asked) == 2
+
+
+@pytest.mark.slow
+def test_live_what_no_plan_keeps_is_left_out_in_every_round(tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    with serving(says(adds(NEVER))) as server:
+        planner = asking(run, server)
+        for round_ in range(2):
+            answer = planner.answer(request(policy="model", round=round_).to_json())
+            assert answer.plan is not None, answer.reason
+            assert "answered by grammar" in answer.plan.grounding_source
+            assert any("no plan keeps what the model added" in text for text in answer.remarks)
+            assert not any(stage.path for stage in answer.plan.stages)
+
+
+def test_policy_model_without_a_model_has_a_reason(planner: LivePlanner) -> None:
+    answer = planner.answer(request(policy="model").to_json())
+    assert answer.plan is None
+    assert "--live --model URL --model-name NAME" in answer.reason
+    assert "model" not in planner.policies
+
+
+def test_live_with_a_model_of_no_address_is_wrong_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    words = ["--model", "nowhere", "--model-name", "stub"]
+    assert robot_gst.run(["plan", str(run.path), "--live", *words]) == 2
+    assert "must begin with http" in capsys.readouterr().err
 
 
 def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

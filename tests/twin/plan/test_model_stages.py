@@ -188,6 +188,7 @@ def test_a_models_stages_find_those_of_the_task() -> None:
     [
         (["--model", "http://127.0.0.1:9/v1"], "--model-name"),
         (["--send-images"], "--model URL"),
+        (["--policy", "model"], "--model URL"),
         (["--model", "nowhere", "--model-name", "m"], "must begin with http"),
         (["--model", "http://127.0.0.1:9/v1", "--model-name", "m", "--dry"], "asks no model"),
     ],

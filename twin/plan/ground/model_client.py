@@ -6,6 +6,7 @@ The answer says which of the three it is. Images leave the machine only where th
 """
 
 import base64
+import fcntl
 import hashlib
 import http.client
 import json
@@ -63,6 +64,8 @@ class ModelConfig:
     """Of the server's answer around the reply."""
     cache: Path | None = None
     """Folder of replies that were taken, by the content of their request."""
+    keep_refused: bool = False
+    """Keep there, too, that both replies were refused: a question has one answer for good."""
     log: Path | None = None
     """File to which requests and replies are appended, one JSON record each, without secrets."""
 
@@ -141,14 +144,30 @@ def ask_model(
         fallback: Plans without a model; its errors are not caught.
     """
     remarks = [_told(question, config)]
+    with _alone(config):
+        found = _judged(question, config, remarks)
+    if found is not None:
+        return _answer(config, *found, remarks)
+    remarks.append("the grammar read the instruction instead")
+    return _answer(config, fallback(), BY_GRAMMAR, remarks)
+
+
+def _judged(
+    question: Question, config: ModelConfig, remarks: list[str]
+) -> tuple[tuple[Stage, ...], str] | None:
+    """Stages that a model gave, and at which try; None: it gave none that can be used."""
     first = messages = _messages(question, config)
     kept = _kept(config, first)
+    if kept and kept[1] == BY_GRAMMAR:
+        remarks.append("both replies to an earlier request with the same content were refused")
+        return None
+    reply = ""
     for who in (BY_MODEL, BY_REPAIR):
         try:
             reply = kept[0] if kept else _reply(messages, question, config, remarks)
         except EndpointError as error:
             remarks.append(f"no reply: the server {error.found}")
-            break
+            return None
         try:
             stages = read_reply(reply, question.vocabulary, question.task)
         except ReplyError as error:
@@ -158,11 +177,12 @@ def ask_model(
             continue
         if kept:
             remarks.append("the reply was kept from an earlier request with the same content")
-            return _answer(config, stages, kept[1], remarks)
+            return stages, kept[1]
         _keep(config, first, reply, who)
-        return _answer(config, stages, who, remarks)
-    remarks.append("the grammar read the instruction instead")
-    return _answer(config, fallback(), BY_GRAMMAR, remarks)
+        return stages, who
+    if config.keep_refused:
+        _keep(config, first, reply, BY_GRAMMAR)
+    return None
 
 
 def _answer(config: ModelConfig, stages: tuple[Stage, ...], who: str, remarks: list[str]) -> Answer:
@@ -432,13 +452,28 @@ def _failure(error: Exception, config: ModelConfig) -> str:
 # What is kept
 
 
+@contextmanager
+def _alone(config: ModelConfig) -> Iterator[None]:
+    """Let no two planners ask at once: the second finds what the first was told."""
+    if config.cache is None:
+        yield
+        return
+    config.cache.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(config.cache, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def _digest(config: ModelConfig, messages: Messages) -> str:
     asked = json.dumps([config.url, config.model, messages], sort_keys=True)
     return hashlib.sha256(asked.encode()).hexdigest()
 
 
 def _kept(config: ModelConfig, messages: Messages) -> tuple[str, str] | None:
-    """A reply to the same content, and whether it took a repair; None: there is none."""
+    """A reply to the same content, and who answered then; None: there is none."""
     if config.cache is None:
         return None
     path = config.cache / f"{_digest(config, messages)}.json"
@@ -448,13 +483,13 @@ def _kept(config: ModelConfig, messages: Messages) -> tuple[str, str] | None:
         reply, who = record["reply"], record["answered_by"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return (reply, who) if isinstance(reply, str) and who in (BY_MODEL, BY_REPAIR) else None
+    taken = (BY_MODEL, BY_REPAIR, *((BY_GRAMMAR,) if config.keep_refused else ()))
+    return (reply, who) if isinstance(reply, str) and who in taken else None
 
 
 def _keep(config: ModelConfig, messages: Messages, reply: str, who: str) -> None:
-    """Remember a reply that was taken; it is judged again when it is used."""
+    """Remember a reply; one that was taken is judged again when it is used."""
     if config.cache is not None:
-        config.cache.mkdir(parents=True, exist_ok=True)
         record = json.dumps({"answered_by": who, "reply": reply})
         write_whole(config.cache / f"{_digest(config, messages)}.json", record.encode())
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.check import TABLE, nearest
 from bridge.task.plan import Plan
+from twin.plan.config import MODEL_POLICY
 from twin.plan.constrain.constraint import (
     SHOWN,
     Constraint,
@@ -118,7 +119,9 @@ LOOSE = Policy(
     ways=(Way(straight=True), Way()),
 )
 """Nothing has to keep a distance, and objects are carried along straight lines."""
-POLICIES = {policy.name: policy for policy in (NOMINAL, SINGLE, LOOSE)}
+MODEL = replace(NOMINAL, name=MODEL_POLICY)
+"""As nominal, of a problem to whose stages a model added constraints."""
+POLICIES = {policy.name: policy for policy in (NOMINAL, SINGLE, LOOSE, MODEL)}
 
 
 @dataclass(frozen=True, kw_only=True)
