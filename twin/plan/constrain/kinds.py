@@ -441,7 +441,7 @@ def _visible(record: Record, problem: Problem) -> Constraint:
         T_camera = like(view.T_base_camera, T)[None]
         if view.T_tcp_camera is not None:
             T_camera = state.T_base_tcp @ like(view.T_tcp_camera, T)
-        eyes = T_camera[:, None, :3, 3]
+        lens_m = T_camera[:, None, :3, 3]
         each = 0.0 * state.T_base_tcp[:, :1, 0]  # of what stands still there is one
         found = [xp.amax(arrays.seen_from(T_camera, p) @ like(planes.T, T), axis=-1) + each]
         for other in (key for key in others if key in state.Ts_base_object):
@@ -451,7 +451,7 @@ def _visible(record: Record, problem: Problem) -> Constraint:
                 shift[:3, 3] = centre
                 half = like(np.array(size) / 2, T)
                 T_panel = T_other @ like(shift, T)
-                found.append(arrays.blocked_length(eyes, p, T_panel, half) + each)
+                found.append(arrays.blocked_length(lens_m, p, T_panel, half) + each)
         return quantile(xp.amax(xp.stack(found, axis=-1), axis=-1), share)
 
     term = Term(
