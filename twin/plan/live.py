@@ -32,7 +32,7 @@ from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
 from twin.plan.model_stages import Asked, ask_about, client_of
 from twin.plan.problem import Problem
-from twin.plan.shapes import shapes_of
+from twin.plan.shapes import keypoints_of, shapes_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
@@ -184,10 +184,12 @@ class LivePlanner:
             task, urdf, poses, covariances=covariances
         )
         start_rad = np.array(request.joints_rad, dtype=np.float64)
+        shapes = shapes_of(self._run.scene_dir, task)
         problem = Problem(
             scene=replace(scene, start_rad=start_rad),
             robot=robot,
-            shapes=shapes_of(self._run.scene_dir, task),
+            shapes=shapes,
+            keypoints=keypoints_of(shapes),
         )
         self._refuse_other_robot(problem)
         refuse_unusable(problem)

@@ -106,10 +106,13 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
     image, marks = (None, {}) if episode is None else marked_view(run, episode, problem)
     question = Question(
         task=task.instruction,
-        vocabulary=Vocabulary.of_task(task),
+        vocabulary=Vocabulary.of_task(
+            task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
+        ),
         labels={key: thing.describe() for key, thing in things.items()},
         image_u8=image,
         marks=marks,
+        keypoints=[(each.object_id, each.name) for each in problem.keypoints],
     )
     client = replace(client_of(run, config), keep_refused=episode is None)
     answer = ask_model(question, client, lambda: stages_in(task))

@@ -35,6 +35,8 @@ class Shape:
     """Distances to it in its own frame, where the rebuilt scene has them."""
     parts_m: Mapping[str, Float[np.ndarray, "num_points 3"]] = field(default_factory=dict)
     """Points of its parts in its own frame, by their names in the rebuilt scene."""
+    keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    """Named points of the rebuilt scene, in its own frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +46,24 @@ class Keypoint:
     p_m: Float[np.ndarray, "3"]
     object_id: str | None = None
     """In whose frame it is and with what it moves; None: the base frame, and it stands still."""
+    name: str = ""
+    """In the rebuilt scene, such as top; empty: it has none."""
+
+    @property
+    def words(self) -> str:
+        """What it is, for a person."""
+        return f"{self.object_id}'s {self.name}" if self.object_id and self.name else self.name
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraView:
-    """A camera that stands still."""
+    """A camera, and where it is."""
 
     camera: Camera
     T_base_camera: Float[np.ndarray, "4 4"]
+    """At the start."""
+    T_tcp_camera: Float[np.ndarray, "4 4"] | None = None
+    """Of a camera in the hand, which moves with it; None: it stands still."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,15 +22,19 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
+from bridge.geometry import se3
+from bridge.geometry.camera import Camera
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Factor, Verdict
 from twin.gate import twin_process
 from twin.plan import model_stages, once
+from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
-from twin.plan.problem import Problem
+from twin.plan.loop.nominal import SINGLE, PlanProposer
+from twin.plan.problem import CameraView, Keypoint, Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
 
@@ -181,6 +185,52 @@ def test_a_models_stages_find_those_of_the_task() -> None:
     changed, _ = model_stages.with_added(problem, stages)
     found = [(each.get("subgoal"), each.get("path")) for each in changed.scene.task.stages]
     assert found == [([LOW], None), ([NEVER], [LOW]), (None, [NEVER])]
+
+
+TOP_CORNER = Keypoint(p_m=np.array([0.015, 0.0, 0.02]), object_id="cube", name="top")
+NEAR = {
+    "kind": "distance",
+    "a": {"kp": 0},
+    "b": {"obj": "box", "anchor": "opening"},
+    "max": 0.07,
+}
+
+
+def test_a_plan_keeps_what_is_asked_of_a_keypoint_where_it_lets_go(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = replace(problem_of_test(), keypoints=(TOP_CORNER,))
+    monkeypatch.setattr(sys.modules[__name__], "problem_of_test", lambda: problem)
+    wanted = reply()
+    wanted["stages"][1]["subgoal"] = [NEAR]
+    with serving(says(json.dumps(wanted))) as server:
+        data, plan = planned(run, server, capsys)
+    assert data["model"]["answered_by"] == "model"
+    scene = json.loads(server.asked[0]["messages"][1]["content"])["scene"]
+    assert scene["keypoints"] == [{"kp": 0, "object": "cube", "name": "top"}]
+    release = plan.stages[-1]
+    assert NEAR in release.subgoal
+    (at_start,) = plan.keypoints_m
+    np.testing.assert_allclose(
+        at_start, se3.apply(problem.scene.Ts_base_object["cube"], TOP_CORNER.p_m)
+    )
+    constraint = compile_constraint(NEAR, problem)
+    assert constraint.violation(once._state(problem, plan, None))[0] > 0
+    assert constraint.violation(once._state(problem, plan, release))[0] <= 0
+    assert any("keypoint 0 (cube's top)" in line for line in data["constraints"])
+
+
+def test_keypoints_and_cameras_change_no_plan_that_names_none() -> None:
+    bare = problem_of_test()
+    view = CameraView(
+        camera=Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0), T_base_camera=np.eye(4)
+    )
+    full = replace(bare, keypoints=(TOP_CORNER,), cameras={"side": view})
+    one, other = (
+        PlanProposer(SINGLE).propose(each, plan_id="p", seed=3, count=1, steer=None)[0].plan
+        for each in (bare, full)
+    )
+    assert one.to_json() == other.to_json()
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ import pytest
 from scripted_plans import scene_of_test
 
 from bridge.episode.run_folder import RunFolder
+from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import SCANNED, Task, load_task
 from twin.plan.loop.nominal import SINGLE, PlanProposer
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.steer import tried_in
 from twin.plan.problem import Problem
-from twin.plan.shapes import GUESSED_SHARE, problem_of, shapes_of
+from twin.plan.shapes import GUESSED_SHARE, keypoints_of, problem_of, shapes_of
 from twin.robot.model import load_robot
 from twin.scene.gaussians import GaussianCloud, write_ply
 from twin.scene.localise.result import LocalisedObject, missing
@@ -25,7 +26,13 @@ from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.semantics.store import write_semantics
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import mesh_ply
-from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION, SPLATS
+from twin.scene.store.folder import (
+    NEEDED,
+    SCENE_FILE,
+    SCENE_VERSION,
+    SPLATS,
+    UnreadableSceneError,
+)
 
 SHIFT_M = np.array([0.004, -0.002, -0.001])
 TRUNCATION_M = 0.006
@@ -177,6 +184,38 @@ def test_parts_of_the_scene_are_where_the_surface_is(tmp_path: Path, task: Task)
     assert parts["top"][:, 2].min() > 0.0
     assert np.abs(parts["top"]).max() <= 0.0201  # moved back with the surface
     assert shapes_of(folder, task)["cube"].parts_m == {}
+
+
+def with_keypoints(folder: Path, **changes: Any) -> None:
+    """A scene that names two points of its cube, in the base frame it was scanned in."""
+    T = se3.transform_from(np.array([0.8, 0.0, 0.0, 0.6]), np.array([0.5, 0.1, 0.02]))
+    places = {"top": (0.0, 0.0, 0.02), "centre": (0.0, 0.0, 0.0)}
+    points = {name: se3.apply(T, np.array(p) + SHIFT_M).tolist() for name, p in places.items()}
+    about = {"object": "cube", "num_splats": 60, "keypoints_m": points | changes}
+    record: dict[str, Any] = {**dict.fromkeys(NEEDED, ""), "schema_version": SCENE_VERSION}
+    record |= {"semantics": {"instances": [about, {"object": None, "num_splats": 1}]}}
+    record |= {"objects": {"cube": {"T_base_object": se3.pose_record(T)}}}
+    (folder / SCENE_FILE).write_text(json.dumps(record))
+
+
+def test_keypoints_of_the_scene_are_numbered_and_where_the_surface_is(
+    tmp_path: Path, task: Task
+) -> None:
+    folder = written(tmp_path / "scene", task)
+    with_keypoints(folder)
+    centre, top = keypoints_of(shapes_of(folder, task))
+    assert (centre.words, top.words) == ("cube's centre", "cube's top")
+    assert top.object_id == "cube"
+    np.testing.assert_allclose(centre.p_m, 0.0, atol=1e-6)  # moved back with the surface
+    np.testing.assert_allclose(top.p_m, (0.0, 0.0, 0.02), atol=1e-6)
+    assert keypoints_of(shapes_of(None, task)) == ()
+
+
+def test_keypoints_that_are_none_name_the_file(tmp_path: Path, task: Task) -> None:
+    folder = written(tmp_path / "scene", task)
+    with_keypoints(folder, top=[0.0, 1.0])
+    with pytest.raises(UnreadableSceneError, match=SCENE_FILE):
+        shapes_of(folder, task)
 
 
 @pytest.mark.slow

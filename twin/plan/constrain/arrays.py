@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from twin.scene.shape.sdf import SdfGrid
 
@@ -189,21 +188,19 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
     return xp.where(overlap <= 0, overlap, clear)
 
 
-def blocked_length(
-    start_m: Float[np.ndarray, "3"], ends_m: Array, T_box: Array, half_m: Array
-) -> Array:
+def blocked_length(starts_m: Array, ends_m: Array, T_box: Array, half_m: Array) -> Array:
     """How long straight lines run inside a box; negative where they miss it [m].
 
     Slabs: a line is inside between the last plane it enters by and the first it leaves by.
 
     Args:
-        start_m: One point all lines start from.
+        starts_m: The point all lines of a state start from, ``(num_states, 1, 3)``.
         ends_m: ``(num_states, num_points, 3)``.
         T_box: Poses of the box's middle, ``(num_states, 4, 4)``.
         half_m: Half its extents, ``(3,)``.
     """
     xp = namespace(ends_m)
-    start = seen_from(T_box, like(start_m, ends_m)[None, None])
+    start = seen_from(T_box, starts_m)
     way = seen_from(T_box, ends_m) - start
     steep = xp.where(abs(way) < _PARALLEL_M, _PARALLEL_M, way)
     first, last = (-half_m - start) / steep, (half_m - start) / steep

@@ -96,7 +96,10 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
         ]
         return sum(places) / len(places) + like(offset, state.T_base_tcp)
 
-    words = f"keypoint {ids[0]}" if "kp" in spec else f"the middle of keypoints {ids}"
+    called = [f"{k} ({words})" if (words := problem.keypoints[k].words) else f"{k}" for k in ids]
+    words = f"keypoint {called[0]}"
+    if "mean" in spec:
+        words = f"the middle of keypoints {', '.join(called)}"
     return mean, words + aside
 
 

@@ -6,6 +6,7 @@ between bodies, which predicates decide too, are beside this in ``relations``.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,7 +32,13 @@ from twin.plan.constrain.bodies import (
 )
 from twin.plan.constrain.constraint import SCALES, Constraint, Term, flattened
 from twin.plan.constrain.relations import RELATIONS
-from twin.plan.constrain.schema import BASE, SCENE, Vocabulary, check_constraint
+from twin.plan.constrain.schema import (
+    BASE,
+    SCENE,
+    ConstraintError,
+    Vocabulary,
+    check_constraint,
+)
 from twin.plan.problem import Problem, State
 
 NUM_SEEN = 50
@@ -54,6 +61,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
     vocabulary = Vocabulary.of_task(
         problem.scene.task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
     )
+    _refuse_unknown_keypoints(record, problem)
     check_constraint(record, vocabulary)
     for name in _named(record):
         if name in problem.scene.missing():
@@ -61,6 +69,31 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
             raise UsageError(message)
     return _KINDS[record["kind"]](record, problem)
+
+
+def names_keypoint(record: Record) -> bool:
+    """Whether a constraint names a keypoint anywhere."""
+    return any(True for _ in _numbers(record))
+
+
+def _refuse_unknown_keypoints(record: Record, problem: Problem) -> None:
+    known = range(len(problem.keypoints))
+    for number in _numbers(record):
+        if isinstance(number, int) and number not in known:
+            listed = ", ".join(f"{k} ({problem.keypoints[k].words})" for k in known)
+            there = f"There are: {listed}." if listed else "There are none without a rebuilt scene."
+            raise ConstraintError(problems=(f"keypoint {number} is unknown. {there}",))
+
+
+def _numbers(record: Record) -> Iterator[Any]:
+    """Of the keypoints that a record names anywhere."""
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from _numbers(value)
+        elif key == "kp":
+            yield value
+        elif key == "mean" and isinstance(value, list | tuple):
+            yield from value
 
 
 _ID_KEYS = ("obj", "container", "support", "reference", "against", "first", "second", "over")
@@ -405,8 +438,12 @@ def _visible(record: Record, problem: Problem) -> Constraint:
         T = pose_of(state, obj)
         xp = namespace(T)
         p = arrays.carried(T, like(points, T))
-        q = arrays.seen_from(like(view.T_base_camera, T)[None], p)
-        found = [xp.amax(q @ like(planes.T, T), axis=-1)]
+        T_camera = like(view.T_base_camera, T)[None]
+        if view.T_tcp_camera is not None:
+            T_camera = state.T_base_tcp @ like(view.T_tcp_camera, T)
+        lens_m = T_camera[:, None, :3, 3]
+        each = 0.0 * state.T_base_tcp[:, :1, 0]  # of what stands still there is one
+        found = [xp.amax(arrays.seen_from(T_camera, p) @ like(planes.T, T), axis=-1) + each]
         for other in (key for key in others if key in state.Ts_base_object):
             T_other = pose_of(state, other)
             for centre, size in problem.model(other).panels():
@@ -414,7 +451,7 @@ def _visible(record: Record, problem: Problem) -> Constraint:
                 shift[:3, 3] = centre
                 half = like(np.array(size) / 2, T)
                 T_panel = T_other @ like(shift, T)
-                found.append(arrays.blocked_length(view.T_base_camera[:3, 3], p, T_panel, half))
+                found.append(arrays.blocked_length(lens_m, p, T_panel, half) + each)
         return quantile(xp.amax(xp.stack(found, axis=-1), axis=-1), share)
 
     term = Term(

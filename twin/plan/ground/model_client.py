@@ -15,7 +15,7 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,6 +108,8 @@ class Question:
     """With the marks of ``draw_marks``."""
     marks: Mapping[str, int] = field(default_factory=dict)
     """The number on each object."""
+    keypoints: Sequence[tuple[str | None, str]] = ()
+    """Of each keypoint, by its number, the object it moves with and its name in the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,7 +211,7 @@ def _messages(question: Question, config: ModelConfig) -> Messages:
     schema = question.vocabulary.schema()
     rules = _RULES + "\nSchema: " + json.dumps({"$defs": schema["$defs"]}, separators=(",", ":"))
     contacts = question.vocabulary.allowed_contacts
-    scene = {
+    scene: dict[str, Any] = {
         "objects": [
             {
                 "id": name,
@@ -222,6 +224,13 @@ def _messages(question: Question, config: ModelConfig) -> Messages:
         ],
         "contacts": None if contacts is None else sorted(sorted(pair) for pair in contacts),
     }
+    if question.keypoints:
+        scene["keypoints"] = [
+            {"kp": number, "object": key, "name": printable(name)[:MOST_LABEL]}
+            for number, (key, name) in enumerate(question.keypoints)
+        ]
+    if question.vocabulary.cameras:
+        scene["cameras"] = list(question.vocabulary.cameras)
     asked = json.dumps({"instruction": question.task, "scene": scene})
     content: list[dict[str, Any]] = [{"type": "text", "text": asked}]
     if config.send_images and question.image_u8 is not None:

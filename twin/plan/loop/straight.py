@@ -17,7 +17,7 @@ from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import ObjectModel, Task
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.steer import Steer
-from twin.plan.loop.tau import plan_stage, refuse_without_stages, stages_of
+from twin.plan.loop.tau import named_keypoints, plan_stage, refuse_without_stages, stages_of
 from twin.plan.problem import Problem
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -161,6 +161,7 @@ def _plan(problem: Problem, choice: _Choice, plan_id: str) -> Plan:
         task=task.name,
         instruction=task.instruction,
         entities={key: se3.pose_record(T) for key, T in scene.Ts_base_object.items()},
+        keypoints_m=named_keypoints(problem),
         joint_names=record.joints,
         stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
         tau=tau,

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.plan import CandidateGrasp, Stage, Waypoint
 from bridge.task.task_file import Task
+from twin.plan.constrain.kinds import names_keypoint
 from twin.plan.constrain.relations import constraint_of
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import waypoints_of
 from twin.plan.path.transfer import Leg
-from twin.plan.problem import Grasp
+from twin.plan.problem import Grasp, Problem
 from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]
@@ -158,6 +159,24 @@ def plan_stage(
         t_start_ns=start_ns,
         t_end_ns=end_ns,
     )
+
+
+def named_keypoints(problem: Problem) -> tuple[tuple[float, float, float], ...]:
+    """All keypoints at the start, base frame, where a stage names one; what it names has a number.
+
+    Args:
+        problem: As it is at the start.
+    """
+    tables = problem.scene.task.stages
+    asked = [table.get(kind, ()) for table in tables for kind in ("subgoal", "path")]
+    if not any(names_keypoint(record) for records in asked for record in records):
+        return ()
+    Ts = problem.scene.Ts_base_object
+    places = [
+        each.p_m if each.object_id is None else se3.apply(Ts[each.object_id], each.p_m)
+        for each in problem.keypoints
+    ]
+    return tuple((float(x), float(y), float(z)) for x, y, z in places)
 
 
 def goals_of(task: Task, key: str) -> list[dict[str, Any]]:

@@ -268,6 +268,49 @@ def test_what_is_hidden_behind_the_post_is_not_visible() -> None:
     )
 
 
+def test_a_keypoint_goes_where_its_object_goes() -> None:
+    record = {"kind": "distance", "a": {"kp": 0}, "b": {"xyz": [0.0, 0.0, 0.0]}, "max": 0.1}
+    constraint = compile_constraint(record, blocks())
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        T = pose(*rng.uniform(-1.0, 1.0, 3), rng.uniform(-3.0, 3.0))
+        away = np.linalg.norm(se3.apply(T, blocks().keypoints[0].p_m))
+        assert constraint.violation(state(cube=T))[0] == pytest.approx(away - 0.1)
+
+
+def test_a_keypoint_that_is_not_there_is_refused_with_those_that_are() -> None:
+    named = replace(blocks().keypoints[0], name="top")
+    record = {"kind": "height", "a": {"mean": [0, 7]}, "min": 0.1}
+    with pytest.raises(UsageError, match=r"keypoint 7 is unknown. There are: 0 \(cube's top\)\."):
+        compile_constraint(record, replace(blocks(), keypoints=(named,)))
+    with pytest.raises(UsageError, match="There are none without a rebuilt scene"):
+        compile_constraint(record, replace(blocks(), keypoints=()))
+    told = compile_constraint(
+        {**record, "a": {"kp": 0}}, replace(blocks(), keypoints=(named,))
+    ).explain(START)
+    assert "keypoint 0 (cube's top)" in told
+
+
+def test_a_camera_in_the_hand_sees_what_one_that_stands_there_sees() -> None:
+    """And what it looks away from, it does not see."""
+    fixed = blocks().cameras["side"]
+    T_base_tcp = pose(0.4, 0.1, 0.3, 0.2)
+    held = replace(fixed, T_tcp_camera=se3.invert(T_base_tcp) @ fixed.T_base_camera)
+    record = EXAMPLES["visible"][0]
+    by_hand = compile_constraint(record, replace(blocks(), cameras={"side": held}))
+    here = state(tcp=T_base_tcp)
+    assert by_hand.violation(here)[0] == pytest.approx(made("visible").violation(here)[0])
+    assert by_hand.violation(here)[0] <= 0
+    turned = fixed.T_base_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    away = state(tcp=turned @ se3.invert(held.T_tcp_camera))
+    assert by_hand.violation(away)[0] > 0
+    assert made("visible").violation(away)[0] <= 0
+    still = compile_constraint(
+        record, replace(blocks(), cameras={"side": replace(fixed, T_base_camera=turned)})
+    )
+    assert still.violation(here)[0] > 0
+
+
 def test_what_was_not_localised_cannot_be_planned_with() -> None:
     scene = blocks().scene
     left = {key: T for key, T in scene.Ts_base_object.items() if key != "box"}
