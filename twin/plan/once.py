@@ -234,7 +234,7 @@ def cameras_at(
             if tree.root_of(info.frame_id) != base_frame:
                 continue
             T = tree.T_root_frame(info.frame_id, stamp_ns)
-            fixed = _stands_still(tree, info.frame_id, moved) if mount is None else mount.fixed
+            fixed = _is_stationary(tree, info.frame_id, moved) if mount is None else mount.fixed
         except GstError:
             continue
         if not np.isfinite(T).all() or fixed is None or not (fixed or T_base_tcp is not None):
@@ -244,15 +244,17 @@ def cameras_at(
     return found
 
 
-def _stands_still(tree: TransformTree, frame: str, moved: bool) -> bool | None:
+def _is_stationary(tree: TransformTree, frame: str, moved: bool) -> bool | None:
     """Whether a camera never moves; None: the arm does not either, so nobody knows."""
     stamps = tree.stamps_ns(frame)
     if len(stamps) <= 1:
         return True
     some = stamps[np.unique(np.linspace(0, len(stamps) - 1, LOOKS).round().astype(int))]
     Ts = tree.Ts_root_frame(frame, some)
-    still = all(same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts)
-    return (True if moved else None) if still else False
+    stationary = all(
+        same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts
+    )
+    return (True if moved else None) if stationary else False
 
 
 @dataclass(frozen=True, kw_only=True)
