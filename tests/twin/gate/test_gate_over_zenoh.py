@@ -277,6 +277,20 @@ def test_two_planners_at_once_each_hear_of_their_own_plan(
     assert heard == {name: [f"{name}_{n}" for n in range(10)] for name in heard}
 
 
+ASKING = """
+import sys, time
+from bridge.wire.config import WireConfig
+from bridge.wire.errors import NoReplyError
+from bridge.wire.session import open_session
+session, plan = open_session(WireConfig(connect=(sys.argv[1],))), sys.stdin.buffer.read()
+while True:  # a session that has just been opened may not know of the service yet
+    try:
+        session.query("lab/gate/verdict", plan, timeout_s=60.0)
+    except NoReplyError:
+        time.sleep(0.1)
+"""
+
+
 def test_a_planner_that_dies_before_the_answer_leaves_the_gate_to_the_next(
     sessions: tuple[WireSession, WireSession], endpoint: str
 ) -> None:
@@ -292,21 +306,17 @@ def test_a_planner_that_dies_before_the_answer_leaves_the_gate_to_the_next(
     published: list[Any] = []
     cell.subscribe("lab/verdict", published.append)
     publish_one_frame(cell)
-    code = (
-        "import sys; from bridge.wire.config import WireConfig; "
-        "from bridge.wire.session import open_session; session = open_session("
-        "WireConfig(connect=(sys.argv[1],))); "
-        "session.query('lab/gate/verdict', sys.stdin.buffer.read(), timeout_s=60.0)"
-    )
     with subprocess.Popen(
-        [sys.executable, "-c", code, endpoint], stdin=subprocess.PIPE, cwd=ROOT
+        [sys.executable, "-c", ASKING, endpoint], stdin=subprocess.PIPE, cwd=ROOT
     ) as planner:
-        assert planner.stdin is not None
-        planner.stdin.write(plan_for("arm", "orphan"))
-        planner.stdin.close()
-        assert inside.acquire(timeout=30)
-        planner.kill()
-        planner.wait(10)
+        try:
+            assert planner.stdin is not None
+            planner.stdin.write(plan_for("arm", "orphan"))
+            planner.stdin.close()
+            assert inside.acquire(timeout=30)
+        finally:
+            planner.kill()
+            planner.wait(10)
     go_on.set()
     assert ask(cell, plan_for("arm", "next")).plan_id == "next"
     _until(lambda: len(published) == 2)

@@ -38,7 +38,9 @@ from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
 from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
+from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.straight import GeometricProposer
+from twin.plan.problem import Problem
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
 FILE = chosen_task_file("cube_into_box")
@@ -220,11 +222,18 @@ def test_two_refused_replies_leave_the_plan_of_nominal_for_good(tmp_path: Path) 
     assert len(server.asked) == 2
 
 
-@pytest.mark.slow
 def test_live_what_no_plan_keeps_is_left_out_in_every_round(tmp_path: Path) -> None:
+    class KeepsNothing(GeometricProposer):
+        def propose(self, problem: Problem, **more: Any) -> Any:
+            if any(stage.get("path") for stage in problem.scene.task.stages):
+                raise NoPlanError("no path keeps that.")
+            return super().propose(problem, **more)
+
     run = RunFolder.create(tmp_path / "run")
     with serving(says(adds(NEVER))) as server:
-        planner = asking(run, server)
+        words = PlanConfig(model=server.url, model_name="stub")
+        made = {"model": KeepsNothing}
+        planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, made, words=words)
         for round_ in range(2):
             answer = planner.answer(request(policy="model", round=round_).to_json())
             assert answer.plan is not None, answer.reason
