@@ -75,8 +75,6 @@ class LivePlanner:
         self._run, self._config, self._urdf = run, config, urdf
         self._proposers = proposers
         self._words = words if words is not None and words.model else None
-        self._fitting: set[tuple[str, str]] = set()
-        """Scenes, by their hash, that were recorded with a robot."""
 
     def answer(self, payload: bytes) -> PlanAnswer:
         """Plan as asked, or say why not.
@@ -148,17 +146,23 @@ class LivePlanner:
         asked = ask_about(self._run, None, problem, words)
         try:
             return self._chosen(request, asked.problem), asked
-        except NoPlanError:
-            if asked.problem is problem:
+        except NoPlanError as error:
+            why = None if asked.problem is problem else self._why_none(request, asked, error)
+            if why is None:
                 raise
-            first = replace(request, round=0, refused=())
-            try:
-                self._chosen(first, asked.problem)
-            except NoPlanError as error:
-                asked = asked.left_out(problem, error)
-            else:
-                raise
-        return self._chosen(request, problem), asked
+        return self._chosen(request, problem), asked.left_out(problem, why)
+
+    def _why_none(
+        self, request: PlanRequest, asked: Asked, error: NoPlanError
+    ) -> NoPlanError | None:
+        """Why what the model added leaves not even a first plan; None: it leaves one."""
+        if request.round == 0 and not request.refused:
+            return error
+        try:
+            self._chosen(replace(request, round=0, refused=()), asked.problem)
+        except NoPlanError as first:
+            return first
+        return None
 
     def _problem(self, request: PlanRequest, task: Task) -> Problem:
         urdf = self._urdf()
@@ -191,17 +195,10 @@ class LivePlanner:
             shapes=shapes,
             keypoints=keypoints_of(shapes),
         )
-        self._refuse_other_robot(problem)
+        if not self._config.robot:
+            refuse_other_robot(self._run, robot.record)
         refuse_unusable(problem)
         return problem
-
-    def _refuse_other_robot(self, problem: Problem) -> None:
-        """Look once for each scene: its source episodes have to be opened."""
-        scene_hash, robot = problem.scene.scene_hash, problem.robot.record
-        if scene_hash is None or self._config.robot or (scene_hash, robot.name) in self._fitting:
-            return
-        refuse_other_robot(self._run, robot)
-        self._fitting.add((scene_hash, robot.name))
 
 
 def claim_planner(session: Any, cell: str) -> None:

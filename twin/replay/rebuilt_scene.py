@@ -381,16 +381,22 @@ def scene_of_other_robot(run: RunFolder, robot: str) -> str:
     """
     sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
     names = {str(source.get("id", "")) for source in sources}
-    for path in run.episodes():
+    for path in run.episodes() if names else ():
         if path.stem not in names:
             continue
         try:
-            other = streams.recorded_robot(Episode.open(path)).name
+            other = _robot_of_recording(path)
         except BridgeError:
             continue
         if other != robot:
             return f"the scene in {run.scene_dir} was recorded with robot {other} ({path.stem})"
     return ""
+
+
+@lru_cache(maxsize=64)
+def _robot_of_recording(path: Path) -> str:
+    """Name of the robot of a finished episode, which does not change; asked for each plan."""
+    return streams.recorded_robot(Episode.open(path)).name
 
 
 def shape_hashes(run: RunFolder) -> dict[str, str]:
