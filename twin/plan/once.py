@@ -38,13 +38,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import for_task
 from twin.replay.run_job import cell_of, planned_grips
 from twin.replay.verdict import replay_plan
-from twin.scene.frames.camera_poses import (
-    LOOKS,
-    STATIONARY_M,
-    STATIONARY_RAD,
-    base_tree,
-    same_pose,
-)
+from twin.scene.frames.camera_poses import base_tree, never_moves
 from twin.scene.localise.episode import first_execution_ns, localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
 from twin.scene.localise.objects import LocaliseConfig
@@ -249,12 +243,7 @@ def _is_stationary(tree: TransformTree, frame: str, moved: bool) -> bool | None:
     stamps = tree.stamps_ns(frame)
     if len(stamps) <= 1:
         return True
-    some = stamps[np.unique(np.linspace(0, len(stamps) - 1, LOOKS).round().astype(int))]
-    Ts = tree.Ts_root_frame(frame, some)
-    stationary = all(
-        same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts
-    )
-    return (True if moved else None) if stationary else False
+    return (True if moved else None) if never_moves(tree, frame, stamps) else False
 
 
 @dataclass(frozen=True, kw_only=True)

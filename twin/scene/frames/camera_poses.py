@@ -94,7 +94,7 @@ def _far_from_any(
     if len(posed_ns) < 2:  # static
         return none
     far = _gaps_ns(posed_ns, stamps_ns) > FAR_NS
-    if not far.any() or _never_moves(tree, frame, posed_ns):
+    if not far.any() or never_moves(tree, frame, posed_ns):
         return none
     for index in np.flatnonzero(far):
         after = int(np.searchsorted(posed_ns, stamps_ns[index]))
@@ -118,7 +118,14 @@ def _gaps_ns(
     return np.asarray(gaps)
 
 
-def _never_moves(tree: TransformTree, frame: str, posed_ns: Int[np.ndarray, " num_poses"]) -> bool:
+def never_moves(tree: TransformTree, frame: str, posed_ns: Int[np.ndarray, " num_poses"]) -> bool:
+    """Say whether a frame stays where it is in its root frame.
+
+    Args:
+        tree: Knows the frame.
+        frame: A camera's, for example.
+        posed_ns: When it was posed, at least once; some of these are compared.
+    """
     some = posed_ns[np.unique(np.linspace(0, len(posed_ns) - 1, LOOKS).round().astype(int))]
     Ts = tree.Ts_root_frame(frame, some)
     return all(same_pose(Ts[0], T, distance_m=STATIONARY_M, angle_rad=STATIONARY_RAD) for T in Ts)
