@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foreign_scene import write_scene_of
 
-from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT, ROBOT_NAME
 from bridge.robots.robot import read_robot
@@ -224,14 +223,7 @@ def test_a_scene_that_another_robot_recorded_gives_no_verdict(
 ) -> None:
     run = RunFolder.create(tmp_path / "run")
     other = read_robot("ur10_parallel_gripper")
-    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
-        writer.describe(EpisodeInfo(id="scan", kind="scan"))
-        data = other.description().encode()
-        writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
-    run.scene_dir.mkdir()
-    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
-              "sources": [{"id": "scan"}], "views": []}  # fmt: skip
-    (run.scene_dir / "scene.json").write_text(json.dumps(record))
+    write_scene_of(run, other)
     asked = accepting(monkeypatch)
     question = question_of(run)
     said = f"with robot {other.name} .scan., and plan p is for {ROBOT_NAME}. Scan"

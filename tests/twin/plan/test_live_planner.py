@@ -15,6 +15,7 @@ import pytest
 
 sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / "constrain")]
 
+from foreign_scene import write_scene_of
 from hostile_replies import valid_reply
 from loopback import free_endpoint
 from own_process import ROOT
@@ -22,9 +23,7 @@ from scripted_plans import scene_of_test
 from test_model_client import Server, says, serving
 
 import robot_gst
-from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT, ROBOT_NAME
@@ -41,7 +40,6 @@ from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_plann
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.straight import GeometricProposer
 from twin.plan.problem import Problem
-from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
 FILE = chosen_task_file("cube_into_box")
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
@@ -152,14 +150,7 @@ def test_a_start_that_cannot_be_used_is_refused_whatever_the_policy(planner: Liv
 def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     other = read_robot("ur10_parallel_gripper")
-    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
-        writer.describe(EpisodeInfo(id="scan", kind="scan"))
-        data = other.description().encode()
-        writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
-    run.scene_dir.mkdir()
-    record: dict[str, Any] = {**dict.fromkeys(NEEDED, ""), "schema_version": SCENE_VERSION}
-    record |= {"scene_hash": "abc", "sources": [{"id": "scan"}]}
-    (run.scene_dir / SCENE_FILE).write_text(json.dumps(record))
+    write_scene_of(run, other)
     asked = request().to_json()
     for _ in range(2):
         answer = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text).answer(asked)

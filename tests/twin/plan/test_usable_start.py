@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foreign_scene import write_scan
 from scripted_plans import scene_of_test
 
 from bridge.episode.cdr.messages import JointSample
@@ -192,10 +193,7 @@ def test_a_scene_of_another_robot_is_refused(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     other = read_robot("ur10_parallel_gripper")
     for name, urdf in (("scan", other.description()), ("trial", ROBOT.urdf_text())):
-        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
-            writer.describe(EpisodeInfo(id=name, kind="scan"))
-            data = urdf.encode()
-            writer.attach("robot.urdf", data, media_type="application/xml", log_time_ns=1)
+        write_scan(run, name, urdf)
     run.scene_dir.mkdir()
 
     def made_of(name: str) -> None:
