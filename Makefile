@@ -46,7 +46,7 @@ demo: $(DEMO_READY)
 
 test: $(READY)
 	@.ci/browser
-	@$(PYTEST) -n 3 --max-worker-restart=1 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
+	@$(PYTEST) -n 3 --max-worker-restart=0 --dist loadfile --no-loadscope-reorder -m "not gpu and not hardware and not network" $(TEST)
 
 soak: $(READY)
 	@GST_KILLS=100 GST_RECORDER_KILLS=12 GST_KILL_NUMBERS=1,2,3,5 GST_EPISODES=1000 GST_WARM_UP_S=15 \
@@ -62,7 +62,7 @@ mutants: $(READY)
 	@$(BIN)/python tests/mutants/mutants.py $(MUTANTS)
 
 fast: $(READY)
-	@$(PYTEST) -n 2 --max-worker-restart=1 --dist loadfile $(TEST)
+	@$(PYTEST) -n 2 --max-worker-restart=0 --dist loadfile $(TEST)
 
 check: $(READY)
 	@$(BIN)/ruff check .

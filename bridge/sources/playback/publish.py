@@ -308,7 +308,8 @@ class EpisodeSource:
 
             return handler
 
-        for verb, act in (("pause", self.pace.pause), ("resume", self.pace.resume)):
+        # Resume first: whoever was answered on pause can already reach resume.
+        for verb, act in (("resume", self.pace.resume), ("pause", self.pace.pause)):
             session.serve(f"rec/{self.config.name}/ctl/{verb}", answer(act))
 
     def _publishers(self, session: WireSession) -> dict[tuple[int, int], WirePublisher]:
