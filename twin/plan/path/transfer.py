@@ -91,60 +91,155 @@ def plan_transfer(
     Raises:
         NoPathError: One of the movements does not exist; its name comes first.
     """
-    name = grasp.object_id
-    task = problem.scene.task
-    held = Carried(object_id=name, T_tcp_object=se3.invert(grasp.T_object_tcp))
-    open_m, closed_m = grasp.open_m, grasp.width_m
-    taking = contacts_of(task, name, grasp=True) | {frozenset((GRIPPER, name))}
-    leaving = contacts_of(task, name, grasp=False) | {frozenset((GRIPPER, name))}
-    robot = problem.robot
-    with _named("approach"):
-        T_base_tcp = robot.T_base_tcp(grasp.joints_rad)
-        back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
-        out = plan_straight(problem, grasp.joints_rad, back, config, width_m=open_m, allowed=taking)
-    with _named("around"):
-        ends = out.path.joints_rad[-1:]
-        around = plan_move(problem, start_rad, ends, config, width_m=open_m)
-    with _named("lift"):
-        lift = _straight_up(problem, grasp.joints_rad, config, closed_m, held, taking, lift_m)
-    lifted = lift.path.joints_rad[-1]
-    placed = replace(
-        problem,
-        scene=replace(
-            problem.scene,
-            Ts_base_object={**problem.scene.Ts_base_object, name: release.T_base_object},
-        ),
+    transfer = _Transfer(
+        problem=problem,
+        grasp=grasp,
+        release=release,
+        config=config,
+        lift_m=lift_m,
+        straight=straight,
     )
-    grip: Allowed = frozenset({frozenset((GRIPPER, name))})
+    taken = transfer.take(start_rad)
+    lifted_rad = taken[-1].movement.path.joints_rad[-1]
     failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
-    for joints in nearest_solutions(robot, release.T_base_tcp, lifted, config.replay.ik):
+    for joints_rad in nearest_solutions(
+        problem.robot, release.T_base_tcp, lifted_rad, config.replay.ik
+    ):
         try:
-            with _named("lower"):
-                rise = _straight_up(problem, joints, config, closed_m, held, leaving, lift_m)
-            with _named("carry"):
-                over = rise.path.joints_rad[-1]
-                carry = (
-                    _carried_straight(problem, lifted, over, config, closed_m, held, grip)
-                    if straight
-                    else plan_move(
-                        problem, lifted, over[None], config, width_m=closed_m,
-                        carried=held, allowed=grip,
-                    )
-                )  # fmt: skip
-            with _named("leave"):
-                leave = _leave(placed, release, joints, config, open_m, leaving, grasp.pregrasp_m)
+            return (*taken, *transfer.put(lifted_rad, joints_rad))
         except NoPathError as error:
             failure = error
-            continue
+    raise failure
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Transfer:
+    """One object from where it is to where it is let go."""
+
+    problem: Problem
+    grasp: Grasp
+    release: Release
+    config: PathConfig
+    lift_m: float
+    straight: bool
+
+    def take(self, start_rad: Float[np.ndarray, " num_joints"]) -> tuple[Leg, Leg, Leg]:
+        """From where the arm stands to the lifted object."""
+        grasp, config = self.grasp, self.config
+        taking = self._touching(grasp=True)
+        with _named("approach"):
+            T_base_tcp = self.problem.robot.T_base_tcp(grasp.joints_rad)
+            back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
+            out = plan_straight(
+                self.problem, grasp.joints_rad, back, config, width_m=grasp.open_m, allowed=taking
+            )
+        with _named("around"):
+            ends = out.path.joints_rad[-1:]
+            around = plan_move(self.problem, start_rad, ends, config, width_m=grasp.open_m)
+        with _named("lift"):
+            lift = self._straight_up(grasp.joints_rad, taking)
         return (
             Leg(name="around", movement=around, g=0),
             Leg(name="approach", movement=_backwards(out), g=0),
             Leg(name="lift", movement=lift, g=1),
+        )
+
+    def put(
+        self,
+        lifted_rad: Float[np.ndarray, " num_joints"],
+        joints_rad: Float[np.ndarray, " num_joints"],
+    ) -> tuple[Leg, Leg, Leg]:
+        """From the lifted object to where the arm has left, let go with these joints."""
+        leaving = self._touching(grasp=False)
+        with _named("lower"):
+            rise = self._straight_up(joints_rad, leaving)
+        with _named("carry"):
+            over_rad = rise.path.joints_rad[-1]
+            carry = (self._carry_straight if self.straight else self._carry)(lifted_rad, over_rad)
+        with _named("leave"):
+            leave = self._leave(joints_rad, leaving)
+        return (
             Leg(name="carry", movement=carry, g=1),
             Leg(name="lower", movement=_backwards(rise), g=1),
             Leg(name="leave", movement=leave, g=0),
         )
-    raise failure
+
+    @property
+    def _held(self) -> Carried:
+        return Carried(
+            object_id=self.grasp.object_id, T_tcp_object=se3.invert(self.grasp.T_object_tcp)
+        )
+
+    @property
+    def _grip(self) -> Allowed:
+        return frozenset({frozenset((GRIPPER, self.grasp.object_id))})
+
+    def _touching(self, *, grasp: bool) -> Allowed:
+        task, name = self.problem.scene.task, self.grasp.object_id
+        return contacts_of(task, name, grasp=grasp) | self._grip
+
+    def _straight_up(
+        self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed
+    ) -> Movement:
+        """Lift as far as is free and within reach, at least two centimetres."""
+        rise_m = self.lift_m
+        while True:
+            T = self.problem.robot.T_base_tcp(joints_rad)
+            T[2, 3] += rise_m
+            try:
+                return plan_straight(
+                    self.problem, joints_rad, T, self.config, width_m=self.grasp.width_m,
+                    carried=self._held, allowed=allowed,
+                )  # fmt: skip
+            except NoPathError:
+                if rise_m / 2 < _LEAST_LIFT_M:
+                    raise
+            rise_m /= 2
+
+    def _carry(
+        self,
+        start_rad: Float[np.ndarray, " num_joints"],
+        goal_rad: Float[np.ndarray, " num_joints"],
+    ) -> Movement:
+        """Carry around whatever stands in between."""
+        return plan_move(
+            self.problem, start_rad, goal_rad[None], self.config, width_m=self.grasp.width_m,
+            carried=self._held, allowed=self._grip,
+        )  # fmt: skip
+
+    def _carry_straight(
+        self,
+        start_rad: Float[np.ndarray, " num_joints"],
+        goal_rad: Float[np.ndarray, " num_joints"],
+    ) -> Movement:
+        """Carry along a straight line that ends on the branch on which the object is let down."""
+        goal = self.problem.robot.T_base_tcp(goal_rad)
+        movement = plan_straight(
+            self.problem, start_rad, goal, self.config, width_m=self.grasp.width_m,
+            carried=self._held, allowed=self._grip,
+        )  # fmt: skip
+        off_rad = float(np.abs(movement.path.joints_rad[-1] - goal_rad).max())
+        if off_rad > _SAME_RAD:
+            detail = f"the straight line ends {off_rad:.2f} rad from how the arm lets down"
+            raise NoPathError(reason="branch", detail=detail)
+        return movement
+
+    def _leave(self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed) -> Movement:
+        """Straight back; the farther the better, for next to a rim nothing else may be planned."""
+        scene, release = self.problem.scene, self.release
+        poses = {**scene.Ts_base_object, self.grasp.object_id: release.T_base_object}
+        placed = replace(self.problem, scene=replace(scene, Ts_base_object=poses))
+        for more_m in _LEAVE_MORE_M:
+            away = release.T_base_tcp @ _along_z(-self.grasp.pregrasp_m - more_m)
+            try:
+                return plan_straight(
+                    placed, joints_rad, away, self.config, width_m=self.grasp.open_m,
+                    allowed=allowed,
+                )  # fmt: skip
+            except NoPathError:
+                if more_m == _LEAVE_MORE_M[-1]:
+                    raise
+        raise NoPathError(reason="unreachable", detail="no way to leave is tried")
 
 
 @contextmanager
@@ -169,71 +264,6 @@ def _backwards(movement: Movement) -> Movement:
         path=reversed_path(movement.path),
         decision=replace(movement.decision, clearance_m=movement.decision.clearance_m[::-1]),
     )
-
-
-def _leave(
-    placed: Problem,
-    release: Release,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    config: PathConfig,
-    width_m: float,
-    allowed: Allowed,
-    least_m: float,
-) -> Movement:
-    """Straight back; the farther the better, for next to a rim nothing else may be planned."""
-    for more_m in _LEAVE_MORE_M:
-        away = release.T_base_tcp @ _along_z(-least_m - more_m)
-        try:
-            return plan_straight(placed, joints_rad, away, config, width_m=width_m, allowed=allowed)
-        except NoPathError:
-            if more_m == _LEAVE_MORE_M[-1]:
-                raise
-    raise NoPathError(reason="unreachable", detail="no way to leave is tried")
-
-
-def _carried_straight(
-    problem: Problem,
-    start_rad: Float[np.ndarray, " num_joints"],
-    goal_rad: Float[np.ndarray, " num_joints"],
-    config: PathConfig,
-    width_m: float,
-    held: Carried,
-    allowed: Allowed,
-) -> Movement:
-    """Carry along a straight line that ends on the branch on which the object is let down."""
-    goal = problem.robot.T_base_tcp(goal_rad)
-    movement = plan_straight(
-        problem, start_rad, goal, config, width_m=width_m, carried=held, allowed=allowed
-    )
-    off_rad = float(np.abs(movement.path.joints_rad[-1] - goal_rad).max())
-    if off_rad > _SAME_RAD:
-        detail = f"the straight line ends {off_rad:.2f} rad from how the arm lets down"
-        raise NoPathError(reason="branch", detail=detail)
-    return movement
-
-
-def _straight_up(
-    problem: Problem,
-    joints_rad: Float[np.ndarray, " num_joints"],
-    config: PathConfig,
-    width_m: float,
-    held: Carried,
-    allowed: Allowed,
-    lift_m: float,
-) -> Movement:
-    """Lift as far as is free and within reach, at least two centimetres."""
-    rise_m = lift_m
-    while True:
-        T = problem.robot.T_base_tcp(joints_rad)
-        T[2, 3] += rise_m
-        try:
-            return plan_straight(
-                problem, joints_rad, T, config, width_m=width_m, carried=held, allowed=allowed
-            )
-        except NoPathError:
-            if rise_m / 2 < _LEAST_LIFT_M:
-                raise
-        rise_m /= 2
 
 
 def nearest_solutions(
