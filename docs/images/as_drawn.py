@@ -1,7 +1,7 @@
 """Write what `robot-gst render` draws of a run, small enough for the documents.
 
-Examples, made with a scene of `robot-gst rebuild RUN --iterations 100`:
-.venv/bin/python docs/images/as_drawn.py trial runs/cell docs/images/trial_twin.jpg
+Examples, of the demo's run and of a scene of `robot-gst rebuild RUN --iterations 100`:
+.venv/bin/python docs/images/as_drawn.py trial runs/demo docs/images/trial_twin.jpg
 .venv/bin/python docs/images/as_drawn.py seen runs/shelf docs/images/shelf_seen.jpg
 "trial" puts recorded image, twin and difference of five instants below each other, the side camera
 left, the wrist camera right. "seen" puts the first view of a scan beside the mask of what was

@@ -364,6 +364,7 @@ class Events:
             steps=self._config.appearance_steps,
             allowance=allowance,
         )
+        keep_colors_in_range(solved.cloud)
         state.colour_steps += solved.steps
         if solved.steps and solved.cloud.num_harmonics > cloud.num_harmonics:
             state.session.rearrange(solved.cloud, np.arange(len(cloud)))
@@ -381,6 +382,18 @@ class Events:
         state.surface = state.surface.take(done.parents)
         state.num_split += done.num_split
         state.num_pruned += done.num_pruned
+
+
+def keep_colors_in_range(cloud: GaussianCloud) -> None:
+    """Move mean colours outside 0..1 to its border, in place.
+
+    Gaussians of which the images show a sliver explain it with any colour, and are seen whole from
+    elsewhere. What depends on the direction may go beyond: it is small where few views show it.
+
+    Args:
+        cloud: Changed.
+    """
+    np.clip(cloud.colors, 0.0, 1.0, out=cloud.colors)
 
 
 def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
@@ -580,6 +593,7 @@ class _Learner:
         report = state.session.step(
             view.half if coarse else view.full, pose, rates, state.exposures[index]
         )
+        keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:
             self.hold(state)
             if at.fraction >= MEAN_FROM:
