@@ -82,50 +82,22 @@ def answer(question: Question) -> Verdict:
     Rounds of one start are tried against the same variations: their identity is the start's name.
 
     Raises:
-        UndecidedError: When the nominal replay alone needs more steps than there may be.
+        UndecidedError: When the scene is another robot's or another than the plan was made in, or
+            the nominal replay alone needs more steps than there may be.
     """
     from twin.replay.agreement import in_each_engine  # noqa: PLC0415
     from twin.replay.audit import audit  # noqa: PLC0415
     from twin.replay.checks import limited_to_task  # noqa: PLC0415
-    from twin.replay.dynamics import num_steps  # noqa: PLC0415
     from twin.replay.monte_carlo import replay_samples, with_probability  # noqa: PLC0415
-    from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
-    from twin.replay.rebuilt_scene import (  # noqa: PLC0415
-        for_task,
-        read_rebuilt_scene,
-        scene_of_other_robot,
-    )
+    from twin.replay.rebuilt_scene import for_task  # noqa: PLC0415
     from twin.replay.result import ReplayResult  # noqa: PLC0415
     from twin.replay.verdict import reason_of, replay_plan  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     run, plan = RunFolder.open(question.run_path), question.plan
-    other = "" if question.any_robot else scene_of_other_robot(run, plan.robot)
-    if other:
-        raise UndecidedError(
-            f"{other}, and plan {plan.id} is for {plan.robot}. Scan the cell with the robot that "
-            "is to act and rebuild it: robot-gst rebuild RUN, or name the robot: --robot"
-        )
-    rebuilt = read_rebuilt_scene(run, question.task)
-    scene = rebuilt.scene(
-        question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
-    )
-    scene = replace(scene, start_rad=question.start_rad)
-    if plan.scene_hash not in (None, scene.scene_hash):
-        raise UndecidedError(
-            f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
-            f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
-        )
+    scene, notes = _scene_of(question, run)
     config = for_task(question.config, read_calibration(run), question.task)
-    # Of a plan with impossible times the replay says what is wrong.
-    end_ns = min(max(plan.tau[-1].t_ns if plan.tau else 0, 0), round(MAX_DURATION_S * 1e9))
-    steps = max(1, num_steps(end_ns, config))
-    if steps > question.max_steps:
-        raise UndecidedError(
-            f"its replay takes {steps} simulated steps, and a verdict at most "
-            f"{question.max_steps} (--max-steps)"
-        )
-    most_samples = question.max_steps // steps - 1
+    most_samples = question.max_steps // _steps_of(question, config) - 1
 
     def judge(there: ReplayScene, settings: ReplayConfig) -> Verdict:
         return in_each_engine(
@@ -154,7 +126,50 @@ def answer(question: Question) -> Verdict:
         plan_id=plan.id,
         identity=plan.start_id or plan.id,
     )
-    return _with_notes(with_probability(verdict, samples), rebuilt.notes)
+    return _with_notes(with_probability(verdict, samples), notes)
+
+
+def _scene_of(question: Question, run: RunFolder) -> tuple[ReplayScene, tuple[str, ...]]:
+    """Where the plan is tried, and what the rebuilt scene could not tell."""
+    from twin.replay.rebuilt_scene import (  # noqa: PLC0415
+        read_rebuilt_scene,
+        scene_of_other_robot,
+    )
+
+    plan = question.plan
+    other = "" if question.any_robot else scene_of_other_robot(run, plan.robot)
+    if other:
+        raise UndecidedError(
+            f"{other}, and plan {plan.id} is for {plan.robot}. Scan the cell with the robot that "
+            "is to act and rebuild it: robot-gst rebuild RUN, or name the robot: --robot"
+        )
+    rebuilt = read_rebuilt_scene(run, question.task)
+    scene = rebuilt.scene(
+        question.task, question.urdf, question.Ts_base_object, covariances=question.covariances
+    )
+    if plan.scene_hash not in (None, scene.scene_hash):
+        raise UndecidedError(
+            f"plan {plan.id} was made in scene {str(plan.scene_hash)[:12]}; the run now has "
+            f"{str(scene.scene_hash or 'none')[:12]}. Start its planner again."
+        )
+    return replace(scene, start_rad=question.start_rad), rebuilt.notes
+
+
+def _steps_of(question: Question, config: ReplayConfig) -> int:
+    """Simulated steps of the nominal replay; no more than a verdict may take."""
+    from twin.replay.dynamics import num_steps  # noqa: PLC0415
+    from twin.replay.path import MAX_DURATION_S  # noqa: PLC0415
+
+    tau = question.plan.tau
+    # Of a plan with impossible times the replay says what is wrong.
+    end_ns = min(max(tau[-1].t_ns if tau else 0, 0), round(MAX_DURATION_S * 1e9))
+    steps = max(1, num_steps(end_ns, config))
+    if steps > question.max_steps:
+        raise UndecidedError(
+            f"its replay takes {steps} simulated steps, and a verdict at most "
+            f"{question.max_steps} (--max-steps)"
+        )
+    return steps
 
 
 def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:

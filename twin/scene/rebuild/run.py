@@ -57,8 +57,10 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 24
+METHOD_VERSION = 25
 """Counts changes of method that make older scenes out of date."""
+SEARCHED_SPLATS = 80_000
+"""Points of the fused surface in which things are looked for, at most."""
 
 
 class _Clock:
@@ -267,10 +269,22 @@ def _write_parts(
         training.views,
         config.fit.threads,
         output,
+        fused=_evenly_fused(training, config),
         models=config.models,
         choices=training.choices,
         task=scanned_tasks(sources).task,
     )
+
+
+def _evenly_fused(training: TrainingSet, config: RebuildConfig) -> GaussianCloud | None:
+    """The measured surface in which things are looked for; None: nobody looks for them in it.
+
+    Not what was fitted: Gaussians gather where colours change, and every fit puts them elsewhere.
+    """
+    if config.models.segmenter:
+        return None
+    finer = replace(config.initialise, max_splats=SEARCHED_SPLATS, growth=0.0)
+    return fuse(training.points, finer, training.views)
 
 
 def _marked_objects(decomposed: Decomposition) -> GaussianCloud | None:

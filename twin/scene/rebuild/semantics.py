@@ -44,6 +44,7 @@ def add_semantics(
     features: SceneFeatures | None = None,
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    fused: GaussianCloud | None = None,
     threads: int = 0,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, Any]:
@@ -63,6 +64,7 @@ def add_semantics(
         robot_m: Points on the robot where it stood, to leave it out.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
+        fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         threads: For drawing; 0: all cores.
         advance: Told the percentage done.
 
@@ -88,6 +90,7 @@ def add_semantics(
                 robot_m=robot_m,
                 known={key: mask[measured] for key, mask in known.items()},
                 surfaces_m=surfaces_m,
+                fused=fused,
                 advance=advance,
             )
             scene = _among_all(scene, measured)
@@ -190,6 +193,7 @@ def write_scene_semantics(
     threads: int,
     output: Output,
     *,
+    fused: GaussianCloud | None = None,
     models: ModelConfig | None = None,
     choices: Sequence[FrameChoice] = (),
     task: Task | None = None,
@@ -202,6 +206,7 @@ def write_scene_semantics(
         views: What it was fitted to.
         threads: For drawing; 0: all cores.
         output: How to talk.
+        fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         models: Large models to ask beside the default segmenter; None: none.
         choices: Training frames that these look at.
         task: Names what they look for.
@@ -227,6 +232,7 @@ def write_scene_semantics(
             masks=found.masks,
             features=found.features,
             surfaces_m=decomposed.surfaces_m(),
+            fused=fused,
             threads=threads,
             advance=advance,
         )

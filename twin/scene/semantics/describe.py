@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, Int64, UInt16
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
@@ -24,10 +24,10 @@ from twin.scene.semantics.segment import (
     SegmentConfig,
     Thing,
     points_of,
-    segment_points,
     solid_splats,
 )
 from twin.scene.semantics.shape_descriptors import CONTAINER, measure_shape
+from twin.scene.semantics.stable_things import segment_stably
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
@@ -36,6 +36,8 @@ from twin.scene.semantics.support import (
     level_frame,
 )
 
+NEAR_POINT_M = 0.02
+"""Gaussians farther from all points of the fused surface belong to no thing."""
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
 MIN_SHOWN_PX = 20.0
@@ -120,9 +122,10 @@ def scene_by_default(
     robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
+    fused: GaussianCloud | None = None,
     advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
-    """Segment the fused Gaussians with the default segmenter.
+    """Segment the scene with the default segmenter.
 
     Support and seen count the viewpoints that show an instance; what fewer than two of them show
     whole is left out. A scene without a level plane, or with nothing on it, gives only what is
@@ -139,17 +142,21 @@ def scene_by_default(
             their names.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
             are told apart on these, which are thinner than any coat of Gaussians.
+        fused: The surface as it was measured, evenly sampled: things are looked for in it. None:
+            in the scene's Gaussians, which a fit put where colours change.
         advance: Told the percentage done.
     """
     frames = list(viewpoints)
     ids = np.flatnonzero(solid_splats(cloud))
     config = config or SegmentConfig()
-    points = points_of(cloud.take(ids))
+    searched = cloud.take(ids) if fused is None else fused
+    points = points_of(searched)
     Ts = [frame.T_base_camera for frame in frames]
     T_level_base = level_frame(points.p_m, points.normals, Ts, config.support)
     is_level = np.array_equal(T_level_base, np.eye(4))
     if not is_level:
-        cloud = moved_cloud(cloud, T_level_base)
+        cloud, searched = (moved_cloud(item, T_level_base) for item in (cloud, searched))
+        points = points_of(searched)
         frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
         robot_m = None if robot_m is None else se3.apply(T_level_base, robot_m)
         surfaces_m = {key: se3.apply(T_level_base, p) for key, p in (surfaces_m or {}).items()}
@@ -157,14 +164,47 @@ def scene_by_default(
     things: tuple[Thing, ...] = ()
     plane: SupportPlane | None = None
     try:
-        found = segment_points(points_of(cloud.take(ids)), config, robot_m)
+        found = segment_stably(points, config, robot_m)
     except NoSupportError as error:
         remark = str(error)
     else:
-        labels[ids] = found.labels.astype(np.uint16)
+        labels[ids] = _nearest_label(found.labels, points.p_m, cloud.means_m[ids])
         things, plane, remark = found.things, found.plane, found.remark
     advance(FOUND, f"{len(things)} things found")
-    final = numbered(labels, known or {})
+    instances, numbers = _seen_instances(
+        cloud, frames, rasteriser, labels, things, known or {}, surfaces_m or {}, plane, advance
+    )
+    if not is_level:
+        up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
+        remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
+        instances = tuple(_moved(item, se3.invert(T_level_base)) for item in instances)
+    return SemanticScene(instances=instances, labels=numbers, source=SOURCE, remark=remark)
+
+
+def _nearest_label(
+    labels: Int64[np.ndarray, " num_points"],
+    p_m: Float[np.ndarray, "num_points 3"],
+    wanted_m: Float32[np.ndarray, "num_splats 3"],
+) -> UInt16[np.ndarray, " num_splats"]:
+    """What the nearest point belongs to; nothing where none is near."""
+    far_m, nearest = cKDTree(p_m).query(wanted_m, distance_upper_bound=NEAR_POINT_M)
+    known = np.append(labels, 0)  # the query gives the number of points where none is near
+    return np.asarray(np.where(np.isfinite(far_m), known[nearest], 0), dtype=np.uint16)
+
+
+def _seen_instances(
+    cloud: GaussianCloud,
+    frames: Sequence[Viewpoint],
+    rasteriser: Rasteriser,
+    labels: UInt16[np.ndarray, " num_splats"],
+    things: Sequence[Thing],
+    known: Mapping[str, Bool[np.ndarray, " num_splats"]],
+    surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]],
+    plane: SupportPlane | None,
+    advance: Advance,
+) -> tuple[tuple[Instance, ...], UInt16[np.ndarray, " num_splats"]]:
+    """Describe what is known and the things that enough frames show whole; their labels, too."""
+    final = numbered(labels, known)
     total = len(final.keys) + len(final.others)
     looked = _told(frames, FOUND, SHOWN, advance, "frames looked at")
     shown, whole = _num_shown(cloud, final.labels, total, looked, rasteriser)
@@ -184,15 +224,11 @@ def scene_by_default(
             score=score,
             source=source,
             plane=plane,
-            surface_m=(surfaces_m or {}).get(key),
+            surface_m=surfaces_m.get(key),
         )
         for number, (key, label, score, source) in enumerate(reporting, start=1)
     )
-    if not is_level:
-        up = ", ".join(f"{value:.2f}" for value in T_level_base[2, :3])
-        remark = " ".join(filter(None, [remark, f"z does not point up here, ({up}) does"]))
-        instances = tuple(_moved(item, se3.invert(T_level_base)) for item in instances)
-    return SemanticScene(instances=instances, labels=final.labels, source=SOURCE, remark=remark)
+    return instances, final.labels
 
 
 def _moved(item: Instance, T: Float[np.ndarray, "4 4"]) -> Instance:

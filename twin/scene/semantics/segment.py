@@ -16,7 +16,6 @@ from twin.scene.semantics.cluster import (
     SurfacePoints,
     ValleySplitConfig,
     Voxels,
-    components,
     joined_by_outline,
     make_voxels,
     neighbour_pairs,
@@ -24,12 +23,14 @@ from twin.scene.semantics.cluster import (
     split_by_valleys,
 )
 from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
+from twin.scene.semantics.height_tree import branches
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
 from twin.scene.semantics.shape_descriptors import ShapeDescriptors, measure_shape
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
     SupportPlane,
+    as_measured,
     find_support,
     no_support,
     roughness_m,
@@ -63,6 +64,8 @@ class SegmentConfig:
     """Higher points belong to the surroundings."""
     voxel_m: float = 0.004
     """Finest size of the voxels that hang together; grows with the spacing of the points."""
+    voxel_scale: float = 1.0
+    """Times the sizes of all voxels."""
     reach_voxels: float = 1.8
     """Voxels nearer than this hang together (the 26 neighbours)."""
     min_voxels: int = 25
@@ -126,6 +129,7 @@ def segment_points(
         plane = find_support(points.p_m, points.normals, config.support)
     except NoSupportError:
         return _without_support(points, config, robot_m)
+    plane = as_measured(plane, points.p_m, points.normals, config.support)
     roughness = roughness_m(points.p_m, points.normals, plane, config.support)
     least = max(config.min_height_m, config.roughness_factor * roughness)
     config = replace(config, min_height_m=least)
@@ -138,7 +142,7 @@ def segment_points(
         raised &= ~_is_relief(lab, height, plane.under(points.p_m), config)
     above = np.flatnonzero(raised)
     labels = np.zeros(len(points), dtype=np.int64)
-    voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[above]))
+    voxel_m = config.voxel_scale * max(config.voxel_m, 2.0 * _spacing(points.p_m[above]))
     labels[above] = _things(points.take(above), height[above], voxel_m, config)
     labels = _largest_first(labels)
     low = free & (np.abs(height) <= config.min_height_m)
@@ -187,8 +191,9 @@ def _without_support(
     """
     free = np.flatnonzero(~_on_robot(points.p_m, robot_m, config))
     labels = np.zeros(len(points), dtype=np.int64)
-    spacing_m = _spacing(points.p_m[free])
-    labels[free] = cut_into_patches(points.take(free), spacing_m, config.patches)
+    spacing_m = config.voxel_scale * _spacing(points.p_m[free])
+    patches = replace(config.patches, voxel_m=config.voxel_scale * config.patches.voxel_m)
+    labels[free] = cut_into_patches(points.take(free), spacing_m, patches)
     if not labels.any():
         raise NoSupportError(no_support(points.p_m, points.normals, config.support))
     labels = _largest_first(labels)
@@ -218,16 +223,18 @@ def _things(
     voxels = make_voxels(points, voxel_m)
     height = np.bincount(voxels.of_point, weights=height_m) / voxels.count
     pairs = neighbour_pairs(voxels.p_m, config.reach_voxels * voxel_m)
-    group = components(len(voxels), pairs)
     labels = np.zeros(len(voxels), dtype=np.int64)
+    parts = branches(
+        voxels.p_m,
+        height,
+        pairs,
+        voxel_m=voxel_m,
+        max_size_m=config.max_size_m,
+        min_voxels=MIN_FRAGMENT,
+    )
     pieces: list[np.ndarray] = []
-    too_large = np.zeros(len(voxels), dtype=bool)
-    for number in np.flatnonzero(np.bincount(group) >= MIN_FRAGMENT):
-        ids = np.flatnonzero(group == number)
-        if _extent(voxels.p_m[ids])[0] <= config.max_size_m:
-            pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
-        else:
-            too_large[ids] = True
+    for ids in parts.groups:
+        pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
     found = 0
     for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
         extent = _extent(voxels.p_m[piece])
@@ -235,7 +242,7 @@ def _things(
             found += 1
             labels[piece] = found
     of_points = np.asarray(labels[voxels.of_point])
-    left = np.flatnonzero(too_large[voxels.of_point])
+    left = np.flatnonzero(parts.too_large[voxels.of_point])
     if len(left):
         cut = cut_into_patches(points.take(left), voxel_m / 2, config.patches)
         of_points[left] = np.where(cut > 0, cut + found, 0)

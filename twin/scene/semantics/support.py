@@ -3,10 +3,15 @@
 The support plane is nearly level, found by RANSAC and refined by least squares. In a robot cell z
 points up. The frame of a foreign scan may be that of its first camera: there up is the direction
 that most surfaces face which the cameras saw from above.
+
+Depth cameras bend planes: they read farther or nearer towards the edges of their images, and poses
+are wrong by millimetres. A table of a metre comes out as a bowl of 10 to 20 mm, more than what
+stands out of it may be high. A surface of second degree follows that, and no thing that stands on
+the plane.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -49,6 +54,22 @@ class NoSupportError(SemanticsError):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Bend:
+    """Heights of the measured plane over the true one."""
+
+    center_m: Float[np.ndarray, "2"]
+    reach_m: float
+    """Half the side of the square around the centre in which it was measured."""
+    coefficients_m: Float[np.ndarray, "6"]
+    """Of 1, x, y, x^2, xy, y^2, with x and y in units of ``reach_m``."""
+
+    def height_m(self, p_m: Float[np.ndarray, "num_points _"]) -> Float[np.ndarray, " num_points"]:
+        """Over the plane at these x and y; beyond where it was measured as at the border."""
+        xy = np.clip((p_m[:, :2] - self.center_m) / self.reach_m, -1.0, 1.0)
+        return np.asarray(_terms(xy) @ self.coefficients_m)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SupportPlane:
     """Points p of the plane fulfil ``normal . p = offset_m``."""
 
@@ -62,6 +83,8 @@ class SupportPlane:
     corner_m: tuple[float, float]
     """Lower x and y of the first cell."""
     cell_m: float
+    bend: Bend | None = None
+    """As measured, where that is far from flat."""
 
     @property
     def area_m2(self) -> float:
@@ -69,8 +92,9 @@ class SupportPlane:
         return float(self.footprint.sum()) * self.cell_m**2
 
     def height_m(self, p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, " num_points"]:
-        """Distance above the plane; negative below [m]."""
-        return np.asarray(p_m @ self.normal - self.offset_m)
+        """Distance above the plane as it was measured; negative below [m]."""
+        height_m = p_m @ self.normal - self.offset_m
+        return np.asarray(height_m if self.bend is None else height_m - self.bend.height_m(p_m))
 
     def under(self, p_m: Float[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Say which points lie above or below where the plane extends."""
@@ -117,6 +141,77 @@ def find_support(
     if not planes:
         raise NoSupportError(no_support(p_m, normals, config))
     return max(planes, key=lambda item: item[0])[1]
+
+
+BEND_ROUNDS = 10
+"""Of least squares with weights."""
+CUT_TOLERANCES = 3.0
+"""Points farther off than so many tolerances have no weight (Tukey's biweight)."""
+BEND_CELL_M = 0.05
+"""Every cell of this size counts the same, however many points lie in it."""
+BENT_M = 0.02
+"""Points that face up and are this near to a plane say how it is bent."""
+WORTH = 0.75
+"""A bend counts where it leaves less than this share of the roughness."""
+
+
+def as_measured(
+    plane: SupportPlane,
+    p_m: Float[np.ndarray, "num_points 3"],
+    normals: Float[np.ndarray, "num_points 3"],
+    config: SupportConfig,
+) -> SupportPlane:
+    """The plane with the bend that the cameras gave it; the same where it is flat.
+
+    Args:
+        plane: What things stand on.
+        p_m: Points of the scene, z up.
+        normals: Unit vectors at the points.
+        config: How near counts as the plane.
+    """
+    near = (np.abs(plane.height_m(p_m)) < BENT_M) & (normals @ UP > np.cos(3 * config.max_tilt_rad))
+    if int(near.sum()) < config.min_points:
+        return plane
+    p = p_m[near]
+    bent = replace(plane, bend=fit_bend(p, plane.height_m(p), config.tolerance_m))
+    inside = np.abs(bent.height_m(p)) < config.tolerance_m
+    if int(inside.sum()) < config.min_points:
+        return plane
+    footprint, corner_m = _footprint(p[inside], config.cell_m)
+    bent = replace(bent, footprint=footprint, corner_m=corner_m)
+    before, after = (roughness_m(p_m, normals, item, config) for item in (plane, bent))
+    return bent if after < WORTH * before else plane
+
+
+def fit_bend(
+    p_m: Float[np.ndarray, "num_points 3"],
+    height_m: Float[np.ndarray, " num_points"],
+    tolerance_m: float,
+) -> Bend:
+    """Fit it to points near the plane, robustly: what stands on the plane is among them.
+
+    Args:
+        p_m: Points that face up.
+        height_m: Of each over the plane.
+        tolerance_m: Points this near are the plane.
+    """
+    center_m = p_m[:, :2].mean(axis=0)
+    reach_m = float(np.abs(p_m[:, :2] - center_m).max())
+    A = _terms((p_m[:, :2] - center_m) / reach_m)
+    cells = np.floor(p_m[:, :2] / BEND_CELL_M).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    share = 1.0 / count[cell.reshape(-1)]
+    x = np.zeros(A.shape[1])
+    for _ in range(BEND_ROUNDS):
+        off = (height_m - A @ x) / (CUT_TOLERANCES * tolerance_m)
+        root = np.sqrt(share) * np.clip(1.0 - off**2, 0.0, None)
+        x = np.linalg.lstsq(A * root[:, None], height_m * root, rcond=None)[0]
+    return Bend(center_m=center_m, reach_m=reach_m, coefficients_m=x)
+
+
+def _terms(xy: Float[np.ndarray, "num_points 2"]) -> Float[np.ndarray, "num_points 6"]:
+    x, y = xy.T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def no_support(p_m: np.ndarray, normals: np.ndarray, config: SupportConfig) -> str:

@@ -4,6 +4,7 @@ import pytest
 from twin.scene.semantics.support import (
     NoSupportError,
     SupportConfig,
+    as_measured,
     find_support,
     level_frame,
     roughness_m,
@@ -73,6 +74,34 @@ def test_a_rough_table_does_not_stand_on_its_own_underside() -> None:
     p = np.concatenate([sheet(rng, 0.0, 0.4, 9000), below])
     plane = find_support(p, np.tile(UP, (len(p), 1)), SupportConfig())
     assert abs(plane.offset_m) < 0.003
+
+
+def bowl(xy: np.ndarray, deep_m: float) -> np.ndarray:
+    return deep_m * ((xy[:, 0] / 0.5) ** 2 + (xy[:, 1] / 0.5) ** 2)
+
+
+def test_a_table_that_was_measured_as_a_bowl_is_followed_and_what_stands_on_it_is_not() -> None:
+    rng = np.random.default_rng(6)
+    p = sheet(rng, 0.0, 0.5, 20000)
+    book = np.all(np.abs(p[:, :2] - 0.25) < 0.1, axis=1)
+    p[:, 2] += bowl(p[:, :2], 0.012) + 0.015 * book
+    normals = np.tile(UP, (len(p), 1))
+    flat = find_support(p, normals, SupportConfig())
+    plane = as_measured(flat, p, normals, SupportConfig())
+    height = plane.height_m(p)
+    assert np.abs(height[~book]).max() < 0.006
+    np.testing.assert_allclose(np.median(height[book]), 0.015, atol=0.002)
+    assert np.abs(flat.height_m(p)[~book]).max() > 0.012
+    assert plane.under(p).mean() > 0.99
+    assert flat.under(p).mean() < 0.95
+
+
+def test_a_flat_table_keeps_its_plane_to_the_bit() -> None:
+    rng = np.random.default_rng(7)
+    p = sheet(rng, 0.0, 0.5, 9000)
+    normals = np.tile(UP, (len(p), 1))
+    plane = find_support(p, normals, SupportConfig())
+    assert as_measured(plane, p, normals, SupportConfig()) is plane
 
 
 def turned(angle_rad: float) -> np.ndarray:

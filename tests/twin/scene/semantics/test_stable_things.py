@@ -1,0 +1,100 @@
+"""What one size of voxels finds by chance is no thing; what most find is, wherever points lie."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from table_scene import World, iou
+
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.semantics import stable_things
+from twin.scene.semantics.cluster import SurfacePoints
+from twin.scene.semantics.describe import scene_by_default
+from twin.scene.semantics.segment import Segmentation, SegmentConfig, Thing, points_of
+from twin.scene.semantics.shape_descriptors import measure_shape
+from twin.scene.semantics.stable_things import VOXEL_SCALES, segment_stably
+
+
+def looks_like(
+    monkeypatch: pytest.MonkeyPatch, found: list[list[range]], num_points: int
+) -> Segmentation:
+    """The outcome where each look finds these things."""
+    pending = iter(found)
+    shape = measure_shape(np.random.default_rng(0).uniform(0.0, 0.04, (500, 3)), 0.004)
+
+    def look(points: SurfacePoints, config: SegmentConfig, robot_m: object) -> Segmentation:
+        labels = np.zeros(num_points, dtype=np.int64)
+        ranges = next(pending)
+        for number, members in enumerate(ranges, start=1):
+            labels[list(members)] = number
+        things = tuple(Thing(label=str(members), shape=shape, score=1.0) for members in ranges)
+        return Segmentation(labels=labels, things=things, plane=None, remark="")
+
+    monkeypatch.setattr(stable_things, "segment_points", look)
+    none = np.zeros((num_points, 3))
+    return segment_stably(SurfacePoints(p_m=none, normals=none, colors=none), SegmentConfig())
+
+
+def test_most_looks_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    firm, rare = range(50), range(60, 90)
+    found = [[firm, rare], [firm], [range(48)], [firm], [range(30)], [firm]]
+    assert len(found) == len(VOXEL_SCALES)
+    result = looks_like(monkeypatch, found, 100)
+    assert [thing.label for thing in result.things] == [str(firm)]
+    assert np.flatnonzero(result.labels).tolist() == list(firm)
+    assert result.remark == ""
+
+
+def test_a_thing_and_its_pieces_are_not_both_things(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, left, right = range(100), range(50), range(50, 100)
+    found = [[whole]] * 4 + [[left, right]] * 2
+    result = looks_like(monkeypatch, found, 100)
+    assert [thing.label for thing in result.things] == [str(whole)]
+
+
+def test_looks_that_do_not_agree_give_nothing_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [[range(10 * k, 10 * k + 10)] for k in range(6)]
+    result = looks_like(monkeypatch, found, 100)
+    assert result.things == ()
+    assert not result.labels.any()
+    assert "no two of 6 sizes" in result.remark
+
+
+def test_things_are_those_of_the_table_largest_first(tabletop: World) -> None:
+    found = segment_stably(points_of(tabletop.cloud), SegmentConfig())
+    truth = tabletop.true_instances()
+    sizes = [int((found.labels == k).sum()) for k in range(1, len(found.things) + 1)]
+    assert sizes == sorted(sizes, reverse=True)
+    for number, name in tabletop.names.items():
+        best = max(
+            range(1, len(found.things) + 1), key=lambda k: iou(found.labels == k, truth == number)
+        )
+        assert iou(found.labels == best, truth == number) > 0.85
+        assert found.things[best - 1].label == name
+
+
+def clumped(cloud: GaussianCloud, rng: np.random.Generator) -> GaussianCloud:
+    """The same surface with Gaussians where a fit may leave them: few, and in clumps."""
+    p = cloud.means_m
+    seeds = p[rng.choice(len(p), 60, replace=False)]
+    near = np.min(np.linalg.norm(p[:, None] - seeds[None], axis=2), axis=1)
+    return cloud.take(np.flatnonzero(rng.random(len(p)) < np.exp(-near / 0.02)))
+
+
+def test_things_do_not_depend_on_where_a_fit_put_the_gaussians(tabletop: World) -> None:
+    rng = np.random.default_rng(0)
+    sparse = clumped(tabletop.cloud, rng)
+    assert len(sparse) < 0.6 * len(tabletop.cloud)
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    fused = scene_by_default(sparse, [], rasteriser, fused=tabletop.cloud)
+    assert {item.label for item in fused.instances} == set(tabletop.names.values())
+    alone = scene_by_default(sparse, [], rasteriser)
+    assert {item.label for item in alone.instances} != set(tabletop.names.values())
+
+
+def test_gaussians_far_from_what_was_measured_belong_to_nothing(tabletop: World) -> None:
+    rasteriser = Rasteriser(RasterConfig(threads=1))
+    lifted = replace(tabletop.cloud, means_m=tabletop.cloud.means_m + np.float32([0, 0, 1]))
+    scene = scene_by_default(lifted, [], rasteriser, fused=tabletop.cloud)
+    assert not scene.labels.any()

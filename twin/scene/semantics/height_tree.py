@@ -1,0 +1,114 @@
+"""Part what hangs together low down, as papers under mugs do: raise the level until it parts.
+
+The parts are the branches of the tree of components over rising levels, cut where they first are
+small enough for things (Jones 1999 on component trees). What lies below a branch belongs to it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from twin.scene.semantics.cluster import components
+
+LEVELS_M = (0.012, 0.018, 0.026, 0.036, 0.05, 0.07)
+"""Heights over the plane at which a group that is too large is looked at again."""
+BESIDE = 1.2
+"""Voxels this near to a branch, seen from above, lie below it."""
+BELOW = 2.0
+"""And no higher over its lowest voxel than so many voxels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Branches:
+    """Groups of voxels that are small enough, and what no level parts."""
+
+    groups: list[Int[np.ndarray, " num_members"]]
+    too_large: Bool[np.ndarray, " num_voxels"]
+
+
+def branches(
+    p_m: Float[np.ndarray, "num_voxels 3"],
+    height_m: Float[np.ndarray, " num_voxels"],
+    pairs: Int[np.ndarray, "num_pairs 2"],
+    *,
+    voxel_m: float,
+    max_size_m: float,
+    min_voxels: int,
+) -> Branches:
+    """Part the connected groups of voxels.
+
+    Args:
+        p_m: Voxels above the plane.
+        height_m: Of each over the plane.
+        pairs: Neighbours.
+        voxel_m: Their size.
+        max_size_m: Groups that reach farther along an axis are parted.
+        min_voxels: Smaller groups are noise.
+    """
+    groups: list[np.ndarray] = []
+    too_large = np.zeros(len(p_m), dtype=bool)
+    group = components(len(p_m), pairs)
+    large = np.flatnonzero(np.bincount(group, minlength=1) >= min_voxels)
+    todo: list[tuple[np.ndarray, tuple[float, ...]]]
+    todo = [(np.flatnonzero(group == number), LEVELS_M) for number in large]
+    while todo:
+        ids, levels = todo.pop(0)
+        if _reach_m(p_m[ids]) <= max_size_m:
+            groups.append(ids)
+            continue
+        parts, left = _parted(ids, p_m, height_m, pairs, levels, max_size_m, min_voxels)
+        todo[:0] = [(part, left) for part in parts]
+        too_large[ids] = not parts
+    grown = _with_what_lies_below(groups, p_m, height_m, voxel_m)
+    for ids in grown:
+        too_large[ids] = False
+    return Branches(groups=grown, too_large=too_large)
+
+
+def _parted(
+    ids: np.ndarray,
+    p_m: np.ndarray,
+    height_m: np.ndarray,
+    pairs: np.ndarray,
+    levels_m: Sequence[float],
+    max_size_m: float,
+    min_voxels: int,
+) -> tuple[list[np.ndarray], tuple[float, ...]]:
+    """What is left of a group above the lowest level that parts it, and the levels above that."""
+    for place, level_m in enumerate(levels_m):
+        high = ids[height_m[ids] > level_m]
+        if len(high) < min_voxels:
+            break
+        rank = np.full(len(p_m), -1, dtype=np.int64)
+        rank[high] = np.arange(len(high))
+        own = rank[pairs]
+        group = components(len(high), own[(own >= 0).all(axis=1)])
+        parts = [high[group == n] for n in np.flatnonzero(np.bincount(group) >= min_voxels)]
+        if len(parts) > 1 or (parts and _reach_m(p_m[parts[0]]) <= max_size_m):
+            return parts, tuple(levels_m[place + 1 :])
+    return [], ()
+
+
+def _with_what_lies_below(
+    groups: list[np.ndarray], p_m: np.ndarray, height_m: np.ndarray, voxel_m: float
+) -> list[np.ndarray]:
+    """Each group with the voxels below it that are nobody's; the first group comes first."""
+    owner = np.full(len(p_m), -1, dtype=np.int64)
+    for number, ids in enumerate(groups):
+        owner[ids] = number
+    for number, ids in enumerate(groups):
+        free = np.flatnonzero(owner < 0)
+        free = free[height_m[free] < height_m[ids].min() + BELOW * voxel_m]
+        if len(free):
+            beside, _ = cKDTree(p_m[ids, :2]).query(
+                p_m[free, :2], distance_upper_bound=BESIDE * voxel_m
+            )
+            owner[free[np.isfinite(beside)]] = number
+    return [np.flatnonzero(owner == number) for number in range(len(groups))]
+
+
+def _reach_m(p_m: np.ndarray) -> float:
+    return float((p_m.max(axis=0) - p_m.min(axis=0)).max())

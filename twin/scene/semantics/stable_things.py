@@ -1,0 +1,98 @@
+"""Things that do not depend on the size of voxels.
+
+Where one thing ends and the next begins is decided by thresholds, and a grid that lies a little
+differently decides otherwise. So the segmenter looks several times, with voxels of other sizes, and
+what it finds again most times is a thing (as Matas et al. 2002 choose regions that stay when a
+threshold moves).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from twin.scene.semantics.cluster import SurfacePoints
+from twin.scene.semantics.segment import Segmentation, SegmentConfig, Thing, segment_points
+
+VOXEL_SCALES = (0.9, 1.0, 1.12, 1.25, 1.4, 1.6)
+"""Of the voxels that the spacing of the points asks for."""
+SAME_IOU = 0.6
+"""Two things are one when they share this much of their union."""
+MIN_SHARE = 0.5
+"""Of the other looks that have to find a thing again."""
+MAX_TAKEN = 0.3
+"""Share of a thing that a stabler one may have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """One thing of one look, and how well the other looks agree."""
+
+    mask: Bool[np.ndarray, " num_points"]
+    thing: Thing
+    share: float
+    """Of the other looks that found it again."""
+    agreement: float
+    """Mean of the best IoU in each of them."""
+
+
+def segment_stably(
+    points: SurfacePoints,
+    config: SegmentConfig,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
+) -> Segmentation:
+    """Find the things that most sizes of voxels find, the largest first.
+
+    Args:
+        points: What was seen, in a frame whose z points up; evenly spaced.
+        config: What counts as a thing; its ``voxel_scale`` is multiplied.
+        robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
+
+    Raises:
+        NoSupportError: When there is no level plane to stand on, and nothing stands out.
+    """
+    looks = [
+        segment_points(points, replace(config, voxel_scale=config.voxel_scale * scale), robot_m)
+        for scale in VOXEL_SCALES
+    ]
+    stable = sorted(
+        (item for item in _all_found(looks) if item.share >= MIN_SHARE),
+        key=lambda item: -(item.share + item.agreement),
+    )
+    kept: list[tuple[np.ndarray, Thing]] = []
+    taken = np.zeros(len(points), dtype=bool)
+    for item in stable:
+        if taken[item.mask].mean() <= MAX_TAKEN:
+            kept.append((item.mask & ~taken, item.thing))
+            taken |= item.mask
+    kept.sort(key=lambda item: -int(item[0].sum()))
+    labels = np.zeros(len(points), dtype=np.int64)
+    for number, (mask, _) in enumerate(kept, start=1):
+        labels[mask] = number
+    things = tuple(thing for _, thing in kept)
+    remark = looks[0].remark
+    if not things and not remark:
+        remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
+    return replace(looks[0], labels=labels, things=things, remark="" if things else remark)
+
+
+def _all_found(looks: list[Segmentation]) -> Iterator[_Found]:
+    sizes = [np.bincount(look.labels, minlength=len(look.things) + 1) for look in looks]
+    for look in looks:
+        others = [(o, size) for o, size in zip(looks, sizes, strict=True) if o is not look]
+        for number, thing in enumerate(look.things, start=1):
+            mask = look.labels == number
+            best = np.array([_best_iou(mask, other, size) for other, size in others])
+            yield _Found(
+                mask=mask,
+                thing=thing,
+                share=float((best >= SAME_IOU).mean()),
+                agreement=float(best.mean()),
+            )
+
+
+def _best_iou(mask: np.ndarray, other: Segmentation, sizes: np.ndarray) -> float:
+    shared = np.bincount(other.labels[mask], minlength=len(sizes))
+    iou = shared / (mask.sum() + sizes - shared)
+    return float(iou[1:].max(initial=0.0))
