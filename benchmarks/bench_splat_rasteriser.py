@@ -10,7 +10,13 @@ from bridge.geometry.camera import Camera
 from bridge.robots.default import ROBOT
 from twin.robot.posture import Posture
 from twin.scene.frames.rgbd import Target as Seen
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32, morton_order
+from twin.scene.gaussians import (
+    GaussianCloud,
+    arrays,
+    as_float32,
+    concatenate,
+    morton_order,
+)
 from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import ObjectSplats
 from twin.scene.raster.rasteriser import FitSession, RasterConfig, Rasteriser, available_isas
