@@ -120,6 +120,27 @@ def components(
     return numbered(np.asarray(labels, dtype=np.int64))
 
 
+def pairs_among(
+    ids: Int[np.ndarray, " num_members"], pairs: Int[np.ndarray, "num_pairs 2"], num_nodes: int
+) -> Int[np.ndarray, "num_own 2"]:
+    """The pairs that lie among some nodes, in the numbering of these.
+
+    Args:
+        ids: The nodes.
+        pairs: Of all nodes.
+        num_nodes: How many there are in all.
+    """
+    rank = np.full(num_nodes, -1, dtype=np.int64)
+    rank[ids] = np.arange(len(ids))
+    own = rank[pairs]
+    return np.asarray(own[(own >= 0).all(axis=1)])
+
+
+def extents_m(p_m: Float[np.ndarray, "num_points 3"]) -> Float[np.ndarray, "3"]:
+    """Extents along the axes, largest first."""
+    return np.asarray(np.sort(p_m.max(axis=0) - p_m.min(axis=0))[::-1])
+
+
 def numbered(labels: Int[np.ndarray, " num_nodes"]) -> Int[np.ndarray, " num_nodes"]:
     """Renumber labels from 0 in the order in which they first appear."""
     _, first, index = np.unique(labels, return_index=True, return_inverse=True)

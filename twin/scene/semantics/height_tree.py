@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from twin.scene.semantics.cluster import components
+from twin.scene.semantics.cluster import components, extents_m, pairs_among
 
 LEVELS_M = (0.012, 0.018, 0.026, 0.036, 0.05, 0.07)
 """Heights over the plane at which a group that is too large is looked at again."""
@@ -56,7 +56,7 @@ def branches(
     todo = [(np.flatnonzero(group == number), LEVELS_M) for number in large]
     while todo:
         ids, levels = todo.pop(0)
-        if _reach_m(p_m[ids]) <= max_size_m:
+        if extents_m(p_m[ids])[0] <= max_size_m:
             groups.append(ids)
             continue
         parts, left = _parted(ids, p_m, height_m, pairs, levels, max_size_m, min_voxels)
@@ -82,12 +82,9 @@ def _parted(
         high = ids[height_m[ids] > level_m]
         if len(high) < min_voxels:
             break
-        rank = np.full(len(p_m), -1, dtype=np.int64)
-        rank[high] = np.arange(len(high))
-        own = rank[pairs]
-        group = components(len(high), own[(own >= 0).all(axis=1)])
+        group = components(len(high), pairs_among(high, pairs, len(p_m)))
         parts = [high[group == n] for n in np.flatnonzero(np.bincount(group) >= min_voxels)]
-        if len(parts) > 1 or (parts and _reach_m(p_m[parts[0]]) <= max_size_m):
+        if len(parts) > 1 or (parts and extents_m(p_m[parts[0]])[0] <= max_size_m):
             return parts, tuple(levels_m[place + 1 :])
     return [], ()
 
@@ -108,7 +105,3 @@ def _with_what_lies_below(
             )
             owner[free[np.isfinite(beside)]] = number
     return [np.flatnonzero(owner == number) for number in range(len(groups))]
-
-
-def _reach_m(p_m: np.ndarray) -> float:
-    return float((p_m.max(axis=0) - p_m.min(axis=0)).max())

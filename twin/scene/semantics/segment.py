@@ -16,9 +16,11 @@ from twin.scene.semantics.cluster import (
     SurfacePoints,
     ValleySplitConfig,
     Voxels,
+    extents_m,
     joined_by_outline,
     make_voxels,
     neighbour_pairs,
+    pairs_among,
     split_by_colour,
     split_by_valleys,
 )
@@ -237,7 +239,7 @@ def _things(
         pieces += _pieces(voxels, ids, height, pairs, voxel_m, config)
     found = 0
     for piece in joined_by_outline(pieces, voxels, height, voxel_m, config.split):
-        extent = _extent(voxels.p_m[piece])
+        extent = extents_m(voxels.p_m[piece])
         if len(piece) >= config.min_voxels and extent[1] >= config.min_size_m:
             found += 1
             labels[piece] = found
@@ -247,11 +249,6 @@ def _things(
         cut = cut_into_patches(points.take(left), voxel_m / 2, config.patches)
         of_points[left] = np.where(cut > 0, cut + found, 0)
     return of_points
-
-
-def _extent(p_m: np.ndarray) -> np.ndarray:
-    """Extents along the axes, largest first."""
-    return np.sort(p_m.max(axis=0) - p_m.min(axis=0))[::-1]
 
 
 def _pieces(
@@ -276,9 +273,6 @@ def _pieces(
 
 def _within(voxels: Voxels, ids: np.ndarray, pairs: np.ndarray) -> tuple[Voxels, np.ndarray]:
     """Some voxels, and the pairs among them in their own numbering."""
-    rank = np.full(len(voxels), -1, dtype=np.int64)
-    rank[ids] = np.arange(len(ids))
-    own = rank[pairs]
     part = Voxels(
         p_m=voxels.p_m[ids],
         normals=voxels.normals[ids],
@@ -286,7 +280,7 @@ def _within(voxels: Voxels, ids: np.ndarray, pairs: np.ndarray) -> tuple[Voxels,
         count=voxels.count[ids],
         of_point=np.zeros(0, dtype=np.int64),
     )
-    return part, own[(own >= 0).all(axis=1)]
+    return part, pairs_among(ids, pairs, len(voxels))
 
 
 def _largest_first(labels: np.ndarray) -> np.ndarray:

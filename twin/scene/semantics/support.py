@@ -123,7 +123,7 @@ def find_support(
     Raises:
         NoSupportError: When no level plane has enough points.
     """
-    upright = normals @ UP > np.cos(3 * config.max_tilt_rad)
+    upright = _faces_up(normals, config)
     left = p_m[upright]
     planes: list[tuple[int, SupportPlane]] = []
     for _ in range(config.num_candidates):
@@ -169,11 +169,11 @@ def as_measured(
         normals: Unit vectors at the points.
         config: How near counts as the plane.
     """
-    near = (np.abs(plane.height_m(p_m)) < BENT_M) & (normals @ UP > np.cos(3 * config.max_tilt_rad))
+    near = (np.abs(plane.height_m(p_m)) < BENT_M) & _faces_up(normals, config)
     if int(near.sum()) < config.min_points:
         return plane
     p = p_m[near]
-    bent = replace(plane, bend=fit_bend(p, plane.height_m(p), config.tolerance_m))
+    bent = replace(plane, bend=_fit_bend(p, plane.height_m(p), config.tolerance_m))
     inside = np.abs(bent.height_m(p)) < config.tolerance_m
     if int(inside.sum()) < config.min_points:
         return plane
@@ -183,7 +183,7 @@ def as_measured(
     return bent if after < WORTH * before else plane
 
 
-def fit_bend(
+def _fit_bend(
     p_m: Float[np.ndarray, "num_points 3"],
     height_m: Float[np.ndarray, " num_points"],
     tolerance_m: float,
@@ -216,12 +216,16 @@ def _terms(xy: Float[np.ndarray, "num_points 2"]) -> Float[np.ndarray, "num_poin
 
 def no_support(p_m: np.ndarray, normals: np.ndarray, config: SupportConfig) -> str:
     """What to tell somebody whose scene has no level plane, nor anything that stands out."""
-    upright = normals @ UP > np.cos(3 * config.max_tilt_rad)
+    upright = _faces_up(normals, config)
     return (
         f"no level plane among {len(p_m)} points, {int(upright.sum())} of them facing up, and "
         "nothing that stands out. The default segmenter needs a table in view, or things before a "
         "wall."
     )
+
+
+def _faces_up(normals: np.ndarray, config: SupportConfig) -> Bool[np.ndarray, " num_points"]:
+    return np.asarray(normals @ UP > np.cos(3 * config.max_tilt_rad))
 
 
 def _largest_plane(p_m: np.ndarray, config: SupportConfig) -> SupportPlane | None:
