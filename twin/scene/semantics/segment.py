@@ -66,8 +66,6 @@ class SegmentConfig:
     """Higher points belong to the surroundings."""
     voxel_m: float = 0.004
     """Finest size of the voxels that hang together; grows with the spacing of the points."""
-    voxel_scale: float = 1.0
-    """Times the sizes of all voxels."""
     reach_voxels: float = 1.8
     """Voxels nearer than this hang together (the 26 neighbours)."""
     min_voxels: int = 25
@@ -127,42 +125,93 @@ def segment_points(
     Raises:
         NoSupportError: When there is no level plane to stand on, and nothing stands out.
     """
+    ground = ground_of(points, config, robot_m)
+    look = ground.look(1.0)
+    numbers = range(1, int(look.labels.max(initial=0)) + 1)
+    things = tuple(ground.thing(look.labels == number, look.voxel_m) for number in numbers)
+    remark = "" if things else ground.nothing
+    return Segmentation(labels=look.labels, things=things, plane=ground.plane, remark=remark)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """What belongs together, seen with voxels of one size."""
+
+    labels: Int[np.ndarray, " num_points"]
+    """Index of the thing plus one, the largest first; 0 is the background."""
+    voxel_m: float
+    """Cells in which the shape of a thing is measured."""
+
+
+def ground_of(
+    points: SurfacePoints,
+    config: SegmentConfig,
+    robot_m: Float[np.ndarray, "num_robot 3"] | None,
+) -> "OverPlane | WithoutPlane":
+    """Find what things stand on, how high everything is over it, and what is free to be a thing.
+
+    Args:
+        points: What was seen, in a frame whose z points up.
+        config: What counts as a thing.
+        robot_m: Points on the robot's surface, to leave it out.
+    """
     try:
         plane = find_support(points.p_m, points.normals, config.support)
     except NoSupportError:
-        return _without_support(points, config, robot_m)
-    plane = as_measured(plane, points.p_m, points.normals, config.support)
-    roughness = roughness_m(points.p_m, points.normals, plane, config.support)
-    least = max(config.min_height_m, config.roughness_factor * roughness)
-    config = replace(config, min_height_m=least)
-    height = plane.height_m(points.p_m)
-    free = plane.under(points.p_m) & (height < config.max_height_m)
-    free &= ~_on_robot(points.p_m, robot_m, config)
-    lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
-    raised = free & (height > config.min_height_m)
-    if least > FINE_M:
-        raised &= ~_is_relief(lab, height, plane.under(points.p_m), config)
-    above = np.flatnonzero(raised)
-    labels = np.zeros(len(points), dtype=np.int64)
-    voxel_m = config.voxel_scale * max(config.voxel_m, 2.0 * _spacing(points.p_m[above]))
-    labels[above] = _things(points.take(above), height[above], voxel_m, config)
-    labels = _largest_first(labels)
-    low = free & (np.abs(height) <= config.min_height_m)
-    _add_feet(labels, points.p_m, lab, low, height, voxel_m, config)
-    labels = _without_relief(labels, lab, low, height, config)
-    things = tuple(
-        _thing(points.take(labels == number), height[labels == number], voxel_m, config)
-        for number in range(1, int(labels.max(initial=0)) + 1)
-    )
-    remark = (
-        ""
-        if things
-        else (
-            f"nothing stands on the level plane at z = {plane.offset_m / plane.normal[2]:.3f} m "
-            f"({len(above)} points above it, none hang together as a thing of 1 to 45 cm)"
+        return WithoutPlane(points, config, robot_m)
+    return OverPlane(points, plane, config, robot_m)
+
+
+class OverPlane:
+    """Points on a level plane, with all that does not depend on the size of voxels."""
+
+    def __init__(
+        self,
+        points: SurfacePoints,
+        plane: SupportPlane,
+        config: SegmentConfig,
+        robot_m: np.ndarray | None,
+    ) -> None:
+        """Measure heights, and choose what is free to be a thing."""
+        plane = as_measured(plane, points.p_m, points.normals, config.support)
+        roughness = roughness_m(points.p_m, points.normals, plane, config.support)
+        least = max(config.min_height_m, config.roughness_factor * roughness)
+        self._config = config = replace(config, min_height_m=least)
+        self._points, self.plane = points, plane
+        self._height = height = plane.height_m(points.p_m)
+        under = plane.under(points.p_m)
+        self._lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
+        free = under & (height < config.max_height_m) & ~_on_robot(points.p_m, robot_m, config)
+        raised = free & (height > config.min_height_m)
+        if least > FINE_M:
+            raised &= ~_is_relief(self._lab, height, under, config)
+        self._low = free & (np.abs(height) <= config.min_height_m)
+        self._above = np.flatnonzero(raised)
+        self._voxel_m = max(config.voxel_m, 2.0 * _spacing(points.p_m[self._above]))
+
+    @property
+    def nothing(self) -> str:
+        """Why no thing was found, where none was."""
+        z_m = self.plane.offset_m / self.plane.normal[2]
+        return (
+            f"nothing stands on the level plane at z = {z_m:.3f} m "
+            f"({len(self._above)} points above it, none hang together as a thing of 1 to 45 cm)"
         )
-    )
-    return Segmentation(labels=labels, things=things, plane=plane, remark=remark)
+
+    def look(self, scale: float) -> Look:
+        """Group them, with voxels so many times as large as their spacing asks for."""
+        points, height, above, config = self._points, self._height, self._above, self._config
+        voxel_m = scale * self._voxel_m
+        labels = np.zeros(len(points), dtype=np.int64)
+        labels[above] = _things(points.take(above), height[above], voxel_m, config)
+        labels = _largest_first(labels)
+        _add_feet(labels, points.p_m, self._lab, self._low, height, voxel_m, config)
+        labels = _without_relief(labels, self._lab, self._low, height, config)
+        return Look(labels=labels, voxel_m=voxel_m)
+
+    def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
+        """Describe the points of one thing."""
+        return _thing(self._points.take(mask), self._height[mask], voxel_m, self._config)
 
 
 def _is_relief(
@@ -183,28 +232,45 @@ def _on_robot(p_m: np.ndarray, robot_m: np.ndarray | None, config: SegmentConfig
     return np.asarray(np.isfinite(distance))
 
 
-def _without_support(
-    points: SurfacePoints, config: SegmentConfig, robot_m: np.ndarray | None
-) -> Segmentation:
-    """Things where nothing level was measured, a shelf of bare metal: all of it is cut.
+class WithoutPlane:
+    """Points where nothing level was measured, a shelf of bare metal: all of it is cut."""
 
-    Raises:
-        NoSupportError: When nothing is found in this way either.
-    """
-    free = np.flatnonzero(~_on_robot(points.p_m, robot_m, config))
-    labels = np.zeros(len(points), dtype=np.int64)
-    spacing_m = config.voxel_scale * _spacing(points.p_m[free])
-    patches = replace(config.patches, voxel_m=config.voxel_scale * config.patches.voxel_m)
-    labels[free] = cut_into_patches(points.take(free), spacing_m, patches)
-    if not labels.any():
-        raise NoSupportError(no_support(points.p_m, points.normals, config.support))
-    labels = _largest_first(labels)
-    things = []
-    for number in range(1, int(labels.max()) + 1):
-        mine = points.take(labels == number)
+    plane = None
+
+    def __init__(
+        self, points: SurfacePoints, config: SegmentConfig, robot_m: np.ndarray | None
+    ) -> None:
+        """Choose what is free to be a thing."""
+        self._points, self._config = points, config
+        self._free = np.flatnonzero(~_on_robot(points.p_m, robot_m, config))
+        self._spacing_m = _spacing(points.p_m[self._free])
+
+    @property
+    def nothing(self) -> str:
+        """Why no thing was found, where none was."""
+        return no_support(self._points.p_m, self._points.normals, self._config.support)
+
+    def look(self, scale: float) -> Look:
+        """Cut them, with voxels so many times as large as their spacing asks for.
+
+        Raises:
+            NoSupportError: When nothing stands out.
+        """
+        patches = self._config.patches
+        scaled = replace(patches, voxel_m=scale * patches.voxel_m)
+        labels = np.zeros(len(self._points), dtype=np.int64)
+        labels[self._free] = cut_into_patches(
+            self._points.take(self._free), scale * self._spacing_m, scaled
+        )
+        if not labels.any():
+            raise NoSupportError(self.nothing)
+        return Look(labels=_largest_first(labels), voxel_m=patches.voxel_m)
+
+    def thing(self, mask: Bool[np.ndarray, " num_points"], voxel_m: float) -> Thing:
+        """Describe the points of one thing."""
+        mine = self._points.take(mask)
         height = mine.p_m[:, 2] - float(np.quantile(mine.p_m[:, 2], 0.01))
-        things.append(_thing(mine, height, config.patches.voxel_m, config))
-    return Segmentation(labels=labels, things=tuple(things), plane=None, remark="")
+        return _thing(mine, height, voxel_m, self._config)
 
 
 def _spacing(p_m: np.ndarray) -> float:

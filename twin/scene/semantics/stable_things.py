@@ -7,13 +7,13 @@ threshold moves).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from twin.scene.semantics.cluster import SurfacePoints
-from twin.scene.semantics.segment import Segmentation, SegmentConfig, Thing, segment_points
+from twin.scene.semantics.segment import Look, Segmentation, SegmentConfig, ground_of
 
 VOXEL_SCALES = (0.9, 1.0, 1.12, 1.25, 1.4, 1.6)
 """Of the voxels that the spacing of the points asks for."""
@@ -30,7 +30,7 @@ class _Found:
     """One thing of one look, and how well the other looks agree."""
 
     mask: Bool[np.ndarray, " num_points"]
-    thing: Thing
+    voxel_m: float
     share: float
     """Of the other looks that found it again."""
     agreement: float
@@ -46,53 +46,55 @@ def segment_stably(
 
     Args:
         points: What was seen, in a frame whose z points up; evenly spaced.
-        config: What counts as a thing; its ``voxel_scale`` is multiplied.
+        config: What counts as a thing.
         robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
 
     Raises:
         NoSupportError: When there is no level plane to stand on, and nothing stands out.
     """
-    looks = [
-        segment_points(points, replace(config, voxel_scale=config.voxel_scale * scale), robot_m)
-        for scale in VOXEL_SCALES
-    ]
+    ground = ground_of(points, config, robot_m)
+    looks = [ground.look(scale) for scale in VOXEL_SCALES]
     stable = sorted(
         (item for item in _all_found(looks) if item.share >= MIN_SHARE),
         key=lambda item: -(item.share + item.agreement),
     )
-    kept: list[tuple[np.ndarray, Thing]] = []
+    kept: list[tuple[np.ndarray, _Found]] = []
     taken = np.zeros(len(points), dtype=bool)
     for item in stable:
         if taken[item.mask].mean() <= MAX_TAKEN:
-            kept.append((item.mask & ~taken, item.thing))
+            kept.append((item.mask & ~taken, item))
             taken |= item.mask
-    kept.sort(key=lambda item: -int(item[0].sum()))
+    kept.sort(key=lambda pair: -int(pair[0].sum()))
     labels = np.zeros(len(points), dtype=np.int64)
     for number, (mask, _) in enumerate(kept, start=1):
         labels[mask] = number
-    things = tuple(thing for _, thing in kept)
-    remark = looks[0].remark
-    if not things and not remark:
-        remark = f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
-    return replace(looks[0], labels=labels, things=things, remark="" if things else remark)
+    things = tuple(ground.thing(item.mask, item.voxel_m) for _, item in kept)
+    remark = "" if things else _why_none(looks, ground.nothing)
+    return Segmentation(labels=labels, things=things, plane=ground.plane, remark=remark)
 
 
-def _all_found(looks: list[Segmentation]) -> Iterator[_Found]:
-    sizes = [np.bincount(look.labels, minlength=len(look.things) + 1) for look in looks]
-    for look in looks:
+def _why_none(looks: list[Look], nothing: str) -> str:
+    if not looks[0].labels.any():
+        return nothing
+    return f"of what stands out, no two of {len(looks)} sizes of voxels find the same"
+
+
+def _all_found(looks: list[Look]) -> Iterator[_Found]:
+    sizes = [np.bincount(look.labels) for look in looks]
+    for look, own in zip(looks, sizes, strict=True):
         others = [(o, size) for o, size in zip(looks, sizes, strict=True) if o is not look]
-        for number, thing in enumerate(look.things, start=1):
+        for number in range(1, len(own)):
             mask = look.labels == number
             best = np.array([_best_iou(mask, other, size) for other, size in others])
             yield _Found(
                 mask=mask,
-                thing=thing,
+                voxel_m=look.voxel_m,
                 share=float((best >= SAME_IOU).mean()),
                 agreement=float(best.mean()),
             )
 
 
-def _best_iou(mask: np.ndarray, other: Segmentation, sizes: np.ndarray) -> float:
+def _best_iou(mask: np.ndarray, other: Look, sizes: np.ndarray) -> float:
     shared = np.bincount(other.labels[mask], minlength=len(sizes))
     iou = shared / (mask.sum() + sizes - shared)
     return float(iou[1:].max(initial=0.0))

@@ -11,7 +11,7 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics import stable_things
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.segment import Segmentation, SegmentConfig, Thing, points_of
+from twin.scene.semantics.segment import Look, Segmentation, SegmentConfig, Thing, points_of
 from twin.scene.semantics.shape_descriptors import measure_shape
 from twin.scene.semantics.stable_things import VOXEL_SCALES, segment_stably
 
@@ -20,18 +20,24 @@ def looks_like(
     monkeypatch: pytest.MonkeyPatch, found: list[list[range]], num_points: int
 ) -> Segmentation:
     """The outcome where each look finds these things."""
-    pending = iter(found)
     shape = measure_shape(np.random.default_rng(0).uniform(0.0, 0.04, (500, 3)), 0.004)
+    pending = iter(found)
 
-    def look(points: SurfacePoints, config: SegmentConfig, robot_m: object) -> Segmentation:
-        labels = np.zeros(num_points, dtype=np.int64)
-        ranges = next(pending)
-        for number, members in enumerate(ranges, start=1):
-            labels[list(members)] = number
-        things = tuple(Thing(label=str(members), shape=shape, score=1.0) for members in ranges)
-        return Segmentation(labels=labels, things=things, plane=None, remark="")
+    class Ground:
+        plane = None
+        nothing = "nothing is there"
 
-    monkeypatch.setattr(stable_things, "segment_points", look)
+        def look(self, scale: float) -> Look:
+            labels = np.zeros(num_points, dtype=np.int64)
+            for number, members in enumerate(next(pending), start=1):
+                labels[list(members)] = number
+            return Look(labels=labels, voxel_m=0.004 * scale)
+
+        def thing(self, mask: np.ndarray, voxel_m: float) -> Thing:
+            first, *_, last = np.flatnonzero(mask).tolist()
+            return Thing(label=str(range(first, last + 1)), shape=shape, score=1.0)
+
+    monkeypatch.setattr(stable_things, "ground_of", lambda *_: Ground())
     none = np.zeros((num_points, 3))
     return segment_stably(SurfacePoints(p_m=none, normals=none, colors=none), SegmentConfig())
 
