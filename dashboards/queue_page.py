@@ -11,6 +11,7 @@ import numpy as np
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema, streams
+from bridge.episode.executions import executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -211,7 +212,7 @@ def _page_t_s(run: RunFolder, row: IndexedTrial, moment: Moment) -> float | None
 def _starts_s(path: Path, _mtime_ns: int, _size: int) -> dict[str, float]:
     """When each executed plan started on the page's clock."""
     episode = Episode.open(path)
-    events = streams.events(episode)
+    events = executed_events(episode)
     zero_ns = streams.first_stamp_ns(episode) or 0
     plan_ids = {str(event.get("plan_id")) for event in events}
     starts_ns = {plan_id: streams.execution_ns(events, plan_id)[0] for plan_id in plan_ids}
@@ -310,7 +311,7 @@ def recorded_ns(path: Path, moment: Moment) -> int | None:
         path: The recorded episode.
         moment: What its replays tell.
     """
-    start_ns, _ = streams.execution_ns(streams.events(Episode.open(path)), moment.plan_id)
+    start_ns, _ = streams.execution_ns(executed_events(Episode.open(path)), moment.plan_id)
     return None if start_ns is None else start_ns + moment.t_ns
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.episode import schema, streams
+from bridge.episode.executions import executed_events
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
@@ -138,7 +139,7 @@ def _read(path: Path, _mtime_ns: int, size: int) -> Recording:
         topics=tuple(topics),
         plans=tuple(problems.attempt(lambda: streams.plans(episode), [])),
         verdicts=tuple(problems.attempt(lambda: streams.verdicts(episode), [])),
-        events=tuple(problems.attempt(lambda: streams.events(episode), [])),
+        events=tuple(problems.attempt(lambda: executed_events(episode), [])),
         contacts=tuple(problems.attempt(lambda: _records(episode, schema.CONTACT), [])),
         divergence=divergences[-1] if divergences else None,
         joints=joints(JOINT_STATES),
@@ -176,10 +177,10 @@ class PageClock:
         zero = 0 if first is None else first
         end = zero if last is None else last
         starts = {}
-        for _, plan in recording.plans:
-            interval = recording.executed_ns(plan.id)
+        for event in recording.events:
+            interval = recording.executed_ns(str(event.get("plan_id")))
             if interval is not None:
-                starts[plan.id] = interval[0]
+                starts[str(event["plan_id"])] = interval[0]
         return PageClock(
             zero_ns=zero,
             end_s=max((end - zero) * 1e-9, 1e-3),

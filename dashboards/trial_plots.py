@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bridge.clock import NS_PER_S
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.streams import JointTrack
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
@@ -63,13 +64,13 @@ def main_plots(
 
 
 def shown_replays(replays: Sequence[Recording], sent_plan: Plan | None) -> dict[str, Recording]:
-    """Pick one planned and one executed replay of the sent plan: dynamic, and the last made."""
+    """Pick a planned and an executed replay of what was sent: dynamic, and the last made."""
     chosen: dict[str, Recording] = {}
     for replay in replays:
         derived = replay.derived
-        if derived is None or derived.trajectory is None or sent_plan is None:
+        if derived is None or derived.trajectory is None:
             continue
-        if derived.plan_id not in (None, sent_plan.id):
+        if derived.plan_id not in (None, NO_PLAN if sent_plan is None else sent_plan.id):
             continue
         if derived.mode == "dynamic" or derived.trajectory not in chosen:
             chosen[derived.trajectory] = replay

@@ -27,6 +27,8 @@ def replay(
 ) -> int:
     """Replay every plan and every execution of a run, and judge each: I(tau).
 
+    A trial needs joint states and a task; a plan is not needed. Exit code 2 where an episode has
+    nothing to replay, with the reason for each.
     Example: robot-gst replay runs/today
 
     Args:
@@ -40,8 +42,9 @@ def replay(
 
     summary = replay_run(RunFolder.open(run), config, output)
     output.result(summary, describe_run(summary))
-    failed = summary["skipped_episodes"] or any(row["error"] for row in summary["rows"])
-    return 1 if failed else 0
+    if summary["skipped_episodes"] or any(row["error"] for row in summary["rows"]):
+        return 1
+    return 2 if summary["nothing_to_replay"] or not (summary["rows"] or summary["imported"]) else 0
 
 
 def gate(

@@ -430,43 +430,63 @@ def label(
     /,
     *,
     result: Literal["success", "failure", "unknown"] | None = None,
+    task: str | None = None,
+    start: str | None = None,
+    policy: str | None = None,
     by: str = "operator",
     detail: str | None = None,
     flag: str | None = None,
     unflag: Annotated[bool, Parameter(negative=())] = False,
     output: Output = OUTPUT,
 ) -> int:
-    """Set the outcome of a recorded episode, or flag it; kept in notes/, nothing is rewritten.
+    """Say how a recorded episode ended, and of what it is a trial; nothing is rewritten.
 
+    With --task, an imported episode is a trial from then on. Kept in notes/.
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
+    Example: robot-gst label runs/monday bag_7 --task cube_into_box --result success --policy act
     Keep it whatever happens: robot-gst label runs/monday trial_0003 --flag "look at the wrist"
 
     Args:
         run: Run folder.
         episode: Id of the episode: its file name without .mcap.
         result: success, failure or unknown.
+        task: Name or file of the task it is a trial of.
+        start: Id of the start that it shares with other trials; with --task.
+        policy: What moved the robot; with --task.
         by: Who says so.
         detail: What happened, in words.
         flag: Why prune and --quota-mb must never remove it.
         unflag: Take the flag away.
         output: How to talk.
     """
-    from bridge.episode.catalogue import flag_episode, label_episode
+    from bridge.episode.catalogue import (
+        assign_trial,
+        flag_episode,
+        label_episode,
+        refuse_without_task,
+    )
     from bridge.episode.metadata import Outcome
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
 
     if flag is not None and unflag:
         raise UsageError("--flag and --unflag exclude each other.")
-    if result is None and flag is None and not unflag:
-        raise UsageError("say what to note: --result success, --flag WHY or --unflag.")
+    if task is None and (start or policy):
+        raise UsageError("--start and --policy belong to a trial: add --task NAME.")
+    if result is None and flag is None and not unflag and task is None:
+        raise UsageError("say what to note: --result success, --task NAME, --flag WHY or --unflag.")
     opened = RunFolder.open(run)
     data: dict[str, object] = {}
     said = []
+    if task is not None:
+        note = assign_trial(opened, episode, task=task, start_id=start, policy=policy)
+        data |= {"task": task, "start": start, "policy": policy, "note": str(note)}
+        said.append(f"a trial of {task} ({note})")
     if result is not None:
+        refuse_without_task(opened, episode)
         outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
         path = label_episode(opened, episode, outcome)
-        data = {"label": asdict(outcome), "file": str(path)}
+        data |= {"label": asdict(outcome), "file": str(path)}
         said.append(f"{result} ({path})")
     if flag is not None or unflag:
         flag_episode(opened, episode, flag)

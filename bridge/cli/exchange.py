@@ -213,6 +213,7 @@ def import_lerobot(
     *,
     cell: str = "lerobot",
     episodes: str | None = None,
+    task: str | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """Turn a LeRobotDataset v3.0 into episodes: joints, actions, images, one file per episode.
@@ -225,8 +226,10 @@ def import_lerobot(
         run: Run folder; made where needed.
         cell: Name of the cell in topics.
         episodes: Which ones, for example 0-9,12; all without it.
+        task: Name or file of the task they are trials of.
         output: How to talk.
     """
+    from bridge.episode.catalogue import task_of_run
     from bridge.episode.run_folder import RunFolder
     from bridge.episode.topics import refuse_bad_name
     from bridge.exchange.lerobot.importing import import_lerobot as read_dataset
@@ -236,10 +239,10 @@ def import_lerobot(
     refuse_bad_name("cell", cell)
     wanted = parse_selection(episodes)
     total = len(read_episodes(read_info(folder), wanted))
+    opened = RunFolder.create(run)
+    name = task_of_run(opened, task) if task else ""
     with output.progress("import", total) as advance:
-        report = read_dataset(
-            folder, RunFolder.create(run), cell=cell, wanted=wanted, advance=advance
-        )
+        report = read_dataset(folder, opened, cell=cell, wanted=wanted, advance=advance, task=name)
     for feature in report.left_out:
         output.say(f"left out: {feature}")
     text = f"{run}: {len(report.files)} episodes, {report.frames} rows"
@@ -437,7 +440,13 @@ def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int
 
 
 def import_rosbag2(
-    bag: Path, run: Path, /, *, episode: str | None = None, output: Output = OUTPUT
+    bag: Path,
+    run: Path,
+    /,
+    *,
+    episode: str | None = None,
+    task: str | None = None,
+    output: Output = OUTPUT,
 ) -> int:
     """Turn a rosbag2 recording into an episode; every message stays byte for byte.
 
@@ -448,20 +457,22 @@ def import_rosbag2(
         bag: A file of a bag, or the folder with metadata.yaml, split files included.
         run: Run folder; made where needed.
         episode: Id of the new episode; by default from the name of the bag.
+        task: Name or file of the task it is a trial of.
         output: How to talk.
     """
     import re
 
+    from bridge.episode.catalogue import task_of_run
     from bridge.episode.run_folder import RunFolder
     from bridge.exchange.rosbag2 import count_messages, import_bag
 
     stem = re.sub(r"(\.mcap|\.db3)?(\.zstd)?$", "", bag.resolve().name)
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_-")
     total = count_messages(bag)
+    opened, name = RunFolder.create(run), episode or plain or "bag"
+    of_task = task_of_run(opened, task) if task else ""
     with output.progress("import", total) as advance:
-        report = import_bag(
-            bag, RunFolder.create(run), episode_id=episode or plain or "bag", advance=advance
-        )
+        report = import_bag(bag, opened, episode_id=name, task=of_task, advance=advance)
     data = {
         "file": str(report.path),
         "bag_files": report.files,

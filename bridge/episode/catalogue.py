@@ -12,6 +12,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+from bridge.episode.assigned import assign
 from bridge.episode.catalogue_store import (
     FILE_NAME,
     FLAG_SUFFIX,
@@ -30,7 +31,8 @@ from bridge.episode.contract import PRESENCE_RECORD, presence_lines
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id, first_part
-from bridge.errors import GstError, MissingDependencyError, PathNotFoundError
+from bridge.errors import GstError, MissingDependencyError, PathNotFoundError, UsageError
+from bridge.task.find import chosen_task_file, keep_task_file
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
 
@@ -373,6 +375,50 @@ def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     path = write_label(run, episode_id, outcome)
     note_finished(run, run.episodes_dir / f"{episode_id}.mcap")
     return path
+
+
+def assign_trial(
+    run: RunFolder, episode_id: str, *, task: str, start_id: str | None, policy: str | None
+) -> Path:
+    """Note that an episode is a trial of a task, beside the run.
+
+    Args:
+        run: The run that holds it.
+        episode_id: Id of a finished episode.
+        task: Name of a task, or its file, which the run then keeps.
+        start_id: Start it shares with others; None: as it says itself.
+        policy: What moved the robot; None: as it says itself.
+    """
+    path, name = _finished(run, episode_id), task_of_run(run, task)
+    info = Episode.open(path).info
+    note = assign(run, path, info, task=name, start_id=start_id, policy=policy)
+    note_finished(run, path)
+    return note
+
+
+def task_of_run(run: RunFolder, task: str) -> str:
+    """Return the name of a task, given by its name or its file, which the run then keeps.
+
+    Raises:
+        UsageError: When there is none of that name.
+    """
+    file = chosen_task_file(task, tasks_dir=run.tasks_dir)
+    name = file.task().name
+    if task.endswith(".toml"):
+        keep_task_file(run.tasks_dir, name, file.data)
+    return name
+
+
+def refuse_without_task(run: RunFolder, episode_id: str) -> None:
+    """Refuse to label what nobody would count: an imported episode of no task.
+
+    Raises:
+        UsageError: Saying how to make it a trial.
+    """
+    if Episode.open(_finished(run, episode_id)).info.kind == "imported":
+        raise UsageError(
+            f"{episode_id} was imported and is no trial yet: say of which task, --task NAME."
+        )
 
 
 def note_finished(run: RunFolder, path: Path) -> None:

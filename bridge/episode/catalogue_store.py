@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.run_folder import RunFolder, file_names, part_paths
 from bridge.errors import UsageError, refuse_outside
 
@@ -25,6 +26,7 @@ LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
 FLAG_SUFFIX = ".flag.json"
 """Of the sidecar that says why an episode must be kept."""
+SIDECARS = (LABEL_SUFFIX, FLAG_SUFFIX, TRIAL_SUFFIX)
 UNSETTLED_NS = 2_000_000_000
 """A file changed this recently may change again within one tick of the disk's clock [ns]."""
 
@@ -83,8 +85,7 @@ class Trace:
 def scan(run: RunFolder) -> dict[str, Trace]:
     """Look at every file once; by printable name of the first part, in name order."""
     now_ns = time.time_ns()
-    suffixes = (LABEL_SUFFIX, FLAG_SUFFIX)
-    labels = {name for suffix in suffixes for name in file_names(run.notes_dir, suffix)}
+    labels = {name for suffix in SIDECARS for name in file_names(run.notes_dir, suffix)}
     return {
         printable(name): trace(
             run,
@@ -115,7 +116,7 @@ def trace(
     """
     now_ns = time.time_ns() if now_ns is None else now_ns
     files = part_paths(path) if parts is None else [*parts]
-    for sidecar in (f"{path.stem}{LABEL_SUFFIX}", f"{path.stem}{FLAG_SUFFIX}"):
+    for sidecar in (f"{path.stem}{suffix}" for suffix in SIDECARS):
         if labels is None or sidecar in labels:
             files.append(run.notes_dir / sidecar)
     return Trace(path, stamp_of(files, now_ns))

@@ -53,6 +53,11 @@ class EpisodeInfo:
         return study_arm_of(self.tags)
 
 
+def imported_info(episode_id: str, task: str, **more: Any) -> EpisodeInfo:
+    """Describe an imported episode; with the name of a task it is a trial like any other."""
+    return EpisodeInfo(id=episode_id, kind="trial" if task else "imported", task=task, **more)
+
+
 RETRY_OF_TAG = "retry_of:"
 STUDY_ARM_TAG = "study_arm:"
 

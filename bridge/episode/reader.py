@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt64
 
 from bridge.episode import metadata
+from bridge.episode.assigned import assigned
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import MESSAGE_HEAD
 from bridge.episode.mcap.messages import (
@@ -310,9 +311,10 @@ class Episode:
 
     @property
     def info(self) -> metadata.EpisodeInfo:
-        """Who, what and when; a foreign MCAP file counts as imported."""
+        """Who, what and when; a foreign MCAP file counts as imported until somebody says more."""
         found = self._metadata("episode", metadata.EpisodeInfo)
-        return found or metadata.EpisodeInfo(id=self.path.stem, kind="imported")
+        info = found or metadata.EpisodeInfo(id=self.path.stem, kind="imported")
+        return assigned(info, self.path)
 
     @property
     def outcome(self) -> metadata.Outcome | None:

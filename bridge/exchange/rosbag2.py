@@ -20,7 +20,7 @@ from bridge.episode import schema
 from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.messages import Selection, merged
 from bridge.episode.mcap.walk import DAMAGE
-from bridge.episode.metadata import EpisodeInfo
+from bridge.episode.metadata import EpisodeInfo, imported_info
 from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
@@ -137,14 +137,16 @@ def import_bag(
     run: RunFolder,
     *,
     episode_id: str,
+    task: str = "",
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> ImportReport:
-    """Write a bag as one episode of kind imported; on any error no episode is left.
+    """Write a bag as one episode, a trial where it is of a task; on any error none is left.
 
     Args:
         source: A file, or a folder with ``metadata.yaml`` or several files.
         run: Where the episode goes.
         episode_id: Its name.
+        task: Name of the task it is a trial of; "": it is not known to be one.
         advance: Told how many messages are done.
 
     Raises:
@@ -156,7 +158,8 @@ def import_bag(
     with tempfile.TemporaryDirectory(prefix="rosbag2_", dir=run.episodes_dir.parent) as folder:
         bag = _open_bag([unpack_file(path, Path(folder)) for path in sources])
         try:
-            return _import(bag, sources, run, episode_id, advance)
+            info = imported_info(episode_id, task, tags=("rosbag2",))
+            return _import(bag, sources, run, info, advance)
         finally:
             bag.close()
 
@@ -165,13 +168,13 @@ def _import(
     bag: "_McapBag | _SqliteBags",
     sources: list[Path],
     run: RunFolder,
-    episode_id: str,
+    info: EpisodeInfo,
     advance: Callable[[int, str], None],
 ) -> ImportReport:
-    writer = EpisodeWriter(run.episodes_dir / f"{episode_id}.mcap")
+    writer = EpisodeWriter(run.episodes_dir / f"{info.id}.mcap")
     counts: dict[str, int] = {}
     try:
-        writer.describe(EpisodeInfo(id=episode_id, kind="imported", tags=("rosbag2",)))
+        writer.describe(info)
         bag.copy_attachments(writer)
         for done, item in enumerate(bag.messages(), start=1):
             writer.write_foreign(

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from bridge.episode.executions import NO_PLAN
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.axes import axis_tables, progress_table
@@ -219,8 +220,12 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
     paired = any(None not in (row.recorded, row.sim_planned) for row in rows)
     if not paired and any(row.sim_planned is not None for row in rows):
         sides = ()  # trials of either side, without pairs: what a row lacks, another one is
+    unplanned = trials_in(row for row in rows if row.plan_id == NO_PLAN)
+    if unplanned:
+        found.append(f"planned: {unplanned} of {trials_in(rows)} trials had no plan")
     for side, words in sides:
-        without = trials_in(row for row in rows if getattr(row, side) is None)
+        asked = rows if side == "sim_executed" else [r for r in rows if r.plan_id != NO_PLAN]
+        without = trials_in(row for row in asked if getattr(row, side) is None)
         if without:
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
     streamed = is_streamed(rows)

@@ -60,7 +60,7 @@ class TrialRow:
     """Recorded successes in ``unit`` (1 of 1 for a trial; ducks in the basket for an object)."""
     n: int | None = None
     plan_id: str | None = None
-    """The plan actually sent: the last one whose execution started."""
+    """The plan actually sent: the last one whose execution started; ``NO_PLAN``: there was none."""
     num_plans: int = 0
     num_plans_sent: int = 0
     nothing_executed: bool = False

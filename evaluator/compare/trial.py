@@ -8,6 +8,7 @@ from pathlib import Path
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue_store import UNLABELLED
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import NOTHING_EXECUTED, Outcome, treatment_of
 from bridge.episode.reader import Episode
 from bridge.episode.streams import pose_track
@@ -82,11 +83,12 @@ def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
     if facts.plan_id is None:
         lacking.append("no execution_started event: no plan was sent")
     else:
-        found = {
+        asked = TRAJECTORIES if facts.plan_id != NO_PLAN else ("executed",)
+        found |= {
             trajectory: index.replay(
                 source=source, source_sha256=sha256, plan_id=facts.plan_id, trajectory=trajectory
             )
-            for trajectory in TRAJECTORIES
+            for trajectory in asked
         }
         lacking += [replay.reason for replay in found.values() if replay.reason is not None]
         cells_engine = index.answer_of_cells_engine(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from evaluator.compare.conclusions import direction
 from evaluator.quantity import noun
+from evaluator.report.wording import agreeing_side
 from evaluator.result import Cell, Measurement, Results, Table
 
 SHOWN_TASKS = 8
@@ -158,9 +159,11 @@ def _ranking_words(row: Row) -> str:
 def _summary(results: Results, num_tasks: int) -> str:
     by_id = {m.id: m for m in results.measurements}
     parts = []
-    rate = by_id.get("agreement.sim_planned.rate")
+    side = agreeing_side(by_id)
+    rate = by_id.get(f"agreement.{side}.rate")
     if rate is not None and rate.k is not None and rate.n:
-        parts.append(f"Sim and outcome agree in {rate.k} of {rate.n} trials.")
+        who = "Sim" if side == "sim_planned" else "Without plans, what was executed in the twin"
+        parts.append(f"{who} and outcome agree in {rate.k} of {rate.n} trials.")
     bias = by_id.get("agreement.bias_pp")
     one_line = num_tasks == 1 and bias is not None and bias.interval is None  # says it already
     if bias is not None and bias.value is not None and (bias.n or 0) > 1 and not one_line:

@@ -1,6 +1,7 @@
 """How numbers are written for people: rounding happens here and nowhere earlier."""
 
 import math
+from collections.abc import Mapping
 
 from evaluator.compare.tables import METHOD_NAMES
 from evaluator.quantity import noun
@@ -153,8 +154,21 @@ def measurement_text(measurement: Measurement) -> str:
 def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
     """Return (label, text, measurement) of the numbers to read first, those that are there."""
     by_id = {measurement.id: measurement for measurement in results.measurements}
-    found = [(label, by_id[name]) for name, label in HEADLINES if name in by_id]
+    listed = HEADLINES
+    if agreeing_side(by_id) == "sim_executed":
+        listed = tuple(
+            (name.replace("sim_planned", "sim_executed"), label.replace("Sim", "Executed in twin"))
+            for name, label in HEADLINES
+        )
+    found = [(label, by_id[name]) for name, label in listed if name in by_id]
     return [(label, measurement_text(m), m) for label, m in found]
+
+
+def agreeing_side(by_id: Mapping[str, Measurement]) -> str:
+    """The side whose agreement is shown first: sim_planned, or sim_executed without any plan."""
+    sides = ("sim_planned", "sim_executed")
+    rates = {side: by_id.get(f"agreement.{side}.rate") for side in sides}
+    return next((side for side, rate in rates.items() if rate is not None and rate.n), sides[0])
 
 
 def stand_in_sentence(results: Results) -> str | None:

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.catalogue_store import LABEL_SUFFIX
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
@@ -134,13 +135,15 @@ def _rank(each: RecordedFile) -> tuple[bool, bool]:
 
 
 def _labels(run: RunFolder) -> dict[str, str]:
-    """Return the content hash of each label given after the fact, by the stem of its episode."""
-    found = {}
-    for path in run.notes_dir.glob(f"*{LABEL_SUFFIX}"):
-        try:
-            found[path.name.removesuffix(LABEL_SUFFIX)] = hash_file(path)
-        except OSError:  # whoever reads the label will say so
-            continue
+    """Return the content hash of what was said afterwards, by the stem of its episode."""
+    found: dict[str, str] = {}
+    for suffix in (LABEL_SUFFIX, TRIAL_SUFFIX):
+        for path in run.notes_dir.glob(f"*{suffix}"):
+            name = path.name.removesuffix(suffix)
+            try:
+                found[name] = f"{found.get(name, '')} {hash_file(path)}"
+            except OSError:  # whoever reads it will say so
+                continue
     return found
 
 

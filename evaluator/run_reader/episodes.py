@@ -13,6 +13,7 @@ from typing import Any
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
+from bridge.episode.executions import NO_PLAN, with_execution
 from bridge.episode.metadata import (
     RETRY,
     Derived,
@@ -163,7 +164,8 @@ class RecordedFacts:
     num_plans: int = 0
     num_plans_sent: int = 0
     plan_id: str | None = None
-    """The plan actually sent: the last one whose execution started."""
+    """The plan actually sent: the last one whose execution started; ``NO_PLAN`` where the robot was
+    moved without any."""
     plan_stages: tuple[StageTime, ...] = ()
     """Of that plan."""
     started_ns: int | None = None
@@ -217,6 +219,9 @@ def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
 
 def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> RecordedFacts:
     log = _read_log(episode)
+    if not log.sent:
+        for event in with_execution(episode, ()):
+            _note_event(log, event)
     plan_id = log.sent[-1] if log.sent else None
     verdict = None if plan_id is None else log.verdicts.get(plan_id)
     return RecordedFacts(
@@ -224,7 +229,7 @@ def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> Recorded
         began_ns=episode.start_ns,
         outcome=outcome_of(run, episode) or log.label,
         num_plans=len(log.plans),
-        num_plans_sent=len(set(log.sent)),
+        num_plans_sent=len(set(log.sent) - {NO_PLAN}),
         plan_id=plan_id,
         plan_stages=() if plan_id is None else log.plans.get(plan_id, ()),
         started_ns=log.started_ns,
@@ -327,8 +332,8 @@ def _note_verdict(log: _Log, message: RawMessage) -> None:
 
 
 def _note_event(log: _Log, event: Mapping[str, Any]) -> None:
-    plan_id = event.get("plan_id")
-    if event["type"] == "execution_started" and isinstance(plan_id, str):
+    plan_id = event.get("plan_id") or NO_PLAN
+    if event["type"] == "execution_started":
         log.sent.append(plan_id)
         log.started_ns, log.ended_ns = int(event["stamp_ns"]), None
         log.first_start_ns.setdefault(plan_id, log.started_ns)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from bridge.episode import schema
+from bridge.episode.executions import NO_PLAN, with_execution
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, execution_ns, joint_track_of, pose_track_of
 from bridge.episode.topics import JOINT_STATES, TCP_POSE
@@ -91,6 +92,8 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
         for data in of_events
         if b"execution_" in data
     ]
+    if plan_id == NO_PLAN:
+        records = with_execution(episode, records)
     started_ns, ended_ns = execution_ns(records, plan_id)
     return Tracks(
         tool=_tool(of_tool),

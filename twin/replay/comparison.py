@@ -3,6 +3,7 @@
 from typing import Any
 
 from bridge.episode import streams
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.reader import Episode
 from bridge.errors import GstError
 from bridge.task.predicate import evaluate_success
@@ -83,6 +84,8 @@ def compare(
 
 
 def _planned(job: ReplayJob, engine: Engine, recording: Recording) -> tuple[Trace | str, Findings]:
+    if job.plan_id == NO_PLAN:
+        return "nothing was planned", {}
     path = job.planned().path(engine)
     if not path.is_file():
         return "the plan was not replayed: nothing planned to compare with", {}

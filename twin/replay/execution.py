@@ -18,48 +18,48 @@ LARGEST_GAP_NS = 500_000_000
 """What was not recorded for longer than this is not made up."""
 
 
-def check_length(length_ns: int, plan: Plan) -> None:
+def check_length(length_ns: int, plan_id: str) -> None:
     """Refuse an execution that took longer than any trajectory that is replayed.
 
     Args:
         length_ns: Of the execution.
-        plan: What was executed; named in the message.
+        plan_id: What was executed; named in the message.
 
     Raises:
         UnusablePlanError: Saying how long.
     """
     if length_ns > MAX_DURATION_S * 1e9:
         raise UnusablePlanError(
-            plan_id=plan.id,
+            plan_id=plan_id,
             found=f"was executed for {length_ns * 1e-9:.0f} s",
             hint=f"At most {MAX_DURATION_S:.0f} s are replayed; split it.",
         )
 
 
-def check_covers(track: JointTrack, what: str, end_ns: int, plan: Plan) -> None:
+def check_covers(track: JointTrack, what: str, end_ns: int, plan_id: str) -> None:
     """Refuse a track that stops well before the execution ended.
 
     Args:
         track: Cut to the execution.
         what: What it holds, as it is said: joints, gripper widths.
         end_ns: When the execution ended.
-        plan: What was executed.
+        plan_id: What was executed.
 
     Raises:
         UnusablePlanError: Saying how much is missing.
     """
     missing_ns = end_ns - int(track.stamps_ns[-1])
     if missing_ns > LARGEST_GAP_NS:
-        raise _not_recorded(plan, what, missing_ns, "at its end")
+        raise _not_recorded(plan_id, what, missing_ns, "at its end")
 
 
-def check_track(track: JointTrack, what: str, plan: Plan) -> None:
+def check_track(track: JointTrack, what: str, plan_id: str) -> None:
     """Refuse numbers that are none, and gaps.
 
     Args:
         track: Cut to the execution.
         what: What it holds, as it is said.
-        plan: What was executed.
+        plan_id: What was executed.
 
     Raises:
         UnusablePlanError: Saying where.
@@ -68,14 +68,14 @@ def check_track(track: JointTrack, what: str, plan: Plan) -> None:
     if wrong.any():
         at_s = int(track.stamps_ns[int(np.argmax(wrong))] - track.stamps_ns[0]) * 1e-9
         raise UnusablePlanError(
-            plan_id=plan.id,
+            plan_id=plan_id,
             found=f"was executed with {what} that are no numbers at {at_s:.2f} s",
             hint=f"{int(wrong.sum())} of {len(wrong)} samples are concerned; look at their source.",
         )
     gaps_ns = np.diff(track.stamps_ns)
     if len(gaps_ns) and int(gaps_ns.max()) > LARGEST_GAP_NS:
         at_s = int(track.stamps_ns[int(gaps_ns.argmax())] - track.stamps_ns[0]) * 1e-9
-        raise _not_recorded(plan, what, int(gaps_ns.max()), f"from {at_s:.1f} s on")
+        raise _not_recorded(plan_id, what, int(gaps_ns.max()), f"from {at_s:.1f} s on")
 
 
 def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
@@ -104,7 +104,7 @@ def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
         stamps_ns=widths.stamps_ns,
         position=widths.position[:, column : column + 1],
     )
-    check_track(found, "gripper widths", plan)
+    check_track(found, "gripper widths", plan.id)
     low, high = float(found.position.min()), float(found.position.max())
     most_m = robot.gripper.max_width_m
     if low < -WIDTH_SLACK_M or high > most_m + WIDTH_SLACK_M:
@@ -116,9 +116,9 @@ def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
     return found
 
 
-def _not_recorded(plan: Plan, what: str, missing_ns: int, where: str) -> UnusablePlanError:
+def _not_recorded(plan_id: str, what: str, missing_ns: int, where: str) -> UnusablePlanError:
     return UnusablePlanError(
-        plan_id=plan.id,
+        plan_id=plan_id,
         found=f"was executed while no {what} were recorded for {missing_ns * 1e-9:.1f} s {where}",
         hint=f"Record {JOINT_STATES} and {GRIPPER_STATE} without gaps over the whole execution.",
     )
@@ -170,7 +170,7 @@ def path_of_execution(
     arm = JointTrack(
         names=robot.joints, stamps_ns=track.stamps_ns, position=track.position[:, order]
     )
-    check_track(arm, "joints", plan)
+    check_track(arm, "joints", plan.id)
     widths = gripper_widths(widths, plan, robot)
     first_ns = int(track.stamps_ns[0])
     times, keep = np.unique(track.stamps_ns - first_ns, return_index=True)

@@ -18,6 +18,10 @@ REPLAY_VERSION = 23
 """Raise it when the same inputs give another replay, so that old files are redone."""
 
 
+WITHOUT = -1
+"""The ``plan_index`` of an execution whose plan nobody recorded."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReplayJob:
     """Everything that decides one replay; its content names the file."""
@@ -26,7 +30,7 @@ class ReplayJob:
     episode_sha256: str
     plan_id: str
     plan_index: int
-    """Position among the plans of the episode, because ids may repeat."""
+    """Position among the plans of the episode, because ids may repeat; ``WITHOUT`` one."""
     trajectory: str
     start_ns: int
     end_ns: int | None

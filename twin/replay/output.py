@@ -13,6 +13,7 @@ from jaxtyping import Int
 from bridge.episode import schema
 from bridge.episode.cdr.batch import joint_messages, pose_messages
 from bridge.episode.cdr.messages import CompressedColor, PointCloudSample, string_to_cdr
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.topics import (
     CLEARANCE,
@@ -101,7 +102,8 @@ def _messages(result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Iterato
     prefix, start = f"/{origin.cell}", origin.start_ns
     robot = robot_of(origin.urdf)
     yield _Message(start, ROBOT_DESCRIPTION, schema.STRING, string_to_cdr(origin.urdf))
-    yield _Message(start, f"{prefix}{PLAN}", schema.PLAN, plan.to_json())
+    if plan.id != NO_PLAN:
+        yield _Message(start, f"{prefix}{PLAN}", schema.PLAN, plan.to_json())
     stamps = start + result.stamps_ns
     for topic, names, values in (
         (JOINT_STATES, robot.joints, result.joints_rad),

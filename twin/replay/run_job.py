@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CompressedColor
+from bridge.episode.executions import executed_events
 from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -28,9 +29,10 @@ from twin.replay.execution import (
     path_of_execution,
     stages_as_executed,
 )
-from twin.replay.job import ReplayJob
+from twin.replay.job import WITHOUT, ReplayJob
 from twin.replay.job_row import judged, row_of_failure
 from twin.replay.monte_carlo import replay_samples, with_probability
+from twin.replay.observed import in_order, observed_plan
 from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import Correction, RebuiltScene, read_rebuilt_scene
 from twin.replay.result import ReplayResult
@@ -39,6 +41,7 @@ from twin.replay.trace import (
     Recording,
 )
 from twin.replay.verdict import replay_joints, replay_plan
+from twin.robot.model import load_robot
 from twin.robot.posture import check_clock, width_track
 
 START_KNOWN_NS = 1_000_000_000
@@ -62,7 +65,7 @@ class _Source:
     job: ReplayJob
     episode: Episode
     plan: Plan
-    """As it was sent."""
+    """As it was sent; without one, what was observed, in a plan's words."""
     plan_as_executed: Plan
     """With the stages at the times at which they were executed."""
     events: list[dict[str, Any]]
@@ -142,8 +145,13 @@ def _open(job: ReplayJob) -> _Source:
             found="no robot description",
             hint=f"Record {ROBOT_DESCRIPTION}, or attach the URDF as robot.urdf.",
         )
-    plan = streams.plans(episode)[job.plan_index][1]
     task = job.task
+    if job.plan_index == WITHOUT:
+        arm, widths = _cut_tracks(job, episode, urdf)
+        robot = load_robot(urdf)
+        plan = observed_plan(in_order(arm, robot.record), widths, robot, task, episode.info)
+    else:
+        plan = streams.plans(episode)[job.plan_index][1]
     rebuilt = (
         RebuiltScene()
         if job.run_path is None
@@ -160,7 +168,7 @@ def _open(job: ReplayJob) -> _Source:
     if job.trajectory == "planned":
         joints = robot_of(urdf).joints
         scene = replace(scene, start_rad=recorded_start(episode, job.start_ns, joints))
-    events = streams.events(episode) if executed else []
+    events = executed_events(episode) if executed else []
     plan_as_executed = replace(plan, stages=stages_as_executed(plan, events, job.start_ns))
     return _Source(
         job=job,
@@ -197,15 +205,20 @@ def _run(source: _Source, scene: ReplayScene, config: ReplayConfig) -> ReplayRes
 
 
 def _tracks(source: _Source) -> tuple[streams.JointTrack, streams.JointTrack]:
+    return _cut_tracks(source.job, source.episode, source.scene.urdf)
+
+
+def _cut_tracks(
+    job: ReplayJob, episode: Episode, urdf: str
+) -> tuple[streams.JointTrack, streams.JointTrack]:
     """Recorded joints and widths, cut to the execution."""
-    job, episode = source.job, source.episode
-    end_ns = job.start_ns + job.length_ns()
-    check_clock(episode, (JOINT_STATES, GRIPPER_STATE), job.start_ns, end_ns, source.plan.id)
-    check_length(job.length_ns(), source.plan)
+    plan_id, end_ns = job.plan_id, job.start_ns + job.length_ns()
+    check_clock(episode, (JOINT_STATES, GRIPPER_STATE), job.start_ns, end_ns, plan_id)
+    check_length(job.length_ns(), plan_id)
     arm = cut_track(streams.joint_track(episode, JOINT_STATES), job.start_ns, end_ns)
-    check_covers(arm, "joints", end_ns, source.plan)
-    widths = cut_track(width_track(episode, robot_of(source.scene.urdf)), job.start_ns, end_ns)
-    check_covers(widths, "gripper widths", end_ns, source.plan)
+    check_covers(arm, "joints", end_ns, plan_id)
+    widths = cut_track(width_track(episode, robot_of(urdf)), job.start_ns, end_ns)
+    check_covers(widths, "gripper widths", end_ns, plan_id)
     return arm, widths
 
 

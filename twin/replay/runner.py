@@ -7,23 +7,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import streams
+from bridge.episode import schema, streams
+from bridge.episode.executions import NO_PLAN, executed_events
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
+from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.process_pool import Failed, Runner
-from bridge.task.plan import Plan
+from bridge.robots.robot import read_robot, robot_of
 from bridge.task.task_file import Task
 from bridge.terminal import Output
+from twin.calibrate.physics.pushes import motion_of
 from twin.replay.config import ReplayRunConfig
+from twin.replay.failure import with_reasons
 from twin.replay.imported import MotionReplay, motion_replays, run_motion_replay
-from twin.replay.job import ReplayJob
+from twin.replay.job import WITHOUT, ReplayJob
 from twin.replay.job_row import row_of_existing, row_of_failure
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene, shape_hashes
 from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts
 from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
+from twin.robot.posture import check_joints, width_track
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
@@ -45,20 +50,24 @@ def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution
         events: All of an episode, in their order.
         plan_id: Whose.
     """
+    whose = "motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
     mine = [event for event in events if event.get("plan_id") == plan_id]
     count = sum(event["type"] == "execution_started" for event in mine)
     start, end = execution_ns(mine, plan_id)
     interval = None if start is None or end is None else (start, end)
     problem = ""
     if count and interval is None:
-        problem = f"the execution of plan {plan_id!r} began, and nobody recorded that it ended"
+        problem = f"the execution of {whose} began, and nobody recorded that it ended"
     elif count > 1:
         problem = (
-            f"plan {plan_id!r} was executed {count} times, and which end belongs to which nobody "
-            "can tell; give each execution a plan with an id of its own"
+            f"{whose} was executed {count} times, and which end belongs to which nobody can tell; "
+            "give each execution a plan with an id of its own"
         )
     return Execution(interval_ns=interval, problem=problem)
 
+
+LABEL = "robot-gst label RUN EPISODE --task NAME"
+"""What makes a trial of an episode."""
 
 # What is to be replayed of one episode: its objects localised, its plans and executions
 # listed.
@@ -89,11 +98,20 @@ class Preparation:
         return float(self.episode_path().stat().st_size)
 
 
-def jobs_of(item: Preparation) -> list[ReplayJob]:
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """The replays of one episode, and why there are none, or fewer."""
+
+    jobs: tuple[ReplayJob, ...] = ()
+    why_not: str = ""
+    was_meant: bool = True
+    """Whether it is a trial, or could be one: no scan, no pictures alone."""
+
+
+def jobs_of(item: Preparation) -> Prepared:
     """Localise the objects of an episode, where that is not there yet, and list its replays.
 
-    Returns:
-        One job per plan, two more where it was executed; none when the episode is not replayed.
+    One job per plan, and two more for each execution, with a plan or without.
 
     Raises:
         GstError: When the episode or its task cannot be read.
@@ -101,25 +119,32 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
     run, path, config = RunFolder.open(item.run_path), item.episode_path(), item.config
     episode = Episode.open(path)
     plans = streams.plans(episode)
-    task_name = replayed_task(episode, plans)
-    if task_name is None:
-        return []
-    task = streams.task_file(episode, task_name).task()
+    events = executed_events(episode)
+    planned = {plan.id for _, plan in plans}
+    without = [i for i in _executed(events) if i not in planned]
+    nothing = _nothing_to_replay(episode, config.robot, is_planned=bool(plans), moved=bool(without))
+    if nothing is not None:
+        return nothing
+    task = streams.task_file(episode, plans[0][1].task if plans else "").task()
     starts = localised_starts(
         run, episode, task, scene_hash=item.scene_hash, force=config.relocalise
     )
     digest = episode.sha256()
     calibration = read_calibration(run)
     replay = for_task(config.replay, calibration, task)
-    jobs, events = [], streams.events(episode)
-    for index, (stamp_ns, plan) in enumerate(plans):
-        execution = execution_of(events, plan.id)
+    jobs, why_not = [], ""
+    listed = [
+        (plan.id, index, stamp_ns, plan.tau[-1].t_ns if plan.tau else 0)
+        for index, (stamp_ns, plan) in enumerate(plans)
+    ]
+    for plan_id, index, stamp_ns, length_ns in [*listed, *((i, WITHOUT, 0, 0) for i in without)]:
+        execution = execution_of(events, plan_id)
         interval = execution.interval_ns
         start_ns = stamp_ns if interval is None else interval[0]
         common = ReplayJob(
             episode_path=path,
             episode_sha256=digest,
-            plan_id=plan.id,
+            plan_id=plan_id,
             plan_index=index,
             trajectory="planned",
             start_ns=start_ns,
@@ -129,7 +154,7 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
             scene_hash=item.scene_hash,
             config=replace(replay, mode="dynamic", samples=config.samples),
             folder=run.derived_dir.resolve(),
-            duration_s=plan.tau[-1].t_ns * 1e-9 if plan.tau else 0.0,
+            duration_s=(length_ns or (interval[1] - interval[0] if interval else 0)) * 1e-9,
             run_path=run.path,
             shapes=item.shapes,
             calibration_id=None if calibration is None else calibration.calibration_id,
@@ -137,33 +162,65 @@ def jobs_of(item: Preparation) -> list[ReplayJob]:
             robot=config.robot,
             problem=execution.problem,
         )
-        jobs.append(common)
+        if index != WITHOUT:
+            jobs.append(common)
         if common.was_executed:
             # Varied replays say what a plan is worth; what was executed happened once.
             executed = replace(
                 common,
                 trajectory="executed",
-                end=starts.after(plan.id),
+                end=starts.after(plan_id),
                 config=replace(common.config, samples=0),
             )
-            jobs.append(executed)
+            if index == WITHOUT and not set(task.manipulated) & set(executed.start.Ts_base_object):
+                unseen = with_reasons(executed.start.reasons)
+                why_not = f"only the robot is replayed; not seen before it moved: {unseen}"
+            else:
+                jobs.append(executed)
             # Which engine is asked makes no other kinematic replay.
             alone = replace(replay, engine="pybullet", engines_must_agree=False)
             jobs.append(replace(executed, config=replace(alone, mode="kinematic")))
-    return jobs
+    return Prepared(jobs=tuple(jobs), why_not=why_not)
 
 
-def replayed_task(episode: Episode, plans: list[tuple[int, Plan]]) -> str | None:
-    """Name the task an episode's plans are judged by; None when it is not one to replay.
+def _executed(events: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Ids under which something was executed, each once."""
+    started = (event for event in events if event["type"] == "execution_started")
+    return list(dict.fromkeys(str(event.get("plan_id") or NO_PLAN) for event in started))
 
-    Args:
-        episode: Only trials are replayed.
-        plans: The episode's plans with their times [ns]; the first names the task where the episode
-            does not.
-    """
-    if episode.info.kind != "trial" or not plans:
+
+def _nothing_to_replay(
+    episode: Episode, robot: str, *, is_planned: bool, moved: bool
+) -> Prepared | None:
+    """Say why nothing of an episode can be replayed; None where something can."""
+    info = episode.info
+    if info.kind not in ("trial", "imported"):
+        return Prepared(why_not=f"a {info.kind}", was_meant=False)
+    joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
+    if info.kind == "imported":
+        if motion_of(episode) is not None:
+            return Prepared(why_not="replayed as an imported motion", was_meant=False)
+        said = "nobody said of which task it is a trial"
+        return Prepared(why_not=f"{said}: {LABEL}" if joints else said, was_meant=bool(joints))
+    if is_planned:
         return None
-    return episode.info.task or plans[0][1].task
+    if not info.task:
+        return Prepared(why_not=f"a trial of no task: {LABEL}")
+    if not joints:
+        return Prepared(
+            why_not=f"neither plans nor joint states (a topic ending in {JOINT_STATES})"
+        )
+    try:
+        urdf = read_robot(robot).description() if robot else streams.robot_description(episode)
+        if urdf is None:
+            known = f"record {ROBOT_DESCRIPTION}, attach robot.urdf, or name it: --robot ur5"
+            return Prepared(why_not=f"nobody said which robot it is; {known}")
+        whose = robot_of(urdf)
+        check_joints(streams.joint_track(episode), f"episode {info.id}", whose)
+        width_track(episode, whose)
+    except GstError as error:
+        return Prepared(why_not=str(error))
+    return None if moved else Prepared(why_not="nothing moved: its joints stay where they were")
 
 
 def there_already(
@@ -230,9 +287,9 @@ def replay_trajectories(
         runner: What does the work.
 
     Returns:
-        ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes``
-        with reasons, replays of ``imported`` recordings, what was said ``against_recorded`` labels,
-        and the scene hash.
+        ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
+        could not be read and ``nothing_to_replay`` in others, with reasons, replays of ``imported``
+        recordings, what was said ``against_recorded`` labels, and the scene hash.
 
     Raises:
         UsageError: When an episode named in the configuration is not in the run.
@@ -240,7 +297,7 @@ def replay_trajectories(
     """
     imported, unusable = _replay_imported(run, config, runner, output)
     scene_hash = _scene_hash(run, config, output)
-    jobs, skipped = _all_jobs(run, scene_hash, config, runner, output)
+    jobs, skipped, prepared = _all_jobs(run, scene_hash, config, runner, output)
     skipped |= unusable
     _say_what_is_missing(run, jobs, output)
     if config.render:
@@ -267,6 +324,11 @@ def replay_trajectories(
         "executions": executions,
         "against_recorded": against_recorded(executions),
         "skipped_episodes": skipped,
+        "nothing_to_replay": {
+            name: each.why_not
+            for name, each in prepared.items()
+            if each.why_not and (each.was_meant or not (rows or imported))
+        },
         "imported": imported,
         "rows": rows,
     }
@@ -298,8 +360,8 @@ def _all_jobs(
     config: ReplayRunConfig,
     runner: Runner,
     output: Output,
-) -> tuple[list[ReplayJob], dict[str, str]]:
-    """List what is to be replayed, and the episodes that cannot be, with the reason."""
+) -> tuple[list[ReplayJob], dict[str, str], dict[str, Prepared]]:
+    """List what is to be replayed, what cannot be read, and what there is of each other episode."""
     names = _chosen(run, config)
     shapes = shape_hashes(run)
     items = [
@@ -312,7 +374,7 @@ def _all_jobs(
         )
         for name in names
     ]
-    jobs: dict[str, list[ReplayJob]] = {}
+    jobs: dict[str, Prepared] = {}
     skipped: dict[str, str] = {}
     with output.progress("localise", len(names)) as advance:
         answers = runner.run(jobs_of, items, Preparation.cost)
@@ -320,14 +382,13 @@ def _all_jobs(
             if isinstance(answer, Failed):
                 skipped[item.episode_id] = answer.message
                 output.detail(answer.trace)
-            elif answer:
-                jobs[item.episode_id] = answer
             else:
-                output.detail(f"{item.episode_id}: no trial with a plan, not replayed")
+                jobs[item.episode_id] = answer
             advance(done, item.episode_id)
     for episode_id, reason in sorted(skipped.items()):
         output.say(f"{episode_id}: {reason}")
-    return [job for name in names for job in jobs.get(name, ())], skipped
+    found = [job for name in names if name in jobs for job in jobs[name].jobs]
+    return found, skipped, {name: jobs[name] for name in names if name in jobs}
 
 
 def _scene_hash(run: RunFolder, config: ReplayRunConfig, output: Output) -> str | None:

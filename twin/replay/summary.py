@@ -9,6 +9,7 @@ from typing import Any
 
 from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -106,29 +107,34 @@ def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]
     return list(found.values())
 
 
+def _asked(executions: Rows) -> dict[str, tuple[str, Rows]]:
+    """What is held against the labels, its key, and of whom; nobody planned what has no plan."""
+    planned = [entry for entry in executions if entry["plan"] != NO_PLAN]
+    asked = {name: (key, planned if key == "planned" else executions) for name, key in TRAJECTORIES}
+    return {name: (key, rows) for name, (key, rows) in asked.items() if rows}
+
+
 def cross_table(executions: Rows) -> dict[str, dict[str, dict[str, int]]]:
     """Planned, executed and seen, by their verdict, against the recorded label."""
     return {
         name: {
             word: {
-                label: sum(
-                    entry[key] is value and entry["recorded"] == label for entry in executions
-                )
+                label: sum(entry[key] is value and entry["recorded"] == label for entry in rows)
                 for label in LABELS
             }
             for value, word in WORDS.items()
         }
-        for name, key in TRAJECTORIES
+        for name, (key, rows) in _asked(executions).items()
     }
 
 
 def agreement_of(executions: Rows) -> dict[str, dict[str, int]]:
     """How often what was said is the operator's label, of the executions where both are decided."""
     found = {}
-    for name, key in TRAJECTORIES:
+    for name, (key, rows) in _asked(executions).items():
         both = [
             entry[key] is (entry["recorded"] == "success")
-            for entry in executions
+            for entry in rows
             if entry[key] is not None and entry["recorded"] in ("success", "failure")
         ]
         found[name] = {"k": sum(both), "n": len(both)}
@@ -148,10 +154,11 @@ def against_recorded(executions: Rows) -> dict[str, dict[str, Any]]:
 
 def describe_run(summary: Mapping[str, Any]) -> str:
     """The final tables as text."""
-    skipped = _skipped_lines(summary.get("skipped_episodes", {}))
+    skipped = _skipped_lines(summary.get("skipped_episodes", {}), "cannot be replayed")
+    skipped += _skipped_lines(summary.get("nothing_to_replay", {}), "with nothing to replay")
     imported = describe_motions(summary.get("imported", []))
     if not summary["rows"]:
-        return "\n".join([*(imported or ["No trial with a plan to replay."]), *skipped])
+        return "\n".join([*(imported or ["No trial to replay."]), *skipped])
     lines = imported + _count_lines(summary["counts"])
     executions = summary.get("executions", [])
     if executions:
@@ -215,13 +222,13 @@ def _by_reason(rows: Rows) -> dict[tuple[str, str, str | None], list[str]]:
     return found
 
 
-def _skipped_lines(skipped: Mapping[str, str]) -> list[str]:
-    """Episodes of which nothing could be replayed."""
+def _skipped_lines(skipped: Mapping[str, str], what: str) -> list[str]:
+    """Episodes of which nothing, or less, could be replayed."""
     lines = [
         f"  {name}: {NOT_EVALUATED}{why.removeprefix(NOT_EVALUATED)}"
         for name, why in sorted(skipped.items())
     ]
-    return ["", "episodes that cannot be replayed:", *lines] if lines else []
+    return ["", f"episodes {what}:", *lines] if lines else []
 
 
 def _sample_lines(rows: Rows) -> list[str]:
@@ -279,7 +286,9 @@ def _cross_of(counts: Mapping[str, Counts], agreement: Counts) -> list[str]:
 
 
 def _divergence_lines(executions: Rows) -> list[str]:
-    lines = ["where planned, executed and recorded diverge first:"]
+    unplanned = all(entry["plan"] == NO_PLAN for entry in executions)
+    sides = "executed and recorded" if unplanned else "planned, executed and recorded"
+    lines = [f"where {sides} diverge first:"]
     for entry in executions:
         first = entry["divergence"]
         if first is None:

@@ -55,7 +55,7 @@ def replay_changed(item: WhatIf) -> dict[str, Any]:
     )
     planned = [
         job
-        for job in jobs_of(preparation)
+        for job in jobs_of(preparation).jobs
         if job.plan_id == item.plan_id and job.trajectory == "planned"
     ]
     if not planned:

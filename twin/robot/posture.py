@@ -1,12 +1,13 @@
 """Recorded postures: joints at an instant, whether the robot stood still, whether time ran back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import schema
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
 from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
@@ -39,10 +40,11 @@ def check_clock(
         BackwardTimeError: Naming the topic, the instant and by how much; or an execution that took
             no time.
     """
+    whose = "the motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
     if end_ns <= start_ns:
         raise BackwardTimeError(
-            f"the execution of plan {plan_id!r} ended {(start_ns - end_ns) * 1e-9:.2f} s before it "
-            "started; look at the clock of the events"
+            f"the execution of {whose} ended {(start_ns - end_ns) * 1e-9:.2f} s before it started; "
+            "look at the clock of the events"
         )
     topics = [
         topic
@@ -58,7 +60,7 @@ def check_clock(
         if jumped and message.topic in inside and stamp_ns <= end_ns:
             raise BackwardTimeError(
                 f"the time of {message.topic} goes back by {(before_ns - stamp_ns) * 1e-9:.2f} s "
-                f"at {max(0, before_ns - start_ns) * 1e-9:.2f} s of plan {plan_id!r}; the "
+                f"at {max(0, before_ns - start_ns) * 1e-9:.2f} s of {whose}; the "
                 "execution is not known in its right order"
             )
         if start_ns <= stamp_ns <= end_ns:
@@ -170,6 +172,9 @@ def width_track(episode: Episode, robot: Robot) -> JointTrack:
         return joint_track(episode, GRIPPER_STATE)
     except EpisodeError:
         arm = joint_track(episode)
+        if GRIPPER_WIDTH in arm.names:  # one vector holds all, as in LeRobot's state
+            column = arm.names.index(GRIPPER_WIDTH)
+            return replace(arm, names=(GRIPPER_WIDTH,), position=arm.position[:, [column]])
         finger = next((item for item in fingers if item.joint in arm.names), None)
         if fingers and finger is None:
             raise

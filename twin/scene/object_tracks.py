@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import streams
+from bridge.episode.executions import executed_events
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
@@ -176,7 +177,7 @@ def localised_tracks(
         task: The objects.
         postures: Joints and fingers, if they were recorded.
     """
-    events = streams.events(episode)
+    events = executed_events(episode)
     plan_ids = {
         str(event["plan_id"])
         for event in events

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int, UInt16
 from bridge.clock import ns_from_s
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, DepthImage, JointSample
-from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.metadata import EpisodeInfo, Outcome, imported_info
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -289,6 +289,7 @@ def import_lerobot(
     cell: str,
     wanted: Sequence[range] | None,
     advance: Advance,
+    task: str = "",
 ) -> ImportReport:
     """Write ``ep_000123.mcap`` for each wanted episode; those already written are passed over.
 
@@ -298,6 +299,7 @@ def import_lerobot(
         cell: Name of the cell in topics.
         wanted: Numbers of episodes; None is all.
         advance: Told how many episodes are done.
+        task: Name of the task they are trials of; "": they are not known to be any.
 
     Raises:
         LeRobotFormatError: Naming the file, and the row or frame, that cannot be believed.
@@ -311,7 +313,8 @@ def import_lerobot(
     missing = [entry for entry in entries if not _is_there(run, entry, origin)]
     report.already_there = len(entries) - len(missing)
     for rows in iterate_rows(missing):
-        path = _write(info, plan, rows, run, cell, origin)
+        about = _about(info, rows, cell, task)
+        path = _write(info, plan, rows, run, about, origin)
         report.files.append(path)
         report.frames += rows.entry.length
         advance(report.already_there + len(report.files), path.name)
@@ -374,17 +377,17 @@ def _write(
     plan: _Plan,
     rows: EpisodeRows,
     run: RunFolder,
-    cell: str,
+    about: EpisodeInfo,
     origin: dict[str, str],
 ) -> Path:
-    entry = rows.entry
+    entry, cell = rows.entry, about.cell
     stamps_ns = _stamps_ns(info, rows)
     columns = {key: _numbers(info, rows, key) for key in plan.joints}
     images = {key: _images(info, rows, key) for key in plan.cameras}
     depths = {key: _depths(info, rows, key) for key in plan.depths}
     writer = EpisodeWriter(run.episodes_dir / f"{_episode_id(entry)}.mcap")
     try:
-        writer.describe(_about(info, rows, cell), outcome=_outcome(rows))
+        writer.describe(about, outcome=_outcome(rows))
         for number, stamp_ns in enumerate(stamps_ns.tolist()):
             for key, topic in plan.joints.items():
                 sample = JointSample(
@@ -505,13 +508,11 @@ def _images(info: DatasetInfo, rows: EpisodeRows, key: str) -> Iterator[bytes]:
         yield data
 
 
-def _about(info: DatasetInfo, rows: EpisodeRows, cell: str) -> EpisodeInfo:
-    task = rows.entry.tasks[0] if rows.entry.tasks else ""
-    return EpisodeInfo(
-        id=_episode_id(rows.entry),
-        kind="imported",
-        task=task,
-        instruction=task,
+def _about(info: DatasetInfo, rows: EpisodeRows, cell: str, task: str) -> EpisodeInfo:
+    return imported_info(
+        _episode_id(rows.entry),
+        task,
+        instruction=rows.entry.tasks[0] if rows.entry.tasks else "",
         trial=rows.entry.index,
         robot=info.robot_type,
         cell=cell,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.cdr.messages import PoseSample
+from bridge.episode.executions import executed_events
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -89,10 +90,10 @@ def localise_episode(
 
 
 def first_execution_ns(episode: Episode) -> int | None:
-    """Source time of the first ``execution_started`` event, None without one."""
+    """Source time at which the first execution started, None without one."""
     stamps = [
         int(event["stamp_ns"])
-        for event in streams.events(episode)
+        for event in executed_events(episode)
         if event["type"] == "execution_started"
     ]
     return min(stamps, default=None)
@@ -103,7 +104,7 @@ def quiet_phases(episode: Episode) -> list[Phase]:
     marks = sorted(
         (
             (int(event["stamp_ns"]), str(event["type"]), event.get("plan_id"))
-            for event in streams.events(episode)
+            for event in executed_events(episode)
             if event["type"] in ("execution_started", "execution_ended")
         ),
         key=lambda mark: mark[0],

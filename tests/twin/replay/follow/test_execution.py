@@ -106,9 +106,9 @@ def test_a_recording_that_stops_early_or_starts_late_is_refused(script: SimpleNa
     track = JointTrack(names=ARM_JOINTS, stamps_ns=stamps, position=np.zeros((len(stamps), 6)))
     plan = script.plan(script.scene())
     cut = cut_track(track, 2_000_000_000, 5_000_000_000)
-    check_covers(cut, "joints", 4_400_000_000, plan)
+    check_covers(cut, "joints", 4_400_000_000, plan.id)
     with pytest.raises(UnusablePlanError, match=r"no joints were recorded for 1\.0 s at its end"):
-        check_covers(cut, "joints", 5_000_000_000, plan)
+        check_covers(cut, "joints", 5_000_000_000, plan.id)
     late = cut_track(track, 1_000_000_000, 3_000_000_000)
     with pytest.raises(UnusablePlanError, match=r"for 1\.0 s from 0\.0 s on"):
         path_of_execution(late, late, plan, ReplayConfig(), ROBOT)
@@ -177,12 +177,12 @@ def test_widths_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) 
     with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 3\.0 s from"):
         path_of_execution(still_arm(times), widths, plan, ReplayConfig(), ROBOT)
     with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 2\.0 s at"):
-        check_covers(widths, "gripper widths", int(times[-1]) + 2_000_000_000, plan)
+        check_covers(widths, "gripper widths", int(times[-1]) + 2_000_000_000, plan.id)
 
 
 def test_an_execution_of_hours_is_refused_before_it_takes_hours(script: SimpleNamespace) -> None:
     plan = script.plan(script.scene())
-    check_length(600_000_000_000, plan)
+    check_length(600_000_000_000, plan.id)
     with pytest.raises(UnusablePlanError, match=r"was executed for 7200 s\. At most 600 s"):
         check_length(7_200_000_000_000, plan)
 
