@@ -29,6 +29,7 @@ from twin.replay.run_job import run_job
 from twin.replay.scene import localised_starts
 from twin.replay.summary import against_recorded, count_verdicts, executions_of, recorded_labels
 from twin.robot.posture import check_joints, width_track
+from twin.scene.localise.episode import MOTION_MARGIN_NS
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
 
@@ -150,7 +151,7 @@ def jobs_of(item: Preparation) -> Prepared:
             start_ns=start_ns,
             end_ns=None if interval is None else interval[1],
             task=task,
-            start=starts.at(start_ns),
+            start=starts.at(start_ns - (MOTION_MARGIN_NS if index == WITHOUT else 0)),
             scene_hash=item.scene_hash,
             config=replace(replay, mode="dynamic", samples=config.samples),
             folder=run.derived_dir.resolve(),

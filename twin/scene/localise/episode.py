@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from bridge.episode import provenance, schema, streams
 from bridge.episode.cdr.messages import PoseSample
-from bridge.episode.executions import executed_events
+from bridge.episode.executions import EXECUTION, NO_PLAN, executed_events
 from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -89,6 +89,11 @@ def localise_episode(
     return localise_objects(frames, task, config, last_seen_m, surfaces)
 
 
+MOTION_MARGIN_NS = 80_000_000
+"""Frames so near to a motion that only the joints tell of are not still for sure: clocks of cameras
+and robots differ, and the first millimetres are in the noise."""
+
+
 def first_execution_ns(episode: Episode) -> int | None:
     """Source time at which the first execution started, None without one."""
     stamps = [
@@ -103,9 +108,9 @@ def quiet_phases(episode: Episode) -> list[Phase]:
     """The start of the episode, and what follows each execution until the next one."""
     marks = sorted(
         (
-            (int(event["stamp_ns"]), str(event["type"]), event.get("plan_id"))
+            (int(event["stamp_ns"]) + _margin_ns(event), str(event["type"]), event.get("plan_id"))
             for event in executed_events(episode)
-            if event["type"] in ("execution_started", "execution_ended")
+            if event["type"] in EXECUTION
         ),
         key=lambda mark: mark[0],
     )
@@ -118,6 +123,12 @@ def quiet_phases(episode: Episode) -> list[Phase]:
                 Phase(name="end", plan_id=plan_id, after_ns=stamp, before_ns=next(following, None))
             )
     return phases
+
+
+def _margin_ns(event: Mapping[str, Any]) -> int:
+    if event.get("plan_id") != NO_PLAN:
+        return 0
+    return -MOTION_MARGIN_NS if event["type"] == EXECUTION[0] else MOTION_MARGIN_NS
 
 
 def write_localised(
