@@ -116,10 +116,20 @@ def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict
         "made_by": made_by,
         "software": software(),
         "sources": [{"file": path.name, "sha256": hash_file(path)} for path in sources],
+        "stand_in": any(Episode.open(path).info.stand_in for path in sources),
         **choices,
     }
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
     (folder / NOTE_NAME).write_text(text, encoding="utf-8")
+
+
+def is_of_stand_in(folder: Path) -> bool:
+    """Whether the note of an export says that a simulated laboratory recorded it."""
+    try:
+        record = json.loads((folder / NOTE_NAME).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(record, dict) and record.get("stand_in") is True
 
 
 def safe_names(names: Iterable[str]) -> dict[str, str]:

@@ -25,6 +25,7 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, MissingDependencyError, PathNotFoundError
+from bridge.exchange.output import is_of_stand_in
 from bridge.exchange.rosbag2_storage import (
     SQLITE_MAGIC,
     BagFormatError,
@@ -158,7 +159,8 @@ def import_bag(
     with tempfile.TemporaryDirectory(prefix="rosbag2_", dir=run.episodes_dir.parent) as folder:
         bag = _open_bag([unpack_file(path, Path(folder)) for path in sources])
         try:
-            info = imported_info(episode_id, task, tags=("rosbag2",))
+            stand_in = is_of_stand_in(source)
+            info = imported_info(episode_id, task, tags=("rosbag2",), stand_in=stand_in)
             return _import(bag, sources, run, info, advance)
         finally:
             bag.close()

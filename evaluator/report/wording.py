@@ -157,8 +157,12 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
     listed = HEADLINES
     if agreeing_side(by_id) == "sim_executed":
         listed = tuple(
-            (name.replace("sim_planned", "sim_executed"), label.replace("Sim", "Executed in twin"))
+            (
+                name.replace("sim_planned", "sim_executed"),
+                label.replace("Sim", "Executed in twin").replace("sim says", "that says"),
+            )
             for name, label in HEADLINES
+            if not name.startswith("motion.planned.")
         )
     found = [(label, by_id[name]) for name, label in listed if name in by_id]
     return [(label, measurement_text(m), m) for label, m in found]

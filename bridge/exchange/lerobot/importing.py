@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.depth import PIX_FMT, SUFFIX
 from bridge.exchange.lerobot.layout import DatasetInfo, LeRobotFormatError, parquet, read_info
 from bridge.exchange.lerobot.video import read_frames
+from bridge.exchange.output import is_of_stand_in
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
 from bridge.terminal import Advance
 
@@ -309,11 +310,12 @@ def import_lerobot(
     plan = _plan(info, cell)
     entries = read_episodes(info, wanted)
     origin = {"dataset": folder.resolve().name, "info_sha256": hash_file(folder / layout.INFO_PATH)}
+    stand_in = is_of_stand_in(folder)
     report = ImportReport(files=[], frames=0, already_there=0, left_out=plan.left_out)
     missing = [entry for entry in entries if not _is_there(run, entry, origin)]
     report.already_there = len(entries) - len(missing)
     for rows in iterate_rows(missing):
-        about = _about(info, rows, cell, task)
+        about = replace(_about(info, rows, cell, task), stand_in=stand_in)
         path = _write(info, plan, rows, run, about, origin)
         report.files.append(path)
         report.frames += rows.entry.length
