@@ -17,6 +17,7 @@ from rich.console import Console
 
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.gone import refuse_gone
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -80,12 +81,6 @@ COMMANDS: tuple[Command, ...] = (
         f"{EPISODES}:prune",
         "Remove labelled episodes by age, size and quota.",
         "runs/demo --quota-mb 50000",
-    ),
-    (
-        "sync",
-        f"{EXCHANGE}:sync",
-        "Copy a run elsewhere, verified by hash; resumes.",
-        "runs/monday /mnt/archive",
     ),
     (
         "rebuild",
@@ -335,6 +330,7 @@ def run(arguments: Sequence[str]) -> int:
         tokens, config = _take_config(list(arguments))
         if config is not None:
             app.config = Toml(config, must_exist=True)
+        refuse_gone(tokens)
         code = app(tokens)
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
@@ -422,6 +418,7 @@ def _check_tables(path: Path) -> None:
     known: dict[str, set[str]] = {name: set() for name, *_ in COMMANDS}
     known |= {group: {name for name, *_ in members} for group, (_, members) in GROUPS.items()}
     for name, table in content.items():
+        refuse_gone([name])
         wrong = [name] if name not in known else []
         if name in GROUPS and isinstance(table, dict):
             wrong = [f"{name}.{member}" for member in table if member not in known[name]]
