@@ -6,6 +6,9 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "record --triggers": (
+        "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
+    ),
 }
 """By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""
 

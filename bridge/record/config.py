@@ -93,9 +93,6 @@ class RecorderConfig:
     contract: str | None = None
     """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
     ``cell.toml`` holds, if there is one."""
-    triggers: Path | None = None
-    """Rules that record by themselves (TOML); they need --preroll-s. Without it the run folder's
-    ``triggers.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
     jpeg_quality: int = 90

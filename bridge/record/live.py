@@ -32,14 +32,13 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.clocks import ClockAsker
-from bridge.record.config import EpisodeAbout, RecorderConfig
+from bridge.record.config import RecorderConfig
 from bridge.record.control import parse_info, parse_outcome, serve_control
 from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
-from bridge.record.triggers import TriggerError, Triggers, find_triggers
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
@@ -221,7 +220,6 @@ class LiveRecorder:
         config: RecorderConfig,
         say: Callable[[str], None],
         task: TaskFile | None = None,
-        about: EpisodeAbout | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
 
@@ -231,7 +229,6 @@ class LiveRecorder:
             config: Settings.
             say: Told what a person should know.
             task: The task file of episodes that name this task or none.
-            about: What episodes are that triggers record.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
@@ -240,9 +237,6 @@ class LiveRecorder:
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         find_contract(run.path, config.contract)  # the same
-        rules = find_triggers(run.path, config.triggers)
-        if rules and not config.preroll_s:
-            raise TriggerError("triggers need the seconds before: add --preroll-s 5.")
         self.run = run
         self._folder_lock = _lock_folder(run, shared=config.shares_folder)
         self._recorder = config.recorder
@@ -260,7 +254,6 @@ class LiveRecorder:
         self._previews = previews
         self._ended = threading.Event()
         session.collect_definitions()
-        self._triggers = Triggers(core, rules, about or EpisodeAbout(), say) if rules else None
         self._subscribers = [
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics
@@ -274,9 +267,6 @@ class LiveRecorder:
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
         self._clocks = ClockAsker(session, core.clocks)
-        if self._triggers is not None:
-            core.also_tell("triggers", self._triggers.status)
-            self._triggers.begin()
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -291,8 +281,6 @@ class LiveRecorder:
     def _take(self, sample: WireSample) -> None:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
-            if self._triggers is not None:
-                self._triggers.receive(sample)
 
     def _on_link(self, is_open: bool) -> None:
         if not is_open:
@@ -393,8 +381,6 @@ class LiveRecorder:
         self.core.news_arrived.set()
         self._heartbeat.close()
         self._clocks.close()
-        if self._triggers is not None:
-            self._triggers.close()
         if self.core.error is not None:  # whoever listens hears why, before the next second
             with contextlib.suppress(WireError):
                 self._say_status()
