@@ -6,6 +6,11 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "record --failover": (
+        "A failing disk ends the recording; start it again with a run folder on another disk. The "
+        "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."
+    ),
+    "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),

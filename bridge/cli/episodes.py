@@ -253,8 +253,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     Example: robot-gst recover runs/monday
 
     Args:
-        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``; of a run and its
-            --failover folder the halves of an episode are joined.
+        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
         in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
@@ -275,11 +274,9 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
             if len(files) == 1:
                 raise
             reports.append(RecoveryReport(path=path, output=None, reason=str(error)))
-    joined = recovery.join_failovers([path for path in paths if path.is_dir()])
     lines = [_describe(report) for report in reports]
-    lines += [f"{path.name}: joined with the parts before it, now {path}" for path in joined]
     text = "\n".join(lines) or "nothing to recover: every file is finished"
-    output.result({"files": [asdict(report) for report in reports], "joined": joined}, text)
+    output.result({"files": [asdict(report) for report in reports]}, text)
     return 1 if any(report.output is None for report in reports) else 0
 
 

@@ -51,11 +51,6 @@ class DiskConfig:
     quota_mb: int = 0
     """What the run's episodes may take [MB]: beyond it the oldest ones go that are labelled and not
     flagged; 0: no quota."""
-    failover: Path | None = None
-    """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
-    DIR`` joins the halves."""
-    hang_s: float = 5.0
-    """With --failover: a disk that has been at one write for longer has failed [s]."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0
@@ -70,7 +65,7 @@ class DiskConfig:
         sizes = ("min_free_mb", "footer_mb", "quota_mb")
         refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
-        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s", "hang_s"), (0.01, UNBOUNDED)))
+        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
     @property
     def backlog_bytes(self) -> int:
