@@ -73,14 +73,8 @@ COMMANDS: tuple[Command, ...] = (
     (
         "label",
         f"{EPISODES}:label",
-        "Set the outcome of a recorded episode, or flag it.",
+        "Set the outcome of a recorded episode.",
         "runs/demo trial_1 --result failure",
-    ),
-    (
-        "prune",
-        f"{EPISODES}:prune",
-        "Remove labelled episodes by age, size and quota.",
-        "runs/demo --quota-mb 50000",
     ),
     (
         "rebuild",

@@ -6,6 +6,15 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "label --flag": "Flag trials for others in the dashboard, on the page label (key f).",
+    "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
+    "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    "ls --no-flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    "prune": (
+        "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
+        "your own, or age whole runs with logrotate."
+    ),
+    "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": (
         "A failing disk ends the recording; start it again with a run folder on another disk. The "
         "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."

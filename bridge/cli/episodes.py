@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery, RetentionPolicy
+from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
 from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
 from bridge.wire.config import DEFAULT_ENDPOINT
@@ -407,7 +407,6 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:
         notes.append(f"unknown: {_shown(entry.cause)}")
-    notes += [f"flagged: {_shown(entry.flag)}"] if entry.flag else []
     if entry.presence:
         notes.append(_shown(entry.presence, 400))
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
@@ -429,14 +428,11 @@ def label(
     result: Literal["success", "failure", "unknown"] | None = None,
     by: str = "operator",
     detail: str | None = None,
-    flag: str | None = None,
-    unflag: Annotated[bool, Parameter(negative=())] = False,
     output: Output = OUTPUT,
 ) -> int:
-    """Set the outcome of a recorded episode, or flag it; kept in notes/, nothing is rewritten.
+    """Set the outcome of a recorded episode; kept in notes/, nothing is rewritten.
 
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
-    Keep it whatever happens: robot-gst label runs/monday trial_0003 --flag "look at the wrist"
 
     Args:
         run: Run folder.
@@ -444,85 +440,19 @@ def label(
         result: success, failure or unknown.
         by: Who says so.
         detail: What happened, in words.
-        flag: Why prune and --quota-mb must never remove it.
-        unflag: Take the flag away.
         output: How to talk.
     """
-    from bridge.episode.catalogue import flag_episode, label_episode
+    from bridge.episode.catalogue import label_episode
     from bridge.episode.metadata import Outcome
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
 
-    if flag is not None and unflag:
-        raise UsageError("--flag and --unflag exclude each other.")
-    if result is None and flag is None and not unflag:
-        raise UsageError("say what to note: --result success, --flag WHY or --unflag.")
-    opened = RunFolder.open(run)
-    data: dict[str, object] = {}
-    said = []
-    if result is not None:
-        outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
-        path = label_episode(opened, episode, outcome)
-        data = {"label": asdict(outcome), "file": str(path)}
-        said.append(f"{result} ({path})")
-    if flag is not None or unflag:
-        flag_episode(opened, episode, flag)
-        data["flag"] = flag
-        said.append("no longer flagged" if flag is None else f"flagged: {flag}")
-    output.result(data, f"{episode}: {', '.join(said)}")
-    return 0
-
-
-POLICY = RetentionPolicy()
-
-
-def prune(
-    run: Path,
-    /,
-    *,
-    policy: Annotated[RetentionPolicy, Parameter(name="*")] = POLICY,
-    delete: Annotated[bool, Parameter(negative=())] = False,
-    output: Output = OUTPUT,
-) -> int:
-    """Remove labelled episodes by age, size and quota; without --delete it only lists them.
-
-    Never what nobody labelled, what is flagged (label --flag, or the tag keep), or what cannot be
-    read. What went stands in notes/removed.jsonl.
-    Example: robot-gst prune runs/monday --older-than-days 30 --outcome failure --quota-mb 50000
-
-    Args:
-        run: Run folder.
-        policy: What may go.
-        delete: Do it.
-        output: How to talk.
-    """
-    import time
-
-    from bridge.episode.catalogue import list_episodes
-    from bridge.episode.retention import choose, may_go, remove
-    from bridge.episode.run_folder import RunFolder
-    from bridge.errors import UsageError
-
-    if policy.is_empty:
-        raise UsageError(
-            "say what may go: --quota-mb 50000, --older-than-days 30 or --larger-than-mb 500."
-        )
-    opened = RunFolder.open(run)
-    opened.refuse_empty()
-    entries = list_episodes(opened)
-    now_ns = time.time_ns()
-    chosen = choose(entries, policy, now_ns=now_ns)
-    gone = [each for each in chosen if not delete or remove(opened, each, now_ns=now_ns)]
-    word = "removed" if delete else "would remove"
-    size_mb = sum(each.entry.size_bytes for each in gone) / 1e6
-    lines = [f"{word} {_shown(e.id)} ({e.outcome}): {reason}" for e, reason in gone]
-    kept = sum(not may_go(entry, policy) for entry in entries)
-    lines.append(
-        f"{word} {len(gone)} of {len(entries)} episodes, {size_mb:.1f} MB; "
-        f"{kept} can never go by these rules" + ("" if delete or not gone else "; do it: --delete")
-    )
-    data = [{"id": each.entry.id, "reason": each.reason} for each in gone]
-    output.result({"deleted": delete, "episodes": data, "size_mb": size_mb}, "\n".join(lines))
+    if result is None:
+        raise UsageError("say what to note: --result success, failure or unknown.")
+    outcome = Outcome(result=result, k=int(result == "success"), n=1, by=by, detail=detail)
+    path = label_episode(RunFolder.open(run), episode, outcome)
+    data = {"label": asdict(outcome), "file": str(path)}
+    output.result(data, f"{episode}: {result} ({path})")
     return 0
 
 

@@ -48,9 +48,6 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
-    quota_mb: int = 0
-    """What the run's episodes may take [MB]: beyond it the oldest ones go that are labelled and not
-    flagged; 0: no quota."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0
@@ -62,9 +59,8 @@ class DiskConfig:
 
     def __post_init__(self) -> None:
         """Refuse negative sizes and times."""
-        sizes = ("min_free_mb", "footer_mb", "quota_mb")
+        sizes = ("min_free_mb", "footer_mb", "split_mb", "split_s")
         refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
-        refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
     @property

@@ -18,7 +18,6 @@ from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
 from bridge.episode.contract import find_contract
-from bridge.episode.retention import keep_quota
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.clocks import ClockBook
@@ -266,8 +265,6 @@ class Recorder:
         path = self._run.episodes_dir / part_name(episode_id, 1)
         note_finished(self._run, path)
         self._tell(path)
-        if quota_mb := self.config.disk.quota_mb:
-            keep_quota(self._run, float(quota_mb), now_ns=self._now_ns(), say=self._say)
 
     def _say(self, text: str) -> None:
         self.news.append(text)
