@@ -274,12 +274,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "runs/x DIR",
             ),
             (
-                "corrected",
-                f"{EXCHANGE}:export_corrected",
-                "An episode with its sources' clocks taken out of all stamps.",
-                "EPISODE OUT.mcap",
-            ),
-            (
                 "catalogue",
                 f"{EPISODES}:export_catalogue",
                 "The list of a run's episodes as a Parquet table.",

@@ -6,6 +6,10 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "export corrected": (
+        "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
+        'open_episode(path, clock="corrected").'
+    ),
     "label --flag": "Flag trials for others in the dashboard, on the page label (key f).",
     "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
     "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",

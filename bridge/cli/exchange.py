@@ -182,30 +182,6 @@ def export_rosbag2(
     return 0
 
 
-def export_corrected(episode: Path, out: Path, /, *, output: Output = OUTPUT) -> int:
-    """Write an episode anew with offset and drift of its sources' clocks taken out of all stamps.
-
-    For commands that read stamps as they are: rebuild, replay, evaluate. robot-gst info says what
-    is known of the clocks.
-    Example: robot-gst export corrected runs/lab/episodes/t1.mcap runs/lab_2/episodes/t1.mcap
-
-    Args:
-        episode: An episode file, the first part of a split one.
-        out: The file to make.
-        output: How to talk.
-    """
-    from bridge.episode.reader import Episode
-    from bridge.exchange.corrected import write_corrected
-
-    total = sum(item.count for item in Episode.open(episode).topics().values())
-    with output.progress("export", total) as advance:
-        moved = write_corrected(episode, out, advance=advance)
-    lines = [f"{out}: stamps of {sum(moved.values())} messages moved"]
-    lines += [f"  {topic}: {count}" for topic, count in moved.items()]
-    output.result({"out": str(out), "moved": moved}, "\n".join(lines))
-    return 0
-
-
 def import_lerobot(
     folder: Path,
     run: Path,
