@@ -244,12 +244,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
         "Export episodes to formats of other programs.",
         (
             (
-                "rrd",
-                "dashboards.cli:export_rrd",
-                "An episode with its replays as a Rerun file.",
-                "EPISODE --out FILE.rrd",
-            ),
-            (
                 "lerobot",
                 f"{EXCHANGE}:export_lerobot",
                 "Trials as a LeRobotDataset v3.0.",
@@ -272,12 +266,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 f"{EXCHANGE}:export_csv",
                 "Joints, poses, events ... as tidy CSV files.",
                 "runs/x DIR",
-            ),
-            (
-                "catalogue",
-                f"{EPISODES}:export_catalogue",
-                "The list of a run's episodes as a Parquet table.",
-                "runs/monday monday.parquet",
             ),
         ),
     ),

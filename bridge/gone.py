@@ -6,6 +6,8 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "export catalogue": "List with robot-gst ls RUN --parquet FILE.",
+    "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": (
         "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
         'open_episode(path, clock="corrected").'

@@ -306,6 +306,7 @@ def ls(
     /,
     *,
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
+    parquet: Path | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
@@ -317,9 +318,10 @@ def ls(
     Args:
         run: Run folder, or a folder of runs.
         query: Which, and in what order.
+        parquet: Write the list to this file too, as a table for pandas or DuckDB.
         output: How to talk.
     """
-    from bridge.episode.catalogue import find_runs
+    from bridge.episode.catalogue import find_runs, write_parquet
 
     runs = find_runs(run)
     found = _find(runs, query, output)
@@ -328,6 +330,8 @@ def ls(
     if len(runs) > 1:
         names = [each.path.relative_to(run).as_posix() for each, _ in found]
         shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
+    if parquet is not None:
+        write_parquet(shown, parquet)
     lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
     data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
     output.result({"episodes": data}, "\n".join(lines))
@@ -453,31 +457,4 @@ def label(
     path = label_episode(RunFolder.open(run), episode, outcome)
     data = {"label": asdict(outcome), "file": str(path)}
     output.result(data, f"{episode}: {result} ({path})")
-    return 0
-
-
-def export_catalogue(
-    run: Path,
-    out: Path,
-    /,
-    *,
-    query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
-    output: Output = OUTPUT,
-) -> int:
-    """Write the list of a run's episodes as a Parquet table, one row per episode.
-
-    Example: robot-gst export catalogue runs/monday monday.parquet --kind trial
-
-    Args:
-        run: Run folder.
-        out: The Parquet file to write; replaced if it is there.
-        query: Which, and in what order.
-        output: How to talk.
-    """
-    from bridge.episode.catalogue import write_parquet
-    from bridge.episode.run_folder import RunFolder
-
-    entries = [entry for _, entry in _find([RunFolder.open(run)], query, output)]
-    write_parquet(entries, out)
-    output.result({"file": str(out), "episodes": len(entries)}, f"{out}: {len(entries)} episodes")
     return 0
