@@ -20,6 +20,7 @@ GONE: dict[str, str] = {
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."
     ),
+    "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": (
         "A failing disk ends the recording; start it again with a run folder on another disk. The "

@@ -92,8 +92,6 @@ class RecorderConfig:
     """Raw depth images: keep them (every viewer reads those), or compress without loss (RVL)."""
     msg_folder: Path | None = None
     """Where the .msg files of your own ROS 2 types lie, as PACKAGE/msg/NAME.msg at any depth."""
-    preview_video: bool = False
-    """Add an H.264 video of each raw colour stream, for people; needs the extra [video]."""
     preview_hz: float = 5.0
     """At most this many small pictures a second for whoever watches; 0 makes none [1/s]."""
     preroll_s: float = 0.0

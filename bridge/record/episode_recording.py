@@ -274,12 +274,6 @@ class EpisodeRecording:
             raise
         self.ledger.count_received(item, finding)
 
-    def write_beside(self, sample: WireSample) -> None:
-        """Append something the recorder made itself; it is in no account."""
-        channel = self._channels.of(sample, sample.type_name)
-        if channel is not None:
-            self._append(channel, sample, sample.received_ns)
-
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
     ) -> None:

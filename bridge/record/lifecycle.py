@@ -242,8 +242,6 @@ class Lifecycle:
                 traceback.print_exc()
             take.ledger.count_refused(item)
             return
-        if item.extra is not None:
-            take.write_beside(item.extra)
 
     def tick(self, now_ns: int) -> None:
         """Do what time asks for: flush, close seconds, split. Raises OSError for the disk."""

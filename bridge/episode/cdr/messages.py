@@ -25,7 +25,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media import depth
 from bridge.media.color import decode_color
-from bridge.media.video import VIDEO_FORMAT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,26 +102,6 @@ def _stamp(data: bytes) -> int:
                 raise ValueError(message)
             parts[number] = protobuf.signed(value)
     return join_ns(parts[1], parts[2])
-
-
-def video_message(stamp_ns: int, frame_id: str, data: bytes) -> bytes:
-    """Serialise one H.264 frame (Annex B) as foxglove.CompressedVideo.
-
-    Args:
-        stamp_ns: Source time of the frame [ns since 1970].
-        frame_id: Of the camera.
-        data: The bytes of the frame, start codes included.
-    """
-    seconds, nanos = split_ns(stamp_ns)
-    timestamp = protobuf.number_field(1, seconds) + protobuf.number_field(2, nanos)
-    return b"".join(
-        [
-            protobuf.bytes_field(1, timestamp),
-            protobuf.bytes_field(2, frame_id.encode()),
-            protobuf.bytes_field(3, data),
-            protobuf.bytes_field(4, VIDEO_FORMAT.encode()),
-        ]
-    )
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:

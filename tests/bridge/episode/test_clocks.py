@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from video_messages import video_message
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -219,7 +220,6 @@ def test_every_kind_of_stamp_is_moved_and_unset_ones_stay(tmp_path: Path) -> Non
         FrameTransform,
         VideoFrame,
         transforms_to_cdr,
-        video_message,
     )
 
     transform = FrameTransform(stamp_ns=START_NS, parent="a", child="b", T_parent_child=np.eye(4))
