@@ -178,7 +178,7 @@ class CompressedColor:
             stamp_ns=stamp_of(message),
             frame_id=message["header"]["frame_id"],
             format=message["format"],
-            data=message["data"],
+            data=bytes(message["data"]),
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
