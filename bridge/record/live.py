@@ -1,12 +1,4 @@
-"""A recorder on the wire: session, recorder, control keys, status, previews; from Python too.
-
-from bridge.record.live import open_recorder
-
-with open_recorder(Path("runs/monday")) as recorder:
-    recorder.start("trial_0001", task="cube_into_box", operator="ada")
-    recorder.mark("gripper closed")
-    print(recorder.stop(result="success"))
-"""
+"""A recorder on the wire: session, recorder, control keys, status, previews."""
 
 import contextlib
 import fcntl
@@ -14,7 +6,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,7 +17,6 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.contract import find_contract
-from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.recovery_report import RecoveryReport
 from bridge.episode.run_folder import RunFolder
@@ -33,7 +24,7 @@ from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.clocks import ClockAsker
 from bridge.record.config import RecorderConfig
-from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.control import serve_control
 from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
@@ -42,12 +33,11 @@ from bridge.record.ros2 import watch_ros2
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
-from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.rmw import read_definitions
-from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
+from bridge.wire.session import Subscriber, WireSample, WireSession
 
 WIDTH = 320
 QUALITY = 70
@@ -206,12 +196,11 @@ class PublisherLiveliness:
 
 STATUS_PERIOD_S = 1.0
 CONTROL_PREFIX = "/rec/"
-HOST = WireConfig(mode="router", connect=(), listen=(DEFAULT_ENDPOINT,))
 """The recorder is where everybody else connects."""
 
 
 class LiveRecorder:
-    """A recorder that others can see and control; use ``open_recorder``."""
+    """A recorder that others can see and control; ``core`` does the recording."""
 
     def __init__(
         self,
@@ -317,64 +306,6 @@ class LiveRecorder:
             data = json.dumps({**about, **entry}).encode()
             self._episodes.put(data, source_ns=self.session.now_ns())
 
-    def start(self, episode_id: str, *, anyway: bool = False, **about: Any) -> dict[str, Any]:
-        """Begin an episode.
-
-        Args:
-            episode_id: Its name.
-            anyway: Warn of topics that are required and missing, instead of refusing.
-            about: Fields of ``EpisodeInfo``: task, operator, tags ...
-
-        Raises:
-            UsageError: When the id or a field is wrong, or another episode is open.
-            BridgeError: When the disk has no space.
-        """
-        return self.core.start(parse_info(episode_id, about), anyway=anyway)
-
-    def stop(
-        self, *, result: str | None = None, detail: str | None = None, discard: bool = False
-    ) -> dict[str, Any]:
-        """Finish the episode; ``result`` is success, failure or unknown.
-
-        Args:
-            result: ``success``, ``failure`` or ``unknown``; None leaves it as it was labelled.
-            detail: Why, in a few words; None for none.
-            discard: Throw the episode away.
-        """
-        return self.core.stop(outcome=_outcome(result, detail), discard=discard)
-
-    def mark(self, text: str = "") -> dict[str, Any]:
-        """Note this instant."""
-        return self.core.mark(text)
-
-    def label(
-        self, result: str, *, detail: str | None = None, episode: str | None = None
-    ) -> dict[str, Any]:
-        """Say how the open episode went, or a finished one by its id.
-
-        Args:
-            result: ``success``, ``failure`` or ``unknown``.
-            detail: Why, in a few words; None for none.
-            episode: Id of a finished episode; None: the open one, else the last.
-        """
-        return self.core.label(outcome=_outcome(result, detail), episode=episode)
-
-    def pause(self) -> dict[str, Any]:
-        """Leave messages out until ``resume``."""
-        return self.core.pause()
-
-    def resume(self) -> dict[str, Any]:
-        """Record again."""
-        return self.core.resume()
-
-    def snapshot(self, episode_id: str, **about: Any) -> dict[str, Any]:
-        """Write the pre-roll as an episode."""
-        return self.core.snapshot(parse_info(episode_id, about))
-
-    def status(self) -> dict[str, Any]:
-        """What is going on."""
-        return self.core.status()
-
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
         self._ended.set()
@@ -400,38 +331,6 @@ class LiveRecorder:
                 os.close(self._folder_lock)
 
 
-@contextlib.contextmanager
-def open_recorder(
-    run_path: Path,
-    *,
-    wire: WireConfig = HOST,
-    config: RecorderConfig | None = None,
-    say: Callable[[str], None] = lambda text: None,
-) -> Iterator[LiveRecorder]:
-    """Record whatever is published, until the block ends; an open episode is then finished.
-
-    Args:
-        run_path: The run folder; made where needed.
-        wire: Where to listen or connect.
-        config: The recorder's settings.
-        say: Called with remarks for people, such as what was recovered.
-
-    Raises:
-        DiskError: At the end of the block, when the disk ended the recording.
-        WireError: When the port is taken, or the configuration cannot be used.
-    """
-    with open_session(wire) as session:
-        recorder = LiveRecorder(
-            session, RunFolder.create(run_path), config or RecorderConfig(), say
-        )
-        try:
-            yield recorder
-        finally:
-            recorder.close()
-        if recorder.core.error is not None:
-            raise recorder.core.error
-
-
 def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
     """Keep other recorders out of a run folder, until the process ends.
 
@@ -452,13 +351,6 @@ def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
         os.close(descriptor)
         return None
     return descriptor
-
-
-def _outcome(result: str | None, detail: str | None) -> Outcome | None:
-    if result is None:
-        return None
-    success = int(result == "success")
-    return parse_outcome({"result": result, "k": success, "n": 1, "detail": detail})
 
 
 def _describe_recovery(report: RecoveryReport) -> str:
