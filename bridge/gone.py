@@ -6,6 +6,7 @@ from bridge.errors import UsageError
 
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "List with robot-gst ls RUN --parquet FILE.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": (

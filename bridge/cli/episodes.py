@@ -139,7 +139,6 @@ def check(
     episodes: tuple[Path, ...] = (),
     /,
     *,
-    rerun: bool = False,
     contract: str | None = None,
     wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
@@ -153,7 +152,6 @@ def check(
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
-        rerun: Let Rerun's own checker read each file too.
         contract: Hold them to this TOML file or template, not to what they were recorded under.
         wire: What to listen to, and where.
         output: How to talk.
@@ -163,7 +161,7 @@ def check(
     from bridge.errors import UsageError
 
     if wire.wire is not None:
-        if episodes or rerun:
+        if episodes:
             raise UsageError("--wire listens to a publisher; give episodes in another command.")
         return _check_wire(wire.wire, wire, output)
     files: list[Path] = []
@@ -185,7 +183,7 @@ def check(
     reports = []
     with output.progress("check", len(files)) as advance:
         asked = None if contract is None else find_contract(Path(), contract)
-        for report in check_all(files, rerun=rerun, contract=asked):
+        for report in check_all(files, contract=asked):
             reports.append(report)
             advance(min(len(reports), len(files)), report.path.name)
     data = {
