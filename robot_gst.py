@@ -17,6 +17,7 @@ from rich.console import Console
 
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.gone import refuse_gone
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -72,20 +73,8 @@ COMMANDS: tuple[Command, ...] = (
     (
         "label",
         f"{EPISODES}:label",
-        "Set the outcome of a recorded episode, or flag it.",
+        "Set the outcome of a recorded episode.",
         "runs/demo trial_1 --result failure",
-    ),
-    (
-        "prune",
-        f"{EPISODES}:prune",
-        "Remove labelled episodes by age, size and quota.",
-        "runs/demo --quota-mb 50000",
-    ),
-    (
-        "sync",
-        f"{EXCHANGE}:sync",
-        "Copy a run elsewhere, verified by hash; resumes.",
-        "runs/monday /mnt/archive",
     ),
     (
         "rebuild",
@@ -255,12 +244,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
         "Export episodes to formats of other programs.",
         (
             (
-                "rrd",
-                "dashboards.cli:export_rrd",
-                "An episode with its replays as a Rerun file.",
-                "EPISODE --out FILE.rrd",
-            ),
-            (
                 "lerobot",
                 f"{EXCHANGE}:export_lerobot",
                 "Trials as a LeRobotDataset v3.0.",
@@ -283,18 +266,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 f"{EXCHANGE}:export_csv",
                 "Joints, poses, events ... as tidy CSV files.",
                 "runs/x DIR",
-            ),
-            (
-                "corrected",
-                f"{EXCHANGE}:export_corrected",
-                "An episode with its sources' clocks taken out of all stamps.",
-                "EPISODE OUT.mcap",
-            ),
-            (
-                "catalogue",
-                f"{EPISODES}:export_catalogue",
-                "The list of a run's episodes as a Parquet table.",
-                "runs/monday monday.parquet",
             ),
         ),
     ),
@@ -335,6 +306,7 @@ def run(arguments: Sequence[str]) -> int:
         tokens, config = _take_config(list(arguments))
         if config is not None:
             app.config = Toml(config, must_exist=True)
+        refuse_gone(tokens)
         code = app(tokens)
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
@@ -422,6 +394,7 @@ def _check_tables(path: Path) -> None:
     known: dict[str, set[str]] = {name: set() for name, *_ in COMMANDS}
     known |= {group: {name for name, *_ in members} for group, (_, members) in GROUPS.items()}
     for name, table in content.items():
+        refuse_gone([name])
         wrong = [name] if name not in known else []
         if name in GROUPS and isinstance(table, dict):
             wrong = [f"{name}.{member}" for member in table if member not in known[name]]

@@ -114,23 +114,6 @@ def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT)
     return 0
 
 
-def export_rrd(episode: Path, /, *, out: Path, output: Output = OUTPUT) -> int:
-    """Write an episode with its replays, or a plan with its own, as a Rerun file.
-
-    Example: robot-gst export rrd runs/monday/episodes/trial_0001.mcap --out trial_0001.rrd
-
-    Args:
-        episode: An episode file, or a plan of a run's plans/; of one inside a run, the replays and
-            the rebuilt scene come along.
-        out: The .rrd file to write; an older one is replaced.
-        output: How to talk.
-    """
-    from dashboards.rerun_viewer import episode_of
-
-    _export(episode_of(episode), out, output)
-    return 0
-
-
 def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -> int:
     """Look at an episode or a plan in Rerun's own window, or say how to where none opens.
 
@@ -138,7 +121,7 @@ def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -
 
     Args:
         target: An episode file, a plan of a run's plans/, or a run folder for its newest trial.
-        out: The .rrd file to write; beside the run's derived episodes without it.
+        out: Only write this .rrd file; without it, one beside the run's derived episodes is opened.
         output: How to talk.
     """
     from dashboards import rerun_viewer as viewer
@@ -147,6 +130,8 @@ def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -
     if target.is_dir():
         output.say(f"Showing {episode.stem}, the newest of {target}; name a file for another.")
     path = _export(episode, out or viewer.default_out(episode), output)
+    if out is not None:
+        return 0
     if viewer.has_display():
         output.say(f"Opened it in Rerun's window, process {viewer.open_window(path)}.")
     else:

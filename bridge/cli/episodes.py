@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery, RetentionPolicy
+from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
 from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
 from bridge.wire.config import DEFAULT_ENDPOINT
@@ -139,7 +139,6 @@ def check(
     episodes: tuple[Path, ...] = (),
     /,
     *,
-    rerun: bool = False,
     contract: str | None = None,
     wire: Annotated[WireCheck, Parameter(name="*", group="A publisher")] = WIRE,
     output: Output = OUTPUT,
@@ -153,7 +152,6 @@ def check(
 
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
-        rerun: Let Rerun's own checker read each file too.
         contract: Hold them to this TOML file or template, not to what they were recorded under.
         wire: What to listen to, and where.
         output: How to talk.
@@ -163,7 +161,7 @@ def check(
     from bridge.errors import UsageError
 
     if wire.wire is not None:
-        if episodes or rerun:
+        if episodes:
             raise UsageError("--wire listens to a publisher; give episodes in another command.")
         return _check_wire(wire.wire, wire, output)
     files: list[Path] = []
@@ -185,7 +183,7 @@ def check(
     reports = []
     with output.progress("check", len(files)) as advance:
         asked = None if contract is None else find_contract(Path(), contract)
-        for report in check_all(files, rerun=rerun, contract=asked):
+        for report in check_all(files, contract=asked):
             reports.append(report)
             advance(min(len(reports), len(files)), report.path.name)
     data = {
@@ -253,8 +251,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     Example: robot-gst recover runs/monday
 
     Args:
-        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``; of a run and its
-            --failover folder the halves of an episode are joined.
+        paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
         in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
@@ -275,11 +272,9 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
             if len(files) == 1:
                 raise
             reports.append(RecoveryReport(path=path, output=None, reason=str(error)))
-    joined = recovery.join_failovers([path for path in paths if path.is_dir()])
     lines = [_describe(report) for report in reports]
-    lines += [f"{path.name}: joined with the parts before it, now {path}" for path in joined]
     text = "\n".join(lines) or "nothing to recover: every file is finished"
-    output.result({"files": [asdict(report) for report in reports], "joined": joined}, text)
+    output.result({"files": [asdict(report) for report in reports]}, text)
     return 1 if any(report.output is None for report in reports) else 0
 
 
@@ -309,6 +304,7 @@ def ls(
     /,
     *,
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
+    parquet: Path | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
@@ -320,9 +316,10 @@ def ls(
     Args:
         run: Run folder, or a folder of runs.
         query: Which, and in what order.
+        parquet: Write the list to this file too, as a table for pandas or DuckDB.
         output: How to talk.
     """
-    from bridge.episode.catalogue import find_runs
+    from bridge.episode.catalogue import find_runs, write_parquet
 
     runs = find_runs(run)
     found = _find(runs, query, output)
@@ -331,6 +328,8 @@ def ls(
     if len(runs) > 1:
         names = [each.path.relative_to(run).as_posix() for each, _ in found]
         shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
+    if parquet is not None:
+        write_parquet(shown, parquet)
     lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
     data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
     output.result({"episodes": data}, "\n".join(lines))
@@ -410,7 +409,6 @@ def _notes(entry: "Entry", *, is_named: bool) -> str:
     notes += ["from the stand-in cell"] if entry.stand_in and is_named else []
     if entry.cause and entry.cause != UNLABELLED:
         notes.append(f"unknown: {_shown(entry.cause)}")
-    notes += [f"flagged: {_shown(entry.flag)}"] if entry.flag else []
     if entry.presence:
         notes.append(_shown(entry.presence, 400))
     return "; ".join(notes + ([_shown(entry.error)] if entry.error else []))
@@ -435,8 +433,6 @@ def label(
     policy: str | None = None,
     by: str = "operator",
     detail: str | None = None,
-    flag: str | None = None,
-    unflag: Annotated[bool, Parameter(negative=())] = False,
     output: Output = OUTPUT,
 ) -> int:
     """Say how a recorded episode ended, and of what it is a trial; nothing is rewritten.
@@ -444,7 +440,6 @@ def label(
     With --task, an imported episode is a trial from then on. Kept in notes/.
     Example: robot-gst label runs/monday trial_0003 --result failure --detail "slipped"
     Example: robot-gst label runs/monday bag_7 --task cube_into_box --result success --policy act
-    Keep it whatever happens: robot-gst label runs/monday trial_0003 --flag "look at the wrist"
 
     Args:
         run: Run folder.
@@ -455,13 +450,10 @@ def label(
         policy: What moved the robot; with --task.
         by: Who says so.
         detail: What happened, in words.
-        flag: Why prune and --quota-mb must never remove it.
-        unflag: Take the flag away.
         output: How to talk.
     """
     from bridge.episode.catalogue import (
         assign_trial,
-        flag_episode,
         label_episode,
         refuse_without_task,
     )
@@ -469,12 +461,10 @@ def label(
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError
 
-    if flag is not None and unflag:
-        raise UsageError("--flag and --unflag exclude each other.")
     if task is None and (start or policy):
         raise UsageError("--start and --policy belong to a trial: add --task NAME.")
-    if result is None and flag is None and not unflag and task is None:
-        raise UsageError("say what to note: --result success, --task NAME, --flag WHY or --unflag.")
+    if result is None and task is None:
+        raise UsageError("say what to note: --result success, --task NAME, or both.")
     opened = RunFolder.open(run)
     data: dict[str, object] = {}
     said = []
@@ -488,89 +478,5 @@ def label(
         path = label_episode(opened, episode, outcome)
         data |= {"label": asdict(outcome), "file": str(path)}
         said.append(f"{result} ({path})")
-    if flag is not None or unflag:
-        flag_episode(opened, episode, flag)
-        data["flag"] = flag
-        said.append("no longer flagged" if flag is None else f"flagged: {flag}")
     output.result(data, f"{episode}: {', '.join(said)}")
-    return 0
-
-
-POLICY = RetentionPolicy()
-
-
-def prune(
-    run: Path,
-    /,
-    *,
-    policy: Annotated[RetentionPolicy, Parameter(name="*")] = POLICY,
-    delete: Annotated[bool, Parameter(negative=())] = False,
-    output: Output = OUTPUT,
-) -> int:
-    """Remove labelled episodes by age, size and quota; without --delete it only lists them.
-
-    Never what nobody labelled, what is flagged (label --flag, or the tag keep), or what cannot be
-    read. What went stands in notes/removed.jsonl.
-    Example: robot-gst prune runs/monday --older-than-days 30 --outcome failure --quota-mb 50000
-
-    Args:
-        run: Run folder.
-        policy: What may go.
-        delete: Do it.
-        output: How to talk.
-    """
-    import time
-
-    from bridge.episode.catalogue import list_episodes
-    from bridge.episode.retention import choose, may_go, remove
-    from bridge.episode.run_folder import RunFolder
-    from bridge.errors import UsageError
-
-    if policy.is_empty:
-        raise UsageError(
-            "say what may go: --quota-mb 50000, --older-than-days 30 or --larger-than-mb 500."
-        )
-    opened = RunFolder.open(run)
-    opened.refuse_empty()
-    entries = list_episodes(opened)
-    now_ns = time.time_ns()
-    chosen = choose(entries, policy, now_ns=now_ns)
-    gone = [each for each in chosen if not delete or remove(opened, each, now_ns=now_ns)]
-    word = "removed" if delete else "would remove"
-    size_mb = sum(each.entry.size_bytes for each in gone) / 1e6
-    lines = [f"{word} {_shown(e.id)} ({e.outcome}): {reason}" for e, reason in gone]
-    kept = sum(not may_go(entry, policy) for entry in entries)
-    lines.append(
-        f"{word} {len(gone)} of {len(entries)} episodes, {size_mb:.1f} MB; "
-        f"{kept} can never go by these rules" + ("" if delete or not gone else "; do it: --delete")
-    )
-    data = [{"id": each.entry.id, "reason": each.reason} for each in gone]
-    output.result({"deleted": delete, "episodes": data, "size_mb": size_mb}, "\n".join(lines))
-    return 0
-
-
-def export_catalogue(
-    run: Path,
-    out: Path,
-    /,
-    *,
-    query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
-    output: Output = OUTPUT,
-) -> int:
-    """Write the list of a run's episodes as a Parquet table, one row per episode.
-
-    Example: robot-gst export catalogue runs/monday monday.parquet --kind trial
-
-    Args:
-        run: Run folder.
-        out: The Parquet file to write; replaced if it is there.
-        query: Which, and in what order.
-        output: How to talk.
-    """
-    from bridge.episode.catalogue import write_parquet
-    from bridge.episode.run_folder import RunFolder
-
-    entries = [entry for _, entry in _find([RunFolder.open(run)], query, output)]
-    write_parquet(entries, out)
-    output.result({"file": str(out), "episodes": len(entries)}, f"{out}: {len(entries)} episodes")
     return 0

@@ -182,30 +182,6 @@ def export_rosbag2(
     return 0
 
 
-def export_corrected(episode: Path, out: Path, /, *, output: Output = OUTPUT) -> int:
-    """Write an episode anew with offset and drift of its sources' clocks taken out of all stamps.
-
-    For commands that read stamps as they are: rebuild, replay, evaluate. robot-gst info says what
-    is known of the clocks.
-    Example: robot-gst export corrected runs/lab/episodes/t1.mcap runs/lab_2/episodes/t1.mcap
-
-    Args:
-        episode: An episode file, the first part of a split one.
-        out: The file to make.
-        output: How to talk.
-    """
-    from bridge.episode.reader import Episode
-    from bridge.exchange.corrected import write_corrected
-
-    total = sum(item.count for item in Episode.open(episode).topics().values())
-    with output.progress("export", total) as advance:
-        moved = write_corrected(episode, out, advance=advance)
-    lines = [f"{out}: stamps of {sum(moved.values())} messages moved"]
-    lines += [f"  {topic}: {count}" for topic, count in moved.items()]
-    output.result({"out": str(out), "moved": moved}, "\n".join(lines))
-    return 0
-
-
 def import_lerobot(
     folder: Path,
     run: Path,
@@ -485,42 +461,3 @@ def import_rosbag2(
         f"of {len(report.files)} files",
     )
     return 0
-
-
-def sync(
-    run: Path,
-    destination: str,
-    /,
-    *,
-    verify: Annotated[bool, Parameter(negative=())] = False,
-    output: Output = OUTPUT,
-) -> int:
-    """Copy a run to another folder or to any target of fsspec, each file verified by SHA-256.
-
-    Finished files only; a copy that was interrupted goes on where it stopped. Nothing is removed.
-    Exit code 1: some files could not be copied; run it again.
-    Example: robot-gst sync runs/monday /mnt/archive
-    With fsspec and what the protocol needs: robot-gst sync runs/monday s3://lab-archive/runs
-
-    Args:
-        run: Run folder; the copy is a folder of the same name.
-        destination: Folder or URL that runs are copied into.
-        verify: Read every copy again, also those that were verified before.
-        output: How to talk.
-    """
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.sync import files_of, sync_run
-
-    opened = RunFolder.open(run)
-    opened.refuse_empty()
-    total = sum((run / name).stat().st_size for name in files_of(opened))
-    with output.progress("copy", total) as advance:
-        report = sync_run(opened, destination, verify=verify, advance=advance)
-    lines = [f"failed: {name}: {why}" for name, why in report.failed.items()]
-    resumed = f" ({len(report.resumed)} of them went on)" if report.resumed else ""
-    lines.append(
-        f"{report.destination}: {len(report.copied)} files copied and verified{resumed}, "
-        f"{report.num_bytes / 1e6:.1f} MB sent, {report.unchanged} there already"
-    )
-    output.result(asdict(report), "\n".join(lines))
-    return 1 if report.failed else 0

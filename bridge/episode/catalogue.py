@@ -15,7 +15,6 @@ from typing import Any
 from bridge.episode.assigned import assign
 from bridge.episode.catalogue_store import (
     FILE_NAME,
-    FLAG_SUFFIX,
     LABEL_SUFFIX,
     UNLABELLED,
     CatalogueQuery,
@@ -187,49 +186,6 @@ def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     return path
 
 
-def flag_of(run: RunFolder, path: Path) -> str:
-    """Why an episode was flagged; "" where nobody did.
-
-    Args:
-        run: The run whose ``notes/`` may hold a flag.
-        path: The episode's first file.
-    """
-    try:
-        data = (run.notes_dir / f"{path.stem}{FLAG_SUFFIX}").read_bytes()
-    except OSError:
-        return ""
-    try:
-        return str(json.loads(data)["text"]) or FLAGGED
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return FLAGGED  # damaged: rather kept than lost
-
-
-FLAGGED = "flagged"
-
-
-def flag_episode(run: RunFolder, episode_id: str, text: str | None) -> Path:
-    """Flag an episode, so that retention never removes it, or take the flag away.
-
-    Args:
-        run: The run that holds it.
-        episode_id: Id of a finished episode.
-        text: Why; None takes the flag away.
-
-    Raises:
-        PathNotFoundError: When there is no such episode.
-    """
-    path = run.notes_dir / f"{check_episode_id(episode_id)}{FLAG_SUFFIX}"
-    episode = _finished(run, episode_id)
-    if text is None:
-        path.unlink(missing_ok=True)
-    else:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        record = {"schema_version": 1, "text": text}
-        write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
-    note_finished(run, episode)
-    return path
-
-
 def _finished(run: RunFolder, episode_id: str) -> Path:
     episode = run.episodes_dir / f"{episode_id}.mcap"
     if not episode.is_file():
@@ -256,8 +212,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         info, outcome = episode.info, outcome_of(run, episode)
         messages = sum(topic.count for topic in episode.topics().values())
     except GstError as error:
-        flag = printable(flag_of(run, path))
-        return Entry(**name, **_extent(parts), flag=flag, error=printable(str(error)))
+        return Entry(**name, **_extent(parts), error=printable(str(error)))
     records = episode.metadata_records
     return Entry(
         **name,
@@ -282,7 +237,6 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
         presence=printable("; ".join(presence_lines(records.get(PRESENCE_RECORD, {})))),
-        flag=printable(flag_of(run, path)),
     )
 
 

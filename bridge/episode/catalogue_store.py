@@ -24,9 +24,7 @@ UNLABELLED = "nobody labelled it"
 """Why the outcome of a trial is unknown that has no label."""
 LABEL_SUFFIX = ".outcome.json"
 """Of the sidecar under ``notes/`` that holds a label given after the fact."""
-FLAG_SUFFIX = ".flag.json"
-"""Of the sidecar that says why an episode must be kept."""
-SIDECARS = (LABEL_SUFFIX, FLAG_SUFFIX, TRIAL_SUFFIX)
+SIDECARS = (LABEL_SUFFIX, TRIAL_SUFFIX)
 UNSETTLED_NS = 2_000_000_000
 """A file changed this recently may change again within one tick of the disk's clock [ns]."""
 
@@ -67,8 +65,6 @@ class Entry:
     """Its writer was killed, so its tail is missing."""
     presence: str = ""
     """Topics that broke the contract, fell silent, or whose losses nobody can see."""
-    flag: str = ""
-    """Why somebody flagged it; retention never removes it."""
     error: str = ""
 
 
@@ -78,8 +74,7 @@ class Trace:
 
     path: Path
     stamp: str
-    """Size, times and inode of each part, of the label and of the flag; "" when it cannot be relied
-    on."""
+    """Size, times and inode of each part and of the sidecars; "" when it cannot be relied on."""
 
 
 def scan(run: RunFolder) -> dict[str, Trace]:
@@ -157,7 +152,7 @@ _COLUMNS: dict[str, str] = {
 
 
 _EXACT = ("kind", "task", "condition", "policy", "operator", "cell", "robot", "outcome")
-_SEARCHED = (*_EXACT, "id", "instruction", "tags", "cause", "presence", "flag", "error")
+_SEARCHED = (*_EXACT, "id", "instruction", "tags", "cause", "presence", "error")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +178,7 @@ class CatalogueQuery:
     tag: tuple[str, ...] = ()
     """A tag; of several, all must be there."""
     text: str | None = None
-    """These words, in whatever case, in name, task, instruction, tags, cause, flag ..."""
-    flagged: bool | None = None
-    """Only flagged ones; --no-flagged only the others."""
+    """These words, in whatever case, in name, task, instruction, tags, cause ..."""
     since: str | None = None
     """Begun at or after this time, for example 2026-03-01 or 2026-03-01T14:30 (local)."""
     until: str | None = None
@@ -227,8 +220,6 @@ class CatalogueQuery:
         if self.text is not None:
             terms.append(f"holds({' || char(10) || '.join(_SEARCHED)}, ?)")
             values.append(self.text)
-        if self.flagged is not None:
-            terms.append(f"(flag != '') = {int(self.flagged)}")
         if self.lost is not None:
             terms.append(f"(ifnull(lost, 0) > 0 OR recovered) = {int(self.lost)}")
         if self.error is not None:
@@ -260,45 +251,8 @@ def _instant_ns(name: str, text: str | None) -> int | None:
         ) from error
 
 
-LABELS = ("success", "failure")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RetentionPolicy:
-    """What may go. Without a limit nothing does."""
-
-    quota_mb: float | None = None
-    """The run's episodes may take this much [MB]; the oldest go first."""
-    older_than_days: float | None = None
-    """Episodes that began longer ago than this [days]."""
-    larger_than_mb: float | None = None
-    """Only episodes larger than this [MB]; with --older-than-days both must hold."""
-    outcome: tuple[str, ...] = LABELS
-    """Only episodes with one of these labels: success, failure."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be asked.
-
-        Raises:
-            UsageError: For labels that are none.
-        """
-        names = ("quota_mb", "older_than_days", "larger_than_mb")
-        refuse_outside(self, dict.fromkeys(names, (0, float("inf"))))
-        unknown = [name for name in self.outcome if name not in LABELS]
-        if unknown:
-            raise UsageError(
-                f"--outcome {unknown[0]!r}: only episodes labelled {' or '.join(LABELS)} can go."
-            )
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether it says of nothing that it may go."""
-        limits = (self.quota_mb, self.older_than_days, self.larger_than_mb)
-        return all(limit is None for limit in limits)
-
-
 FILE_NAME = "catalogue.sqlite"
-VERSION = 4
+VERSION = 5
 """Raise it whenever a column, or the way one is read from an episode, changes."""
 BUSY_S = 5.0
 

@@ -7,9 +7,6 @@ recovered, leaves a whole file (``exit_code`` 3). Files of other programs are he
 only; our contract is asked of ours.
 """
 
-import shutil
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -36,38 +33,7 @@ from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
 from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import LIBRARY
-from bridge.errors import BridgeError, MissingDependencyError, UsageError
-
-TIMEOUT_S = 3600
-
-
-def rerun_faults(path: Path) -> list[str]:
-    """Run ``rerun mcap check --full`` on a file and return what it objects to.
-
-    Raises:
-        MissingDependencyError: When Rerun is not installed.
-    """
-    beside = Path(sys.executable).with_name("rerun")
-    command = str(beside) if beside.is_file() else shutil.which("rerun")
-    if command is None:
-        raise MissingDependencyError(
-            package="rerun-sdk", extra="dashboard", purpose="the second opinion of --rerun"
-        )
-    try:
-        done = subprocess.run(
-            [command, "mcap", "check", "--full", str(path)],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return [f"{path.name}: rerun mcap check did not end within {TIMEOUT_S} s"]
-    if done.returncode == 0:
-        return []
-    said = (done.stderr.strip() or done.stdout.strip()).splitlines()
-    return [f"{path.name}: rerun mcap check says: {said[-1] if said else 'nothing'}"]
+from bridge.errors import BridgeError, UsageError
 
 
 @dataclass(kw_only=True)
@@ -156,18 +122,12 @@ class CheckReport:
         }
 
 
-def check_episode(
-    path: Path, *, rerun: bool = False, contract: Contract | None = None
-) -> CheckReport:
+def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
     """Read every byte of an episode and of its parts, and decode every type this project knows.
 
     Args:
         path: The episode; the parts behind it are found.
-        rerun: Let Rerun's own checker read each file too.
         contract: Judge by this one; None takes the one the episode was recorded under.
-
-    Raises:
-        MissingDependencyError: When ``rerun`` is asked for and not installed.
     """
     report = CheckReport(path=path)
     faults = Faults()
@@ -179,9 +139,6 @@ def check_episode(
     for part in report.parts:
         if episode is not None:
             watch.read(FileCheck(part, faults))
-        if rerun:
-            for text in rerun_faults(part):
-                faults.add(text)
     if episode is not None:
         _check_parts(report, episode, faults)
         _check_metadata(episode, faults)
@@ -205,23 +162,17 @@ def learn_from(path: Path) -> Contract:
     return learn_contract(report.presences, cell=Episode.open(path).info.cell)
 
 
-def check_all(
-    paths: Iterable[Path], *, rerun: bool = False, contract: Contract | None = None
-) -> Iterator[CheckReport]:
+def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Iterator[CheckReport]:
     """Check every episode among some files; a later part goes with the first of its episode.
 
     Args:
         paths: Files, in any order.
-        rerun: Let Rerun's own checker read each file too.
         contract: Judge by this one; None takes the one each episode was recorded under.
-
-    Raises:
-        MissingDependencyError: When ``rerun`` is asked for and not installed.
     """
     done: set[Path] = set()
     for path in sorted(paths, key=_by_part):
         if path not in done:
-            report = check_episode(path, rerun=rerun, contract=contract)
+            report = check_episode(path, contract=contract)
             done.update(report.parts)
             yield report
 

@@ -69,7 +69,7 @@ class Decoder:
         if known is None or encoding not in ("", known.message_encoding):
             return
         if type_of_topic(topic) is None and type_name in DEFINITIONS:
-            codec.validate(type_name, data)
+            codec.decode(type_name, data)
             return
         try:
             self._decode_contract(topic, type_name, data)
@@ -86,7 +86,7 @@ class Decoder:
                 )
                 raise codec.MalformedMessageError(type_name=type_name, found=found)
         elif type_name == schema.IMAGE:
-            codec.validate(type_name, data)
+            codec.decode(type_name, data)
         elif type_name == schema.CAMERA_INFO:
             camera = CameraInfo.from_cdr(data).camera
             self._info_sizes[topic] = (camera.width, camera.height)
@@ -95,7 +95,7 @@ class Decoder:
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in DEFINITIONS:
-            codec.validate(type_name, data)
+            codec.decode(type_name, data)
 
     def _add_losses(self, record: dict[str, Any]) -> None:
         self.has_drop_log = True

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.data_section import DataSection, EncodedChunk
@@ -44,12 +43,6 @@ class _Small:
     """When its first message came."""
     closed_s: float
     is_in_journal: bool = False
-
-
-class _Waiting(NamedTuple):
-    chunk: EncodedChunk
-    since_s: float | None
-    """Of small messages: when the first one came."""
 
 
 def _size(chunk: EncodedChunk) -> int:
@@ -89,8 +82,6 @@ class ChunkQueue:
         self._began_at = 0
         """Where the write under way begins in the file."""
         self._is_ending = False
-        self._is_left = False
-        """Another disk has everything that waits here, the write under way included."""
         self._changed = threading.Condition()
         self.small_bytes = 0
         self.bulk_bytes = 0
@@ -235,24 +226,12 @@ class ChunkQueue:
             with self._changed:
                 self._busy_since_s = None
                 self._error, self._is_held = error, error is not None
-                if self._is_left:
-                    break
                 if error is None:
                     self._forget(len(chunks), is_small=bool(small))
                     self._batch_bytes = BATCH_BYTES
                 else:
                     self._batch_bytes = 0  # what does not fit together may fit alone
                 self._changed.notify_all()
-        if self._is_left:
-            self._tidy_up()
-
-    def _tidy_up(self) -> None:
-        """The disk that hung answers again: drop what another one has, and let the file go."""
-        with contextlib.suppress(OSError):
-            self._section.file.truncate(self._began_at, 0)
-        self._section.file.close()
-        self._journal.close()
-        self._journal.remove()
 
     def _batch(self) -> list[EncodedChunk]:
         chunks: list[EncodedChunk] = []
@@ -287,31 +266,6 @@ class ChunkQueue:
             with self._changed:
                 for small in waiting:
                     small.is_in_journal = True
-
-    def give_up(self) -> "list[_Waiting]":
-        """End, and return what is in no file yet, for another disk."""
-        self.end()
-        waiting = [_Waiting(small.chunk, small.since_s) for small in self._small]
-        return waiting + [_Waiting(chunk, None) for chunk in self._bulk]
-
-    def leave(self) -> "list[_Waiting]":
-        """Return what waits and what is being written, for another disk; waits for nobody.
-
-        The thread stays with the file. When its disk answers, it takes back the write under way.
-        """
-        with self._changed:
-            self._is_ending = self._is_left = True
-            if self._busy_since_s is None:
-                self._began_at = self._section.file.offset
-            waiting = [_Waiting(small.chunk, small.since_s) for small in self._small]
-            waiting += [_Waiting(chunk, None) for chunk in self._bulk]
-            self._changed.notify_all()
-        return waiting
-
-    def add_all(self, waiting: "list[_Waiting]") -> None:
-        """Take what another queue gave up."""
-        for each in waiting:
-            self.add(each.chunk, is_small=each.since_s is not None, since_s=each.since_s or 0.0)
 
     def end(self) -> None:
         """End the threads after the write under way; what still waits is given up."""

@@ -471,16 +471,6 @@ class CorrectedEpisode(Episode):
             else:
                 yield message
 
-    def payloads(self, *groups: Iterable[str]) -> list[list[bytes]]:
-        """Return the bytes of all messages of each group of topics, in log order."""
-        wanted = [frozenset(topics) for topics in groups]
-        found: list[list[bytes]] = [[] for _ in wanted]
-        for message in self.messages(frozenset[str]().union(*wanted)):
-            for topics, payloads in zip(wanted, found, strict=True):
-                if message.topic in topics:
-                    payloads.append(message.data)
-        return found
-
 
 def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
     """Open an episode as ``Episode.open`` does, with the clock a person asked for.

@@ -7,7 +7,7 @@ or a finished one is there, and it can be run again.
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +15,15 @@ from pathlib import Path
 from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.chunk_queue import JOURNAL, journal_path
 from bridge.episode.mcap.damaged import RecordFile, finished_data
-from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
-from bridge.episode.mcap.walk import DAMAGE
 from bridge.episode.recovery_report import (
     RECORD_NAME,
     RecoveryReport,
     RecoveryTally,
     to_metadata,
 )
-from bridge.episode.run_folder import PART, SUFFIX, RunFolder, first_part_name
+from bridge.episode.run_folder import PART, SUFFIX, RunFolder
 from bridge.episode.salvage import (
     CopyTarget,
     InPlaceTarget,
@@ -128,59 +126,6 @@ def recover_parts(run: RunFolder) -> list[RecoveryReport]:
         if journal.with_suffix("").exists():  # killed between the last two steps of an end
             journal.unlink(missing_ok=True)
     return reports
-
-
-def join_failovers(folders: Iterable[Path]) -> list[Path]:
-    """Bring the halves of episodes together that a failing disk divided.
-
-    Args:
-        folders: Run folders: that of the failed disk, and those that took over.
-
-    Returns:
-        The parts that were moved beside the parts before them, where they are now.
-
-    Raises:
-        RecoveryError: When one cannot be moved.
-    """
-    homes = [found for folder in folders if (found := folder / "episodes").is_dir()]
-    moved = []
-    for path in [each for home in homes for each in sorted(home.glob(f"*{SUFFIX}"))]:
-        if "failover" not in _metadata_names(path):
-            continue
-        first = first_part_name(path)
-        home = next((h for h in homes if h != path.parent and (h / first).is_file()), None)
-        if home is None or (home / path.name).exists():
-            continue
-        try:
-            _move(path, home / path.name)
-        except OSError as error:
-            raise RecoveryError(
-                f"{path} cannot be moved to {home}: {error.strerror}. Copy both folders to a disk "
-                "that works, then recover them there."
-            ) from error
-        moved.append(home / path.name)
-    return moved
-
-
-def _metadata_names(path: Path) -> set[str]:
-    try:
-        return {record.name for record in McapFile(path).metadata}
-    except (OSError, *DAMAGE):
-        return set()
-
-
-def _move(path: Path, target: Path) -> None:
-    """Move a file to another disk: its name appears when every byte is there."""
-    part = target.with_name(target.name + TEMPORARY)
-    try:
-        shutil.copyfile(path, part)
-        with part.open("rb") as stream:
-            os.fsync(stream.fileno())
-        part.rename(target)
-    finally:
-        part.unlink(missing_ok=True)
-    sync_folder(target.parent)
-    path.unlink()
 
 
 def _set_aside(path: Path) -> None:

@@ -38,11 +38,6 @@ def part_name(episode_id: str, index: int) -> str:
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
 
 
-def first_part_name(path: Path) -> str:
-    """Return the name of the file that the episode of this one begins with."""
-    return part_name(_part_of(path.name)[0], 1)
-
-
 def _part_of(name: str) -> tuple[str, int]:
     """Return the episode a file name belongs to, and its number; another program's is whole."""
     found = _LATER_PART.fullmatch(name)

@@ -72,12 +72,6 @@ class Channels:
         self._channels: dict[tuple[str, str, int, About], Channel] = {}
         self._known: dict[tuple[str, int, str, About], tuple[Channel, schema.Schema | None]] = {}
 
-    def move_to(self, summary: Summary) -> None:
-        """Tell another summary from now on, and at once what there is already."""
-        summary.schemas.update(self._summary.schemas)
-        summary.channels.update(self._summary.channels)
-        self._summary = summary
-
     def find(
         self,
         topic: str,
@@ -510,48 +504,6 @@ class EpisodeWriter:
         self.wait_for_disk()
         self._file.restore()
         return True
-
-    def continue_in(self, path: Path, *, is_hanging: bool = False) -> "EpisodeWriter":
-        """Go on in another file, with everything that this one's disk has not taken.
-
-        This writer ends; its ``.part`` file stays for recovery.
-
-        Args:
-            path: The other file.
-            is_hanging: This one's disk does not answer: do not wait for it, not even for the write
-                under way, which goes along.
-
-        Raises:
-            UsageError: When that episode exists.
-            BridgeError: When the other folder cannot be written; this writer is as it was.
-        """
-        other = EpisodeWriter(path, config=self.config, monotonic=self._monotonic)
-        try:
-            other._take_over(self._channels)
-        except OSError as error:
-            other.discard()
-            raise cannot_write(other.part_path, error) from error
-        other._small, other._groups = self._small, self._groups
-        if is_hanging and self._queue is not None and other._queue is not None:
-            other._queue.add_all(self._queue.leave())
-            self._open = False
-            if self._sync is not None:
-                self._sync.stop(wait=False)
-            return other
-        if self._queue is not None and other._queue is not None:
-            other._queue.add_all(self._queue.give_up())
-            self._queue.remove_journal()  # what it holds goes along
-        self._stop()
-        return other
-
-    def _take_over(self, channels: Channels) -> None:
-        """Use the channels of another writer under their numbers; raises OSError."""
-        channels.move_to(self._section.summary)
-        summary = self._section.summary
-        definitions = [*summary.schemas.values(), *summary.channels.values()]
-        if definitions:
-            self._file.append(definitions)
-        self._channels = channels
 
     def close(self) -> Path:
         """Finish, sync to disk and give the file its final name."""

@@ -48,14 +48,6 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: int = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
-    quota_mb: int = 0
-    """What the run's episodes may take [MB]: beyond it the oldest ones go that are labelled and not
-    flagged; 0: no quota."""
-    failover: Path | None = None
-    """A run folder on another disk, which takes over when this one fails; ``robot-gst recover RUN
-    DIR`` joins the halves."""
-    hang_s: float = 5.0
-    """With --failover: a disk that has been at one write for longer has failed [s]."""
     split_mb: int = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
     split_s: float = 0.0
@@ -67,10 +59,9 @@ class DiskConfig:
 
     def __post_init__(self) -> None:
         """Refuse negative sizes and times."""
-        sizes = ("min_free_mb", "footer_mb", "quota_mb")
+        sizes = ("min_free_mb", "footer_mb", "split_mb", "split_s")
         refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
-        refuse_outside(self, dict.fromkeys(("split_mb", "split_s"), (0, UNBOUNDED)))
-        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s", "hang_s"), (0.01, UNBOUNDED)))
+        refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 
     @property
     def backlog_bytes(self) -> int:
@@ -93,9 +84,6 @@ class RecorderConfig:
     contract: str | None = None
     """What the cell must publish: a TOML file, or a template by name. Without it the run folder's
     ``cell.toml`` holds, if there is one."""
-    triggers: Path | None = None
-    """Rules that record by themselves (TOML); they need --preroll-s. Without it the run folder's
-    ``triggers.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
     jpeg_quality: int = 90
@@ -104,8 +92,6 @@ class RecorderConfig:
     """Raw depth images: keep them (every viewer reads those), or compress without loss (RVL)."""
     msg_folder: Path | None = None
     """Where the .msg files of your own ROS 2 types lie, as PACKAGE/msg/NAME.msg at any depth."""
-    preview_video: bool = False
-    """Add an H.264 video of each raw colour stream, for people; needs the extra [video]."""
     preview_hz: float = 5.0
     """At most this many small pictures a second for whoever watches; 0 makes none [1/s]."""
     preroll_s: float = 0.0

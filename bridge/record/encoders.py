@@ -10,8 +10,6 @@ import traceback
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
 from bridge.episode import schema
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import (
@@ -21,71 +19,11 @@ from bridge.episode.cdr.images import (
     depth_to_compact,
     image_header,
     image_to_jpeg,
-    pixel_rows,
 )
-from bridge.episode.cdr.messages import CompressedColor, video_message
-from bridge.media.color import UnreadableImageError, decode_color
-from bridge.media.video import H264Encoder, VideoEncodingError
 from bridge.record.config import RecorderConfig
 from bridge.record.inspection import GOOD, MessageState, fits, inspect
 from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
 from bridge.wire.session import WireSample
-
-RATE_HZ = 30.0
-"""What the encoder plans with; the true rate may differ."""
-_ORDER = {"BGR": [2, 1, 0], "RGBA": [0, 1, 2], "BGRA": [2, 1, 0], "GRAY": [0, 0, 0]}
-
-
-class VideoStreams:
-    """One encoder for each colour stream; each is used by its stream's thread alone."""
-
-    def __init__(self) -> None:
-        """Check that videos can be made at all.
-
-        Raises:
-            MissingDependencyError: When PyAV is not installed.
-        """
-        H264Encoder(64, 64, RATE_HZ)
-        self._encoders: dict[str, tuple[tuple[int, ...], H264Encoder]] = {}
-
-    def frame(self, sample: WireSample) -> WireSample | None:
-        """Return the video frame that goes with a colour image; None when it cannot be one."""
-        try:
-            pixels, stamp_ns, frame_id = _pixels(sample)
-            size, encoder = self._encoders.get(sample.topic, ((), None))
-            if encoder is None or size != pixels.shape:
-                encoder = H264Encoder(pixels.shape[1], pixels.shape[0], RATE_HZ)
-                self._encoders[sample.topic] = (pixels.shape, encoder)
-            data = encoder.encode(pixels, stamp_ns)
-        except (MalformedMessageError, UnreadableImageError, VideoEncodingError):
-            return None
-        return replace(
-            sample,
-            topic=preview_topic(sample.topic),
-            type_name=schema.COMPRESSED_VIDEO,
-            message_encoding="protobuf",
-            type_hash="",
-            data=video_message(stamp_ns, frame_id, data),
-        )
-
-
-def preview_topic(topic: str) -> str:
-    """Name the video of an image topic: ``.../color/image`` has ``.../color/preview``."""
-    return topic.removesuffix("/image") + "/preview"
-
-
-def _pixels(sample: WireSample) -> tuple[np.ndarray, int, str]:
-    if sample.type_name == schema.COMPRESSED_IMAGE:
-        image = CompressedColor.from_cdr(sample.data)
-        return decode_color(image.data), image.stamp_ns, image.frame_id
-    header = image_header(sample.data)
-    layout, channels = COLOR_LAYOUTS[header.encoding]
-    rows = pixel_rows(sample.data, header, channels)
-    pixels = rows.reshape(header.height, header.width, channels)
-    if layout in _ORDER:
-        pixels = pixels[..., _ORDER[layout]]
-    return pixels, header.stamp_ns, header.frame_id
-
 
 MAX_THREADS = 32
 """Streams beyond this many share the threads of others."""
@@ -98,26 +36,14 @@ class ImageEncoder:
     """Turns raw images into what an episode holds."""
 
     def __init__(self, config: RecorderConfig, shed: Callable[[], LoadShedding]) -> None:
-        """Choose the profile; ``shed`` says how far shedding has gone.
-
-        Raises:
-            MissingDependencyError: When a preview video is wanted and PyAV is not installed.
-        """
+        """Choose the profile; ``shed`` says how far shedding has gone."""
         self._config = config
         self._shed = shed
-        self._video = VideoStreams() if config.preview_video else None
         self.kinds: dict[str, str] = {}
         """color or depth, for each image topic seen."""
 
     def encode(self, item: Item) -> None:
         """Replace the item's message where the profile asks for it; flag what is broken."""
-        original = item.sample
-        self._look_and_transcode(item)
-        is_good_color = item.finding is GOOD and self.kinds.get(original.topic) == "color"
-        if self._video is not None and is_good_color and self._shed() < LoadShedding.PREVIEWS:
-            item.extra = self._video.frame(original)
-
-    def _look_and_transcode(self, item: Item) -> None:
         sample = item.sample
         if item.type_name != schema.IMAGE or sample.message_encoding not in ("", "cdr"):
             item.finding = inspect(item.type_name, sample.message_encoding, sample.data)

@@ -18,7 +18,6 @@ from bridge.record.config import BYTES_PER_MB, DiskConfig
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import TaskFile
 
-FAILOVER_RECORD = "failover"
 """Of the metadata record of a part that lies on another disk than the parts before."""
 
 
@@ -125,31 +124,6 @@ class EpisodeFiles:
         self._full.append(full)
         self._finisher = threading.Thread(target=self._finish, name="finish part", daemon=True)
         self._finisher.start()
-
-    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
-        """Go on in another folder, with all that the disk has not taken.
-
-        Args:
-            folder: Where episodes lie on the other disk.
-            cause: What the disk said.
-            is_hanging: It says nothing, and is not waited for.
-
-        Raises:
-            UsageError: When the part exists there.
-            BridgeError: When that folder cannot be written either.
-            OSError: The same, a moment later.
-        """
-        before = self.writer
-        path = folder / part_name(self._info.id, self.index + 1)
-        self.writer = before.continue_in(path, is_hanging=is_hanging)
-        self.index += 1
-        self._is_split = True
-        self._paths.append(path)
-        self._say_what_it_is(self.writer)
-        values = {"of": json.dumps(str(before.path)), "cause": json.dumps(cause)}
-        self.writer.add_metadata(FAILOVER_RECORD, values)
-        self._folder = folder
-        return path
 
     def _say_part(self, writer: EpisodeWriter, *, is_last: bool) -> None:
         if self._is_split and writer is not self._said:

@@ -197,8 +197,6 @@ class EpisodeRecording:
         self.outcome: metadata.Outcome | None = None
         self.presence: dict[str, TopicReport] = {}
         """By topic, when it was there; known at the end."""
-        self.failovers: list[dict[str, str]] = []
-        """Where it went on when a disk failed."""
         self.news: list[News] = []
         """What it noticed and a person should hear of."""
         self._jumps = StampJumps()
@@ -238,13 +236,6 @@ class EpisodeRecording:
         """Write the file anew where somebody removed it; raises OSError when that fails."""
         return self._parts.writer.keep_name()
 
-    def fail_over(self, folder: Path, cause: str, *, is_hanging: bool = False) -> Path:
-        """Go on in another folder; see ``EpisodeFiles.fail_over``."""
-        path = self._parts.fail_over(folder, cause, is_hanging=is_hanging)
-        self.failovers.append({"path": str(path), "cause": cause})
-        self.ledger.warn(f"the disk failed ({cause}); the rest is in {path}")
-        return path
-
     @property
     def keeps_up(self) -> bool:
         """Whether little enough waits for the disk to give it more images."""
@@ -282,12 +273,6 @@ class EpisodeRecording:
             self.ledger.count_refused(item)
             raise
         self.ledger.count_received(item, finding)
-
-    def write_beside(self, sample: WireSample) -> None:
-        """Append something the recorder made itself; it is in no account."""
-        channel = self._channels.of(sample, sample.type_name)
-        if channel is not None:
-            self._append(channel, sample, sample.received_ns)
 
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
@@ -449,7 +434,6 @@ class EpisodeRecording:
             "clock_steps_ns": self._clock_steps_ns,
             "paused": paused,
             "parts": self.num_parts,
-            "failovers": self.failovers,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}

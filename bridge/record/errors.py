@@ -88,6 +88,5 @@ class DiskError(BridgeError):
         )
         super().__init__(
             f"cannot write {path}: {cause}. The recorder stopped. {kept}. "
-            "Free some space or choose another disk, then record again; "
-            "--failover DIR lets another disk take over by itself."
+            "Free some space or choose another disk, then record again."
         )

@@ -120,7 +120,7 @@ def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
             return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
-        codec.validate(type_name, data)
+        codec.decode(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     if type_name == schema.COMPRESSED_IMAGE and _is_cut_jpeg(data):

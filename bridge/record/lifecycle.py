@@ -14,7 +14,7 @@ from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
 from bridge.episode.contract import Contract, breaches_of, unknown_tails
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, UsageError
+from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
@@ -195,7 +195,6 @@ class Lifecycle:
         self._queued_bytes = queued_bytes
         self._reserve = DiskReserve(run.episodes_dir, config.disk.footer_mb)
         self._unwritable: set[str] = set()
-        self._has_failed_over = False
 
     @property
     def is_quiet(self) -> bool:
@@ -243,8 +242,6 @@ class Lifecycle:
                 traceback.print_exc()
             take.ledger.count_refused(item)
             return
-        if item.extra is not None:
-            take.write_beside(item.extra)
 
     def tick(self, now_ns: int) -> None:
         """Do what time asks for: flush, close seconds, split. Raises OSError for the disk."""
@@ -266,51 +263,10 @@ class Lifecycle:
             return ""
         return f"{take.part_path} was removed while it was written; it was written there anew"
 
-    def hangs(self) -> str:
-        """Say that the disk does not answer while another one could take over; else ""."""
-        disk, take = self._config.disk, self.take
-        if disk.failover is None or take is None or self._has_failed_over:
-            return ""
-        busy_s = take.disk["busy_s"]
-        return f"the disk has not answered for {busy_s:.1f} s" if busy_s > disk.hang_s else ""
-
     @property
     def may_ask_disk(self) -> bool:
         """Whether the disk answers, so that asking it for names and space holds nobody up."""
         return self.take is None or self.take.disk["busy_s"] < UNANSWERED_S
-
-    def fail_over(self, cause: str, *, is_hanging: bool = False) -> str:
-        """Let another disk take over the open episode and all later ones.
-
-        Args:
-            cause: What the disk said.
-            is_hanging: It says nothing, and is not waited for.
-
-        Returns:
-            What happened, in words; "" when there is no other disk, or it fails as well.
-        """
-        folder = self._config.disk.failover
-        if folder is None or self.take is None or self.is_finishing or self._has_failed_over:
-            return ""
-        self._has_failed_over = True
-        before = self.take.part_path
-        try:
-            run = RunFolder.create(folder)
-            path = self.take.fail_over(run.episodes_dir, cause, is_hanging=is_hanging)
-        except (GstError, OSError):
-            return ""
-        self._run = run
-        if not is_hanging:  # closing a file there would hang as well
-            self._reserve.release()
-        self._reserve = DiskReserve(run.episodes_dir, self._config.disk.footer_mb)
-        with contextlib.suppress(NoSpaceError):  # then there is none to hold back
-            self._reserve.hold()
-        return f"cannot write {before}: {cause}. The recording goes on in {path}"
-
-    @property
-    def run(self) -> RunFolder:
-        """Where episodes go now."""
-        return self._run
 
     def look_at_disk(self) -> str:
         """Return why the open episode must end now, or ""."""
@@ -554,7 +510,6 @@ def counts(take: EpisodeRecording) -> Answer:
         "unknown_type": total.unknown_type,
         "shed": total.shed,
         "parts": take.num_parts,
-        "failovers": take.failovers,
         "unnumbered": take.ledger.unnumbered(),
         "breaches": breaches_of(take.presence),
         "unknown_tails": unknown_tails(take.presence),

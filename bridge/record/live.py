@@ -1,12 +1,4 @@
-"""A recorder on the wire: session, recorder, control keys, status, previews; from Python too.
-
-from bridge.record.live import open_recorder
-
-with open_recorder(Path("runs/monday")) as recorder:
-    recorder.start("trial_0001", task="cube_into_box", operator="ada")
-    recorder.mark("gripper closed")
-    print(recorder.stop(result="success"))
-"""
+"""A recorder on the wire: session, recorder, control keys, status, previews."""
 
 import contextlib
 import fcntl
@@ -14,7 +6,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,30 +17,27 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.contract import find_contract
-from bridge.episode.metadata import Outcome
 from bridge.episode.recover import recover_parts
 from bridge.episode.recovery_report import RecoveryReport
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import COLOR_TOPIC
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.record.clocks import ClockAsker
-from bridge.record.config import EpisodeAbout, RecorderConfig
-from bridge.record.control import parse_info, parse_outcome, serve_control
+from bridge.record.config import RecorderConfig
+from bridge.record.control import serve_control
 from bridge.record.errors import FolderTakenError
 from bridge.record.presence import Heartbeat, PresenceMonitor
 from bridge.record.queue import LoadShedding
 from bridge.record.recorder import Recorder
 from bridge.record.ros2 import watch_ros2
-from bridge.record.triggers import TriggerError, Triggers, find_triggers
 from bridge.task.task_file import TaskFile
 from bridge.wire import rmw
 from bridge.wire.clocks import ALIVE
-from bridge.wire.config import DEFAULT_ENDPOINT, WireConfig
 from bridge.wire.errors import WireError
 from bridge.wire.publisher import WirePublisher
 from bridge.wire.qos import Qos
 from bridge.wire.rmw import read_definitions
-from bridge.wire.session import Subscriber, WireSample, WireSession, open_session
+from bridge.wire.session import Subscriber, WireSample, WireSession
 
 WIDTH = 320
 QUALITY = 70
@@ -207,12 +196,11 @@ class PublisherLiveliness:
 
 STATUS_PERIOD_S = 1.0
 CONTROL_PREFIX = "/rec/"
-HOST = WireConfig(mode="router", connect=(), listen=(DEFAULT_ENDPOINT,))
 """The recorder is where everybody else connects."""
 
 
 class LiveRecorder:
-    """A recorder that others can see and control; use ``open_recorder``."""
+    """A recorder that others can see and control; ``core`` does the recording."""
 
     def __init__(
         self,
@@ -221,7 +209,6 @@ class LiveRecorder:
         config: RecorderConfig,
         say: Callable[[str], None],
         task: TaskFile | None = None,
-        about: EpisodeAbout | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
 
@@ -231,7 +218,6 @@ class LiveRecorder:
             config: Settings.
             say: Told what a person should know.
             task: The task file of episodes that name this task or none.
-            about: What episodes are that triggers record.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
@@ -240,9 +226,6 @@ class LiveRecorder:
         if config.msg_folder is not None:  # complain now, not at the first message
             read_definitions(config.msg_folder)
         find_contract(run.path, config.contract)  # the same
-        rules = find_triggers(run.path, config.triggers)
-        if rules and not config.preroll_s:
-            raise TriggerError("triggers need the seconds before: add --preroll-s 5.")
         self.run = run
         self._folder_lock = _lock_folder(run, shared=config.shares_folder)
         self._recorder = config.recorder
@@ -260,7 +243,6 @@ class LiveRecorder:
         self._previews = previews
         self._ended = threading.Event()
         session.collect_definitions()
-        self._triggers = Triggers(core, rules, about or EpisodeAbout(), say) if rules else None
         self._subscribers = [
             session.subscribe(key, self._take, max_bytes=config.queues.max_message_bytes)
             for key in config.topics
@@ -274,9 +256,6 @@ class LiveRecorder:
         self._links = session.watch_links(self._on_link)
         self._heartbeat = Heartbeat(session, config.recorder, core.presence, say)
         self._clocks = ClockAsker(session, core.clocks)
-        if self._triggers is not None:
-            core.also_tell("triggers", self._triggers.status)
-            self._triggers.begin()
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
@@ -291,8 +270,6 @@ class LiveRecorder:
     def _take(self, sample: WireSample) -> None:
         if not sample.topic.startswith(CONTROL_PREFIX):
             self.core.receive(sample)
-            if self._triggers is not None:
-                self._triggers.receive(sample)
 
     def _on_link(self, is_open: bool) -> None:
         if not is_open:
@@ -329,72 +306,12 @@ class LiveRecorder:
             data = json.dumps({**about, **entry}).encode()
             self._episodes.put(data, source_ns=self.session.now_ns())
 
-    def start(self, episode_id: str, *, anyway: bool = False, **about: Any) -> dict[str, Any]:
-        """Begin an episode.
-
-        Args:
-            episode_id: Its name.
-            anyway: Warn of topics that are required and missing, instead of refusing.
-            about: Fields of ``EpisodeInfo``: task, operator, tags ...
-
-        Raises:
-            UsageError: When the id or a field is wrong, or another episode is open.
-            BridgeError: When the disk has no space.
-        """
-        return self.core.start(parse_info(episode_id, about), anyway=anyway)
-
-    def stop(
-        self, *, result: str | None = None, detail: str | None = None, discard: bool = False
-    ) -> dict[str, Any]:
-        """Finish the episode; ``result`` is success, failure or unknown.
-
-        Args:
-            result: ``success``, ``failure`` or ``unknown``; None leaves it as it was labelled.
-            detail: Why, in a few words; None for none.
-            discard: Throw the episode away.
-        """
-        return self.core.stop(outcome=_outcome(result, detail), discard=discard)
-
-    def mark(self, text: str = "") -> dict[str, Any]:
-        """Note this instant."""
-        return self.core.mark(text)
-
-    def label(
-        self, result: str, *, detail: str | None = None, episode: str | None = None
-    ) -> dict[str, Any]:
-        """Say how the open episode went, or a finished one by its id.
-
-        Args:
-            result: ``success``, ``failure`` or ``unknown``.
-            detail: Why, in a few words; None for none.
-            episode: Id of a finished episode; None: the open one, else the last.
-        """
-        return self.core.label(outcome=_outcome(result, detail), episode=episode)
-
-    def pause(self) -> dict[str, Any]:
-        """Leave messages out until ``resume``."""
-        return self.core.pause()
-
-    def resume(self) -> dict[str, Any]:
-        """Record again."""
-        return self.core.resume()
-
-    def snapshot(self, episode_id: str, **about: Any) -> dict[str, Any]:
-        """Write the pre-roll as an episode."""
-        return self.core.snapshot(parse_info(episode_id, about))
-
-    def status(self) -> dict[str, Any]:
-        """What is going on."""
-        return self.core.status()
-
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""
         self._ended.set()
         self.core.news_arrived.set()
         self._heartbeat.close()
         self._clocks.close()
-        if self._triggers is not None:
-            self._triggers.close()
         if self.core.error is not None:  # whoever listens hears why, before the next second
             with contextlib.suppress(WireError):
                 self._say_status()
@@ -412,38 +329,6 @@ class LiveRecorder:
         finally:
             if self._folder_lock is not None:
                 os.close(self._folder_lock)
-
-
-@contextlib.contextmanager
-def open_recorder(
-    run_path: Path,
-    *,
-    wire: WireConfig = HOST,
-    config: RecorderConfig | None = None,
-    say: Callable[[str], None] = lambda text: None,
-) -> Iterator[LiveRecorder]:
-    """Record whatever is published, until the block ends; an open episode is then finished.
-
-    Args:
-        run_path: The run folder; made where needed.
-        wire: Where to listen or connect.
-        config: The recorder's settings.
-        say: Called with remarks for people, such as what was recovered.
-
-    Raises:
-        DiskError: At the end of the block, when the disk ended the recording.
-        WireError: When the port is taken, or the configuration cannot be used.
-    """
-    with open_session(wire) as session:
-        recorder = LiveRecorder(
-            session, RunFolder.create(run_path), config or RecorderConfig(), say
-        )
-        try:
-            yield recorder
-        finally:
-            recorder.close()
-        if recorder.core.error is not None:
-            raise recorder.core.error
 
 
 def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
@@ -466,13 +351,6 @@ def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
         os.close(descriptor)
         return None
     return descriptor
-
-
-def _outcome(result: str | None, detail: str | None) -> Outcome | None:
-    if result is None:
-        return None
-    success = int(result == "success")
-    return parse_outcome({"result": result, "k": success, "n": 1, "detail": detail})
 
 
 def _describe_recovery(report: RecoveryReport) -> str:

@@ -276,11 +276,6 @@ class PresenceMonitor:
                 if self._is_silent(name, topic)
             ]
 
-    def quiet(self) -> dict[str, float]:
-        """How long each topic has been silent, as far as the recorder could hear it [s]."""
-        with self._lock:
-            return {name: topic.quiet_s for name, topic in self._topics.items()}
-
     def missing(self, contract: Contract | None) -> list[str]:
         """Sentences on the topics that a contract requires and that are not there now."""
         seen = self._seen()

@@ -160,7 +160,7 @@ def run_recorder(
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)
-        recorder = LiveRecorder(session, run, config, output.say, task, about)
+        recorder = LiveRecorder(session, run, config, output.say, task)
         _say_where(output, wire, config.recorder, run)
         try:
             if episode is not None and not _start(recorder.core, episode, stop, output, anyway):

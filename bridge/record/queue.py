@@ -175,8 +175,6 @@ class Item:
     """None when nobody has looked yet."""
     reduced: bool = False
     """Of less than the wanted quality."""
-    extra: WireSample | None = None
-    """Made here of this message, and written behind it; in no account."""
     for_preview: bool = False
     """Nobody records; only a preview is made of it."""
     image_encoding: str = ""

@@ -18,7 +18,6 @@ from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, list_episodes, note_finished
 from bridge.episode.contract import find_contract
-from bridge.episode.retention import keep_quota
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
 from bridge.record.clocks import ClockBook
@@ -266,8 +265,6 @@ class Recorder:
         path = self._run.episodes_dir / part_name(episode_id, 1)
         note_finished(self._run, path)
         self._tell(path)
-        if quota_mb := self.config.disk.quota_mb:
-            keep_quota(self._run, float(quota_mb), now_ns=self._now_ns(), say=self._say)
 
     def _say(self, text: str) -> None:
         self.news.append(text)
@@ -412,7 +409,7 @@ class Recorder:
             except GstError as error:
                 future.set_exception(error)
             except OSError as error:
-                self._answer_failed(future, error, lambda: act(command))
+                future.set_exception(self._fail(error))
             except Exception as error:  # noqa: BLE001  # a bug: tell the caller, keep recording
                 future.set_exception(error)
 
@@ -445,21 +442,6 @@ class Recorder:
                 self._life.end()
                 return
 
-    def _answer_failed(
-        self, future: "Future[Answer]", error: OSError, again: Callable[[], Answer]
-    ) -> None:
-        """Answer a command that the disk refused: by another disk, or with the error."""
-        failure = self._fail(error)
-        if failure is not None:
-            future.set_exception(failure)
-            return
-        try:
-            future.set_result(again())
-        except GstError as refusal:
-            future.set_exception(refusal)
-        except OSError as second:
-            future.set_exception(self._fail(second) or second)
-
     def _drain(self) -> None:
         for entry in self._merge.ready():
             self._status.beat()
@@ -488,8 +470,6 @@ class Recorder:
     def _tick(self) -> None:
         now_ns, now_s = self._now_ns(), time.monotonic()
         self._status.beat()
-        if cause := self._life.hangs():
-            self._take_over(cause, is_hanging=True)
         self._life.tick(now_ns)
         if now_s >= self._next_second_s:
             self._next_second_s = now_s + SECOND_S
@@ -505,7 +485,7 @@ class Recorder:
             if happened := self._life.look_at_file():
                 self.note(News(text=happened, data={"kind": "file_removed"}))
             cause = self._life.look_at_disk()
-            if cause and not self._status.failing and not self._take_over(cause):
+            if cause and not self._status.failing:
                 self._end_because(cause)
 
     def _end_because(self, cause: str) -> None:
@@ -518,22 +498,11 @@ class Recorder:
         self._status.failing = cause
         self.input_queue.put_command(Command(action=act, received_ns=self._now_ns()))
 
-    def _take_over(self, cause: str, *, is_hanging: bool = False) -> bool:
-        """Let another disk take over, if there is one."""
-        happened = self._life.fail_over(cause, is_hanging=is_hanging)
-        if not happened:
-            return False
-        self._run = self._life.run
-        self.note(News(text=happened, data={"kind": "failover"}))
-        return True
-
-    def _fail(self, error: OSError) -> DiskError | None:
-        """End the recording; None when another disk has taken over."""
+    def _fail(self, error: OSError) -> DiskError:
+        """End the recording."""
         cause = cause_of(error)
         if self._life.error is not None:
             return self._life.error
-        if self._take_over(cause):
-            return None
         self._status.failing = f"cannot write: {cause}. Finishing what there is."
         self._encoders.is_passing = True
         failure = self._life.fail(cause, self._now_ns(), self._rest)

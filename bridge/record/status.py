@@ -166,7 +166,6 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
-        line += "".join(f"; goes on in {each['path']}" for each in answer["failovers"])
         return "\n  ".join([line, *presence_lines(answer)])
     remark = f"; {text}" if (text := answer.get("task_remark")) else ""
     if answer.get("missing"):

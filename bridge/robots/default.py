@@ -14,5 +14,4 @@ ARM_JOINTS = ROBOT.joints
 FINGER_JOINTS = tuple(finger.joint for finger in ROBOT.gripper.fingers)
 FINGER_LINKS = ROBOT.gripper.finger_links
 GRIPPER = ROBOT.gripper.name
-GRIPPER_LINKS = ROBOT.gripper.links
 MAX_WIDTH_M = ROBOT.gripper.max_width_m

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
+from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
 from serving import serving
 
@@ -18,7 +19,6 @@ from bridge.episode.metadata import Outcome
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.record.live import LiveRecorder, open_recorder
 from bridge.task.find import chosen_task_file
 from bridge.task.protocol import Endpoint, PolicyArms, Protocol, StudyTask
 from bridge.wire.config import WireConfig

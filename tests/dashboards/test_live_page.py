@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, chromium
+from live_recorder import open_recorder
 from loopback import free_endpoint
 from serving import dashboard
 from test_review_index import HOSTILE
@@ -20,7 +21,6 @@ from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.run_folder import RunFolder
 from bridge.media.color import encode_jpeg
-from bridge.record.live import open_recorder
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
 from dashboards import live_page

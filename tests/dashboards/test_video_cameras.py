@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from video_messages import video_message
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import video_message
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import decode_color

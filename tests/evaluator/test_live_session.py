@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
 
 from bridge.episode import schema
 from bridge.episode.catalogue import Entry, label_episode
 from bridge.episode.metadata import Outcome
 from bridge.episode.run_folder import RunFolder
-from bridge.record.live import LiveRecorder, open_recorder
 from bridge.task.record import check_record
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig

@@ -73,20 +73,11 @@ def recover_target(data: bytes) -> None:
 
 
 def cdr_target(data: bytes) -> None:
-    """Decode a message of some type; a look must accept exactly what decoding reads."""
+    """Decode a message of some type; what does not fit is one error."""
     if not data:
         return
-    name, raw = TYPES[data[0] % len(TYPES)], data[1:]
-    good = []
-    for function in (codec.decode, codec.validate):
-        try:
-            function(name, raw)
-            good.append(True)
-        except codec.MalformedMessageError:
-            good.append(False)
-    if good[0] != good[1]:
-        message = f"{name}: decode and validate disagree on {raw.hex()}"
-        raise AssertionError(message)
+    with contextlib.suppress(codec.MalformedMessageError):
+        codec.decode(TYPES[data[0] % len(TYPES)], data[1:])
 
 
 def attachment_target(data: bytes) -> None:

@@ -1,7 +1,7 @@
 """Our CDR and schema texts against rosbags, an independent implementation."""
 
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -142,7 +142,7 @@ def same(ours: object, theirs: object) -> bool:
         return all(same(value, getattr(theirs, key)) for key, value in ours.items())
     if isinstance(ours, list):
         return len(ours) == len(theirs) and all(map(same, ours, theirs))
-    if isinstance(ours, bytes):
+    if isinstance(ours, memoryview):
         return ours == theirs.tobytes()
     if isinstance(ours, np.ndarray):
         return np.array_equal(ours, theirs)
@@ -159,34 +159,15 @@ def test_random_messages_of_rosbags_are_read_in_both_byte_orders(
     raw = bytes(STORE.serialize_cdr(to_rosbags(name, message), name, little_endian=little_endian))
     decoded = codec.decode(name, raw)
     assert same(decoded, STORE.deserialize_cdr(raw, name))
-    codec.validate(name, raw)
     if little_endian:
         assert codec.encode(name, message) == raw
         assert same(codec.decode(name, memoryview(raw)), STORE.deserialize_cdr(raw, name))
 
 
-@settings(max_examples=300, deadline=None)
-@given(st.data(), st.sampled_from(sorted(DEFINITIONS)))
-def test_a_look_accepts_exactly_what_decoding_reads(data: st.DataObject, name: str) -> None:
-    raw = bytearray(codec.encode(name, data.draw(messages_of(name))))
-    for _ in range(data.draw(st.integers(0, 3))):
-        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
-    del raw[data.draw(st.integers(0, len(raw))) :]
-
-    def refused(function: Callable[[str, bytes], object]) -> bool:
-        try:
-            function(name, bytes(raw))
-        except codec.MalformedMessageError:
-            return True
-        return False
-
-    assert refused(codec.decode) == refused(codec.validate)
-
-
 def test_a_look_at_a_large_image_copies_nothing() -> None:
     data = codec.encode("sensor_msgs/msg/Image", {"encoding": "16UC1", "data": bytes(50_000_000)})
     tracemalloc.start()
-    codec.validate("sensor_msgs/msg/Image", data)
+    codec.decode("sensor_msgs/msg/Image", data)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 100_000

@@ -2,15 +2,17 @@
 
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from video_messages import video_message
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
-from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame, video_message
+from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.depth import RVL_FORMAT, unpack
 
@@ -34,16 +36,20 @@ def color(index: int) -> bytes:
 
 
 def write(path: Path) -> None:
-    pytest.importorskip("av")
-    from bridge.media.video import H264Encoder
-
-    encoder = H264Encoder(32, 24, 30.0)
+    av = pytest.importorskip("av")
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = 32, 24, "yuv420p"
+    encoder.time_base = Fraction(1, 30)
+    encoder.options = {"tune": "zerolatency", "bf": "0", "x264-params": "annexb=1:repeat-headers=1"}
     with EpisodeWriter(path) as writer:
         for index in range(COUNT):
             stamp_ns = START_NS + index * 33_333_333
             raw = DepthImage(stamp_ns=stamp_ns, frame_id="camera", depth_mm=depth(index)).to_cdr()
             image = np.zeros((24, 32, 3), dtype=np.uint8)
-            video = video_message(stamp_ns, "camera", encoder.encode(image, stamp_ns))
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts = index
+            (packet,) = encoder.encode(picture)
+            video = video_message(stamp_ns, "camera", bytes(packet))
             for topic, data, name in (
                 ("/c/cam/raw/depth/image", raw, schema.IMAGE),
                 ("/c/cam/compact/depth/image", depth_to_compact(raw), schema.COMPRESSED_IMAGE),

@@ -1,6 +1,7 @@
 """ROS 2 CDR (XCDR1; written little endian, read in both orders) of ``ros2_definitions``.
 
-Messages are plain dicts. ``uint8[]`` is bytes; numeric arrays are NumPy arrays; times are dicts.
+Messages are plain dicts. ``uint8[]`` is a memoryview; numeric arrays are NumPy arrays; times are
+dicts.
 Layout: OMG DDS-XTypes 1.3, section 7.4.3: every primitive is aligned to its size, counted from
 the end of the 4-byte encapsulation header.
 """
@@ -42,8 +43,6 @@ Buffer = bytes | bytearray | memoryview
 Message = dict[str, Any]
 ReadPart = Callable[[Buffer, int, Message], int]
 """Reads one part of a message from a position into the dict; returns the position behind it."""
-SkipPart = Callable[[Buffer, int], int]
-"""Walks over one part; returns the position behind it."""
 Shape = tuple[tuple[str, Any], ...]
 """Names of a run of fixed-size fields; a nested message has a shape of its own, others None."""
 
@@ -80,18 +79,6 @@ def reader_of(type_name: str, order: str) -> tuple[ReadPart, ...]:
             parts.append(_read_run(*run, order))
         if field is not None:
             parts.append(_read_field(field, order))
-    return tuple(parts)
-
-
-@cache
-def walker_of(type_name: str, order: str) -> tuple[SkipPart, ...]:
-    """Return the functions that walk over a message of this type and copy no payload."""
-    parts: list[SkipPart] = []
-    for run, field in _runs(type_name):
-        if run is not None:
-            parts.append(_skip_run(run[1], order))
-        if field is not None:
-            parts.append(_skip_field(field, order))
     return tuple(parts)
 
 
@@ -167,19 +154,6 @@ def _nest(shape: Shape, values: Iterator[Any], out: Message) -> None:
             nested: Message = {}
             out[name] = nested
             _nest(inner, values, nested)
-
-
-def _skip_run(codes: str, order: str) -> SkipPart:
-    sizes = tuple(layout.size for layout in _layouts(codes, order))
-
-    def skip(data: Buffer, at: int) -> int:
-        end = at + sizes[at & 7]
-        if end > len(data):
-            message = f"{len(data)} bytes end in the middle of a field"
-            raise ValueError(message)
-        return end
-
-    return skip
 
 
 def _counter(order: str, *, item_bytes: int = 1) -> Callable[[Buffer, int], tuple[int, int]]:
@@ -268,7 +242,7 @@ def _read_array(field: Field, order: str) -> ReadPart:
 
     def read_bytes(data: Buffer, at: int, out: Message) -> int:
         at, length = extent(data, at)
-        out[name] = bytes(data[at : at + length])
+        out[name] = data[at : at + length]
         return at + length
 
     def read_array(data: Buffer, at: int, out: Message) -> int:
@@ -307,45 +281,6 @@ def _read_sequence(field: Field, order: str) -> ReadPart:
         return at
 
     return read_messages
-
-
-def _skip_field(field: Field, order: str) -> SkipPart:
-    if field.length is not None and field.type_name in PRIMITIVES:
-        extent = _extent(field, order)
-        size = struct.calcsize("<" + PRIMITIVES[field.type_name])
-
-        def skip_array(data: Buffer, at: int) -> int:
-            at, length = extent(data, at)
-            return at + length * size
-
-        return skip_array
-    item = _skip_item(field.type_name, order)
-    if field.length is None:
-        return item
-    fixed = field.length
-    count = _counter(order, item_bytes=_least_bytes(field.type_name))
-
-    def skip_sequence(data: Buffer, at: int) -> int:
-        length, at = (fixed, at) if fixed else count(data, at)
-        for _ in range(length):
-            at = item(data, at)
-        return at
-
-    return skip_sequence
-
-
-def _skip_item(type_name: str, order: str) -> SkipPart:
-    if type_name == "string":
-        text = _text(order)
-        return lambda data, at: text(data, at)[1]
-    parts = walker_of(type_name, order)
-
-    def skip_message(data: Buffer, at: int) -> int:
-        for part in parts:
-            at = part(data, at)
-        return at
-
-    return skip_message
 
 
 @cache
@@ -442,8 +377,8 @@ def _write_value(out: bytearray, type_name: str, value: Any) -> None:
 def decode(type_name: str, data: Buffer) -> Message:
     """Read a message into dicts; bytes behind its last field are passed over.
 
-    Numeric arrays look into ``data``, in its byte order; nothing but ``uint8[]`` is copied. What
-    is made is never larger than a fixed multiple of ``data``, whatever lengths it claims.
+    Arrays look into ``data``, in its byte order, and are not copied. What is made is never larger
+    than a fixed multiple of ``data``, whatever lengths it claims.
 
     Args:
         type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
@@ -455,33 +390,13 @@ def decode(type_name: str, data: Buffer) -> Message:
     """
     order = _byte_order(type_name, data)
     message: Message = {}
-    at = ORIGIN
+    at, view = ORIGIN, memoryview(data)
     try:
         for part in reader_of(type_name, order):
-            at = part(data, at, message)
+            at = part(view, at, message)
     except (struct.error, ValueError) as error:
         raise MalformedMessageError(type_name=type_name, found=str(error)) from error
     return message
-
-
-def validate(type_name: str, data: Buffer) -> None:
-    """Walk over a message without copying its arrays; accepts exactly what ``decode`` reads.
-
-    Args:
-        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-        data: The whole message, its four bytes of encapsulation first.
-
-    Raises:
-        MalformedMessageError: When the bytes do not fit the type.
-        KeyError: When the type is none of ``ros2_definitions``.
-    """
-    order = _byte_order(type_name, data)
-    at = ORIGIN
-    try:
-        for part in walker_of(type_name, order):
-            at = part(data, at)
-    except (struct.error, ValueError) as error:
-        raise MalformedMessageError(type_name=type_name, found=str(error)) from error
 
 
 def _byte_order(type_name: str, data: Buffer) -> str:

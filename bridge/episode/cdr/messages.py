@@ -25,7 +25,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media import depth
 from bridge.media.color import decode_color
-from bridge.media.video import VIDEO_FORMAT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,26 +104,6 @@ def _stamp(data: bytes) -> int:
     return join_ns(parts[1], parts[2])
 
 
-def video_message(stamp_ns: int, frame_id: str, data: bytes) -> bytes:
-    """Serialise one H.264 frame (Annex B) as foxglove.CompressedVideo.
-
-    Args:
-        stamp_ns: Source time of the frame [ns since 1970].
-        frame_id: Of the camera.
-        data: The bytes of the frame, start codes included.
-    """
-    seconds, nanos = split_ns(stamp_ns)
-    timestamp = protobuf.number_field(1, seconds) + protobuf.number_field(2, nanos)
-    return b"".join(
-        [
-            protobuf.bytes_field(1, timestamp),
-            protobuf.bytes_field(2, frame_id.encode()),
-            protobuf.bytes_field(3, data),
-            protobuf.bytes_field(4, VIDEO_FORMAT.encode()),
-        ]
-    )
-
-
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
     sec, nanosec = split_ns(stamp_ns)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
@@ -199,7 +178,7 @@ class CompressedColor:
             stamp_ns=stamp_of(message),
             frame_id=message["header"]["frame_id"],
             format=message["format"],
-            data=message["data"],
+            data=bytes(message["data"]),
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:

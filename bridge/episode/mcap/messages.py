@@ -6,7 +6,6 @@ would pass ``MEMORY_BYTES``, the one needed last is forgotten and unpacked again
 """
 
 import heapq
-import struct
 from array import array
 from collections.abc import Iterable, Iterator, Sequence, Set
 from typing import NamedTuple
@@ -19,9 +18,7 @@ from bridge.episode.mcap.file import McapFile, damaged
 from bridge.episode.mcap.format import (
     CHUNK,
     MESSAGE,
-    MESSAGE_FIELDS,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
     RECORD_HEAD,
 )
 from bridge.episode.mcap.walk import (
@@ -38,26 +35,6 @@ from bridge.episode.mcap.walk import (
     walk,
 )
 
-# Walking from record to record takes a microsecond each, and a chunk of joints and poses holds
-# thousands. The index behind the chunk says where they begin. It is only a hint: each record it
-# names is looked at, and with what lies between them they must fill the chunk. Where they do not,
-# and where there is no index, the chunk is walked through. Both ways give the same (tests compare
-# them).
-
-_HEAD = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel_id", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time_ns", "<u8"),
-        ("publish_time_ns", "<u8"),
-    ]
-)
-"""``MESSAGE_HEAD`` in NumPy's words."""
-_INDEX_HEAD = struct.Struct("<HI")
-"""Channel, and bytes of the entries that follow."""
-_ENTRY_BYTES = 16
 NUM_CHANNEL_IDS = 1 << 16
 
 
@@ -68,8 +45,6 @@ class MessageTable(NamedTuple):
     channel_ids: UInt16[np.ndarray, " num_messages"]
     starts: Int64[np.ndarray, " num_messages"]
     """Where each record begins in the chunk's data."""
-    ends: Int64[np.ndarray, " num_messages"]
-    """The first byte after it."""
 
 
 def mask_of(channel_ids: Iterable[int]) -> Bool[np.ndarray, " num_channel_ids"]:
@@ -79,7 +54,7 @@ def mask_of(channel_ids: Iterable[int]) -> Bool[np.ndarray, " num_channel_ids"]:
     return mask
 
 
-def refuse_strays(
+def _refuse_strays(
     channel_ids: UInt16[np.ndarray, " num_messages"],
     announced: Bool[np.ndarray, " num_channel_ids"],
 ) -> None:
@@ -96,126 +71,25 @@ def refuse_strays(
         raise BrokenRecordError(message)
 
 
-def message_table(data: bytes, index: bytes) -> MessageTable:
+def message_table(data: bytes) -> MessageTable:
     """List the messages in a chunk.
-
-    Args:
-        data: The chunk's records, unpacked.
-        index: The message index records that follow the chunk; may be empty, or anything else.
-
-    Raises:
-        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
-    """
-    table = by_index(data, index)
-    return by_walk(data) if table is None else table
-
-
-def by_walk(data: bytes) -> MessageTable:
-    """List the messages in a chunk by going from record to record.
 
     Raises:
         BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
     times_ns, channel_ids = array("Q"), array("H")
-    starts, ends = array("q"), array("q")
-    for opcode, at, length in records_in(data):
+    starts = array("q")
+    for opcode, at, _ in records_in(data):
         if opcode == MESSAGE:
             _, _, channel_id, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
             times_ns.append(log_time_ns)
             channel_ids.append(channel_id)
             starts.append(at)
-            ends.append(at + RECORD_HEAD.size + length)
     return MessageTable(
         np.array(times_ns, dtype=np.uint64),
         np.array(channel_ids, dtype=np.uint16),
         np.array(starts, dtype=np.int64),
-        np.array(ends, dtype=np.int64),
     )
-
-
-def by_index(data: bytes, index: bytes) -> MessageTable | None:
-    """List the messages in a chunk where its index says; None where it does not say all or wrong.
-
-    Args:
-        data: The chunk's records, unpacked.
-        index: The message index records that follow the chunk.
-    """
-    listed = _entries(index)
-    if listed is None:
-        return None
-    channel_ids, times_ns, offsets = listed
-    if int(offsets.max()) > len(data) - MESSAGE_HEAD.size:
-        return None
-    order = np.argsort(offsets, kind="stable")
-    starts = offsets[order].astype(np.int64)
-    anywhere = np.ndarray(len(data) - _HEAD.itemsize + 1, dtype=_HEAD, buffer=data, strides=(1,))
-    heads = anywhere[starts]
-    lengths = heads["length"]
-    is_right = (
-        (heads["opcode"] == MESSAGE)
-        & (lengths >= MESSAGE_FIELDS)
-        & (lengths <= (len(data) - RECORD_HEAD.size - starts).astype(np.uint64))
-        & (heads["channel_id"] == channel_ids[order])
-        & (heads["log_time_ns"] == times_ns[order])
-    )
-    if not is_right.all():
-        return None
-    ends = starts + RECORD_HEAD.size + lengths.astype(np.int64)
-    if not _fill(data, starts, ends):
-        return None
-    return MessageTable(times_ns[order], channel_ids[order], starts, ends)
-
-
-def _entries(
-    index: bytes,
-) -> (
-    tuple[
-        UInt16[np.ndarray, " num_messages"],
-        UInt64[np.ndarray, " num_messages"],
-        UInt64[np.ndarray, " num_messages"],
-    ]
-    | None
-):
-    """Return channel, log time and offset of each entry; None where these are no such records."""
-    channels, pairs, at = list[int](), [], 0
-    while at < len(index):
-        body = at + RECORD_HEAD.size
-        if len(index) - body < _INDEX_HEAD.size:
-            return None
-        opcode, length = RECORD_HEAD.unpack_from(index, at)
-        channel_id, size = _INDEX_HEAD.unpack_from(index, body)
-        at = body + length
-        is_right = opcode == MESSAGE_INDEX and size == length - _INDEX_HEAD.size
-        if not is_right or size % _ENTRY_BYTES or at > len(index):
-            return None
-        found = np.frombuffer(index, "<u8", size // 8, body + _INDEX_HEAD.size)
-        channels.append(channel_id)
-        pairs.append(found.reshape(-1, 2))
-    counts = [len(found) for found in pairs]
-    if not sum(counts):
-        return None
-    every = np.concatenate(pairs)
-    return np.repeat(np.array(channels, dtype=np.uint16), counts), every[:, 0], every[:, 1]
-
-
-def _fill(
-    data: bytes,
-    starts: Int64[np.ndarray, " num_messages"],
-    ends: Int64[np.ndarray, " num_messages"],
-) -> bool:
-    """Whether messages and the other whole records between them fill a chunk."""
-    froms = np.concatenate([np.zeros(1, dtype=np.int64), ends])
-    tos = np.append(starts, len(data))
-    if (froms > tos).any():
-        return False
-    for gap in np.flatnonzero(froms < tos).tolist():
-        try:
-            kinds = [opcode for opcode, _, _ in records_in(data[froms[gap] : tos[gap]])]
-        except BrokenRecordError:
-            return False
-        if MESSAGE in kinds:
-            return False
-    return True
 
 
 MEMORY_BYTES = 256 << 20
@@ -291,7 +165,7 @@ class _OpenFile:
         channel_ids: UInt16[np.ndarray, " num_messages"],
     ) -> Bool[np.ndarray, " num_messages"]:
         """Say of each message whether it is wanted; raises BrokenRecordError for a stray one."""
-        refuse_strays(channel_ids, self._announced)
+        _refuse_strays(channel_ids, self._announced)
         wanted: Bool[np.ndarray, " num_messages"] = self._chosen[channel_ids]
         if self.select.start_ns is not None:
             wanted &= log_times_ns >= self.select.start_ns
@@ -385,11 +259,8 @@ def read_chunk(
         message = f"the index points at byte {offset}, where no chunk lies"
         raise BrokenRecordError(message)
     chunk = parse_chunk(read_body(stream, place))
-    # Whatever claims more than there is cannot be the index of this chunk.
-    length = index.message_index_length
-    listed = stream.read(length) if length <= data_end - place.end else b""
     data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
-    return data, message_table(data, listed)
+    return data, message_table(data)
 
 
 class _Loose:

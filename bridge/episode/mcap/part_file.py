@@ -190,11 +190,10 @@ class BackgroundSync:
                 return
             synced = offset
 
-    def stop(self, *, wait: bool = True) -> None:
-        """End the thread; ``wait`` for a sync under way."""
+    def stop(self) -> None:
+        """End the thread, after a sync under way."""
         self._stop.set()
-        if wait:
-            self._thread.join()
+        self._thread.join()
 
 
 def open_part(path: Path, *, replace_dead: bool) -> PartFile:

@@ -347,7 +347,7 @@ def test_the_parquet_table_holds_the_same(run: RunFolder, tmp_path: Path) -> Non
     write(run, "a", task="cube", tags=("x", "y"), lost=1, trial=3)
     write(run, "b", start_ns=7)
     out = tmp_path / "list.parquet"
-    assert robot_gst.run(["export", "catalogue", str(run.path), str(out), "-q"]) == 0
+    assert robot_gst.run(["ls", str(run.path), "--parquet", str(out), "-q"]) == 0
     found = [
         Entry(**{**row, "tags": tuple(row["tags"])}) for row in parquet.read_table(out).to_pylist()
     ]

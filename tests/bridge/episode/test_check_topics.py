@@ -284,14 +284,3 @@ def test_names_of_other_programs_do_not_move_the_cursor(
     said = capsys.readouterr().out
     assert "/a?[2J?" in said
     assert "\x1b" not in said
-
-
-@pytest.mark.slow
-def test_rerun_gives_a_second_opinion(tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    check(tmp_path, lambda writer: write_joints(writer, [0, 1]))
-    assert check_episode(tmp_path / "e1.mcap", rerun=True).exit_code == 0
-    broken = tmp_path / "broken.mcap"
-    broken.write_bytes((tmp_path / "e1.mcap").read_bytes()[:-20])
-    faults = check_episode(broken, rerun=True).faults
-    assert any("rerun mcap check says" in fault for fault in faults)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from video_messages import video_message
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -219,7 +220,6 @@ def test_every_kind_of_stamp_is_moved_and_unset_ones_stay(tmp_path: Path) -> Non
         FrameTransform,
         VideoFrame,
         transforms_to_cdr,
-        video_message,
     )
 
     transform = FrameTransform(stamp_ns=START_NS, parent="a", child="b", T_parent_child=np.eye(4))
@@ -260,23 +260,3 @@ def test_every_kind_of_stamp_is_moved_and_unset_ones_stay(tmp_path: Path) -> Non
     assert json.loads(found["/lab/event"])["stamp_ns"] == moved
     assert found["/lab/unset"] == _joints(0)
     assert found["/lab/broken"] == b"\0\1"
-
-
-def test_a_corrected_copy_is_the_corrected_episode_for_everybody(tmp_path: Path) -> None:
-    import robot_gst
-    from bridge.episode.check import check_episode
-    from bridge.exchange.corrected import RECORD
-
-    path, out = tmp_path / "t.mcap", tmp_path / "copy" / "t.mcap"
-    _write(path, Host(5, ahead_ns=3e9, drift=-50e-6), jump_at=10)
-    assert robot_gst.run(["export", "corrected", str(path), str(out)]) == 0
-    corrected, copy = open_episode(path, clock="corrected"), Episode.open(out)
-    topics = [JOINTS, "/other/x"]
-    assert list(copy.messages(topics)) == list(corrected.messages(topics))
-    assert copy.info == corrected.info
-    assert check_episode(out).exit_code == check_episode(path).exit_code
-    assert CLOCKS not in copy.topics()
-    assert copy.metadata_records[RECORD]["source_episode"] == "t.mcap"
-    with pytest.raises(EpisodeError, match="holds no clock readings"):  # never twice
-        open_episode(out, clock="corrected")
-    assert robot_gst.run(["export", "corrected", str(path), str(out)]) == 2  # nothing is replaced

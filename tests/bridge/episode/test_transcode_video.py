@@ -3,10 +3,11 @@ import contextlib
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from video_messages import video_message
 
 from bridge.episode import protobuf, schema
 from bridge.episode.cdr.codec import MalformedMessageError
-from bridge.episode.cdr.messages import VideoFrame, video_message
+from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.topics import type_of_topic
 
 NS = 1_700_000_000_123_456_789

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from video_messages import video_message
 
 from bridge.episode import protobuf, schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import DepthImage, video_message
+from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.protobuf import bytes_field, number_field

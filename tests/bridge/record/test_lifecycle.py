@@ -232,7 +232,7 @@ def test_a_message_nobody_thought_of_ends_nothing(
 
     recorder.start(EpisodeInfo(id="t1", kind="trial"))
     with monkeypatch.context() as patch:
-        patch.setattr("bridge.episode.cdr.codec.validate", inspect_badly)
+        patch.setattr("bridge.episode.cdr.codec.decode", inspect_badly)
         recorder.receive(make_sample())
         recorder.receive(make_sample())
         recorder.mark("behind both")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
 from mcap.reader import make_reader
 
@@ -21,7 +22,6 @@ from bridge.errors import UsageError
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
 from bridge.record.control import RecorderClient
-from bridge.record.live import LiveRecorder, open_recorder
 from bridge.record.recorder import Recorder
 from bridge.task.record import parse_record
 from bridge.wire.config import WireConfig
@@ -66,9 +66,9 @@ def test_recording_from_python(tmp_path: Path, wire: WireConfig, endpoint: str) 
             publisher = session.publisher("/lab/note", "odd/Type")
             publisher.put(b"1", source_ns=1)
             wait_for(lambda: recorder.status()["messages"] == 1)
-        recorder.mark("here")
-        recorder.pause()
-        recorder.resume()
+        recorder.core.mark("here")
+        recorder.core.pause()
+        recorder.core.resume()
         answer = recorder.stop(result="success", detail="well done")
         assert (answer["messages"], answer["lost"]) == (1, 0)
         recorder.label("failure", episode="t1")

@@ -11,8 +11,7 @@ import pytest
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame
-from bridge.episode.check import check_episode
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -253,23 +252,3 @@ def test_a_small_picture_is_a_jpeg_of_whatever_is_colour() -> None:
     for picture in (raw, packed):
         assert decode_color(picture.data).shape == (80, WIDTH, 3)
     assert small_picture(sample_of(DEPTH, depth_image())) is None
-
-
-def test_a_preview_video_lies_beside_the_pictures_and_in_no_account(
-    make_recorder: MakeRecorder, run: RunFolder
-) -> None:
-    av = pytest.importorskip("av")
-    recorder = make_recorder(preview_video=True)
-    for number in range(5):
-        recorder.receive(sample_of(COLOR, raw_image(smooth(48, 64)[..., ::-1], "bgr8"), number))
-        recorder.receive(sample_of(DEPTH, depth_image(), number))
-    answer = recorder.stop()
-    assert (answer["messages"], answer["unknown_type"]) == (10, 0)
-    frames = messages_of(run, "/cell/cam/a/color/preview")
-    assert [type_name for type_name, _ in frames] == [schema.COMPRESSED_VIDEO] * 5
-    decoder = av.CodecContext.create("h264", "r")
-    data = VideoFrame.from_protobuf(frames[0][1]).data
-    [picture] = decoder.decode(av.Packet(data)) + decoder.decode(None)
-    shown = picture.to_ndarray(format="rgb24").astype(int)
-    assert np.abs(shown - smooth(48, 64)).mean() < 12
-    assert check_episode(run.episodes_dir / "t1.mcap").exit_code == 0

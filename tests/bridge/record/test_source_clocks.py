@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
 
 from bridge.clock import NS_PER_S, AnchoredClock
@@ -17,7 +18,6 @@ from bridge.episode.clocks import Reading, clocks_of, open_episode
 from bridge.episode.reader import Episode
 from bridge.record import clocks as record_clocks
 from bridge.record.clocks import ClockBook, StampJumps
-from bridge.record.live import LiveRecorder, open_recorder
 from bridge.record.presence import News
 from bridge.record.status import describe_status
 from bridge.wire.clocks import ClockAnswer, announce, ask_clocks

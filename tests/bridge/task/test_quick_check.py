@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import jsonschema_rs
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +16,7 @@ from jsonschema import Draft202012Validator
 import bridge
 import evaluator
 from bridge.errors import InvalidRecordError
-from bridge.task.record import check_record, compile_check
+from bridge.task.record import check_record
 from bridge.task.verdict import Factor, Verdict
 from evaluator.result import Exclusion, Interval, Measurement, Results, Table
 
@@ -24,7 +26,9 @@ SCHEMAS = {
     for path in sorted(Path(str(package.__file__)).parent.rglob("*.schema.json"))
     if path.name != "constraint.schema.json"  # never read by check_record: tests/twin/plan has it
 }
-CHECKS = {name: compile_check(schema) for name, schema in SCHEMAS.items()}
+CHECKS = {
+    name: jsonschema_rs.Draft202012Validator(schema).is_valid for name, schema in SCHEMAS.items()
+}
 VALIDATORS = {name: Draft202012Validator(schema) for name, schema in SCHEMAS.items()}
 
 scalars = (
@@ -165,95 +169,20 @@ def test_one_change_to_results_that_fit_is_judged_as_jsonschema_does(data: st.Da
         holder[key] = data.draw(anything)
     else:
         del holder[key]
-    fits = VALIDATORS["results"].is_valid(spoiled)
-    sure = CHECKS["results"](spoiled)
-    assert sure == fits or (
-        fits and ".0" in repr(spoiled)
-    )  # an integer to jsonschema, and not sure
-
-
-known = st.sampled_from(
-    [
-        True, False, {}, {"type": "integer"}, {"type": "number"}, {"type": ["null", "string"]},
-        {"const": 1}, {"const": None}, {"const": [1]}, {"enum": [0, True, "a"]}, {"minimum": 2},
-        {"required": ["a"]}, {"additionalProperties": False}, {"items": {"type": "integer"}},
-    ]
-)  # fmt: skip
-unknown = st.sampled_from([{"not": {"type": "null"}}, {"uniqueItems": True}, {"multipleOf": 2}])
-conditions = st.recursive(
-    known | unknown,
-    lambda inner: (
-        st.dictionaries(st.sampled_from("ab"), inner, min_size=1).map(lambda p: {"properties": p})
-        | st.dictionaries(st.sampled_from(["if", "then", "else"]), inner, min_size=1)
-    ),
-    max_leaves=6,
-)
-
-
-@given(conditions, conditions, conditions, anything)
-def test_a_condition_never_lets_pass_what_jsonschema_refuses(
-    wanted: Any, then: Any, otherwise: Any, value: Any
-) -> None:
-    for sides in ({"then": then}, {"else": otherwise}, {"then": then, "else": otherwise}):
-        schema = {"if": wanted, **sides}
-        assert not compile_check(schema)(value) or Draft202012Validator(schema).is_valid(value)
+    assert CHECKS["results"](spoiled) == VALIDATORS["results"].is_valid(spoiled)
 
 
 @pytest.mark.parametrize(
-    ("wanted", "value", "side"),
-    [
-        (True, 1, "then"),
-        (False, 1, "else"),
-        ({"type": "null"}, None, "then"),
-        ({"type": "null"}, 1, "else"),
-        ({"const": 1}, 1, "then"),
-        ({"const": 1}, 2, "else"),
-        ({"enum": [1, "a"]}, "b", "else"),
-        ({"required": ["a"]}, {}, "else"),
-        ({"required": ["a"]}, 3, "then"),
-        ({"properties": {"a": {"type": "null"}}}, {"a": 1}, "else"),
-        ({"properties": {"a": {"type": "null"}}}, {}, "then"),
-        ({"type": "integer"}, 1.0, None),
-        ({"const": 1}, True, None),
-        ({"const": 1}, 1.0, None),
-        ({"minimum": 2}, 1, None),
-        ({"uniqueItems": True}, [1], None),
-    ],
+    ("field", "value"),
+    [("result", "\ud800"), ("k", True), ("k", np.float64(1.5)), ("n", float("inf"))],
 )
-def test_a_condition_picks_one_side_where_it_is_sure_and_else_asks_for_both(
-    wanted: Any, value: Any, side: str | None
-) -> None:
-    assert compile_check({"if": wanted, "then": False})(value) == (side == "else")
-    assert compile_check({"if": wanted, "else": False})(value) == (side == "then")
-    assert compile_check({"if": wanted, "then": True, "else": True})(value)
-
-
-def test_sides_without_a_condition_mean_nothing() -> None:
-    assert compile_check({"then": False, "else": False})(1)
-
-
-@pytest.mark.parametrize(
-    ("schema", "record"),
-    [
-        ({"const": 1}, True),
-        ({"enum": [0, 1]}, False),
-        ({"type": "integer"}, True),
-        ({"minimum": 2}, 1),
-        ({"maximum": 2}, 3),
-        ({"exclusiveMaximum": 2}, 2),
-        ({"exclusiveMinimum": 2}, 2),
-        ({"minLength": 2}, "a"),
-        ({"pattern": "^a"}, "ba"),
-        ({"additionalProperties": {"type": "string"}}, {"a": 1}),
-        ({"anyOf": [{"type": "null"}, {"minimum": 2}]}, 1),
-        ({"oneOf": [{"type": "integer"}, {"type": "number"}]}, 1),
-        ({"uniqueItems": True}, [1, 1]),
-        ({"$ref": "#/properties/a"}, 1),
-        (False, 1),
-    ],
-)
-def test_what_is_wrong_or_not_known_is_not_sure(schema: Any, record: object) -> None:
-    assert not compile_check({"items": schema})([record])
+def test_what_cannot_be_judged_quickly_is_left_to_jsonschema(field: str, value: Any) -> None:
+    record = {"schema_version": 1, "result": "success", "k": 1, "n": 1, field: value}
+    if VALIDATORS["outcome"].is_valid(record):
+        assert check_record(record, name="outcome") is record
+        return
+    with pytest.raises(InvalidRecordError, match=f"^.*{field}"):
+        check_record(record, name="outcome")
 
 
 def test_what_does_not_fit_is_still_named_by_jsonschema() -> None:

@@ -1,0 +1,48 @@
+"""Commands and flags of earlier editions, each with what to use instead; kept for one release."""
+
+from collections.abc import Sequence
+
+from bridge.errors import UsageError
+
+GONE: dict[str, str] = {
+    "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
+    "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
+    "export catalogue": "List with robot-gst ls RUN --parquet FILE.",
+    "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
+    "export corrected": (
+        "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
+        'open_episode(path, clock="corrected").'
+    ),
+    "label --flag": "Flag trials for others in the dashboard, on the page label (key f).",
+    "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
+    "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    "ls --no-flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    "prune": (
+        "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
+        "your own, or age whole runs with logrotate."
+    ),
+    "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
+    "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
+    "record --failover": (
+        "A failing disk ends the recording; start it again with a run folder on another disk. The "
+        "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."
+    ),
+    "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
+    "record --triggers": (
+        "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
+    ),
+}
+"""By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""
+
+
+def refuse_gone(tokens: Sequence[str]) -> None:
+    """Answer a command or a flag that went.
+
+    Raises:
+        UsageError: Naming it, with what to use instead.
+    """
+    words = [token.partition("=")[0] for token in tokens]
+    for command in (" ".join(words[:2]), words[0] if words else ""):
+        for name in (command, *(f"{command} {word}" for word in words if word.startswith("--"))):
+            if name in GONE:
+                raise UsageError(f"{name} is gone. {GONE[name]}")
