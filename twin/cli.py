@@ -113,23 +113,20 @@ def plan(
         )
         raise UsageError(message)
     folder = RunFolder.open(run)
-    understood = understand(folder, task)
-    if dry and words.model:
-        message = "--dry asks no model, because it ends before the start is known. Leave one out."
-        raise UsageError(message)
-    if dry:
+    if dry and not words.model:
+        understood = understand(folder, task)
         output.result({**understood.to_json(), "file": None}, "\n".join(understood.lines()))
         return 0
     from twin.gate.twin_process import judge_of
-    from twin.plan.model_stages import client_of
-    from twin.plan.once import plan_once, proposer_of, start_of
+    from twin.plan.once import begin, plan_once
 
-    proposer_of(words.policy)
-    if words.model:
-        client_of(folder, words)
-    start = start_of(folder, understood.file.task(), words, config.robot)
-    judge = judge_of(folder.path, start.problem.scene)
-    planned = plan_once(folder, understood, start, judge, words)
+    begun = begin(folder, task, words, config.robot)
+    understood = begun.understood
+    if dry:
+        output.result({**begun.to_json(), "file": None}, "\n".join(begun.lines()))
+        return 0
+    judge = judge_of(folder.path, begun.start.problem.scene)
+    planned = plan_once(folder, begun, judge, words)
     path = keep(folder, understood)
     data = {**planned.to_json(), "file": None if path is None else str(path)}
     wrote = [] if path is None else [f"wrote {path}"]

@@ -347,6 +347,8 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
 }
 """By the name of the kind."""
 
+PLACES = ("inside", "on", "outside", "beside", "between", "moved")
+"""Kinds that say where an object ends."""
 _KEYS = {
     "object": "obj",
     "margin_m": "margin",
@@ -383,6 +385,26 @@ def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
         if "by" in record:
             record.setdefault("tol", MOVED_TOLERANCE_M)
     return record
+
+
+def predicate_of(record: Record) -> dict[str, Any] | None:
+    """Write a constraint about where an object ends as the success predicate that decides the same.
+
+    The other way round of ``constraint_of``; None: no predicate says it.
+
+    Args:
+        record: That fits the schema of constraints.
+    """
+    if record["kind"] not in PLACES or "obj" not in record or "frac" in record:
+        return None
+    names = {value: key for key, value in _KEYS.items()} | {"way": "direction"}
+    names["vector"] = "direction"
+    found = {names.get(key, key): value for key, value in record.items()}
+    if "min_gap" in found or "max_gap" in found:
+        low, high = BESIDE_GAP_M
+        low, high = found.pop("min_gap", low), found.pop("max_gap", high)
+        found["gap_m"] = [low, max(low, high)]
+    return found
 
 
 def _aligned(predicate: Record, task: Task) -> dict[str, Any]:
