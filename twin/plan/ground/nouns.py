@@ -190,7 +190,7 @@ class Nouns:
 
     def is_table(self, phrase: NounPhrase) -> bool:
         """Whether a phrase means the table."""
-        return phrase.nouns[-1:] != () and phrase.nouns[-1] in TABLES
+        return phrase in [NounPhrase(text=phrase.text, nouns=(name,)) for name in TABLES]
 
     def _of(self, slot: str) -> tuple[str, ...]:
         if slot == "theme":

@@ -49,7 +49,7 @@ from twin.plan.path.planner import (
 )
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
-from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
+from twin.plan.release.final_states import ReleaseConfig, final_states
 from twin.plan.release.resting import NoFinalStateError
 from twin.replay.clearance.bodies import SCENE
 from twin.replay.config import ReplayConfig
@@ -438,20 +438,20 @@ class _Options:
 
     def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
         try:
-            found = self._final_states(grasp)
+            releases = self._final_states(grasp)
         except NoFinalStateError as error:
             self.why = str(error)
             if error.cause in _HOPELESS:
                 raise
             return ()
-        steer, releases = self._steer, found.releases
+        steer = self._steer
         if steer is not None and steer.change == "release":
             releases = tuple(
                 each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
             )
         return releases
 
-    def _final_states(self, grasp: Grasp) -> FinalStates:
+    def _final_states(self, grasp: Grasp) -> tuple[Release, ...]:
         problem, config = self._problem, self._policy.release
         relation = self._relation
         placed = relation is None or (relation[0] in _PLACED and relation[1] != TABLE)
