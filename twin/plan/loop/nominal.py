@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.check import TABLE, nearest
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan
-from twin.plan.config import MODEL_POLICY
 from twin.plan.constrain.constraint import (
     SHOWN,
     Constraint,
