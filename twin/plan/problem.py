@@ -116,7 +116,6 @@ class Grasp:
     """Length of the straight approach along the tool's z axis."""
     contacts_m: Float[np.ndarray, "2 3"] | None = None
     """Where the pads meet the surface, object frame; None: not known."""
-    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +140,5 @@ class TimedPath:
 
     times_s: Float[np.ndarray, " num_points"]
     joints_rad: Float[np.ndarray, "num_points num_joints"]
-    length_rad: float
     work: Mapping[str, float] = field(default_factory=dict)
     """Counted steps: nodes, checks, halvings; never seconds."""

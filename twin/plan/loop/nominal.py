@@ -368,7 +368,7 @@ class _Options:
     ) -> None:
         self._problem, self._key, self._policy = problem, key, policy
         self._seed, self._steer = seed, steer
-        searcher = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed))
+        searcher = GraspSearcher(problem, policy.grasp)
         found = searcher.search(key, _part_points(problem, key))
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
@@ -470,7 +470,7 @@ class _Options:
         return (
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
-            *(f"{self._key}: {text}" for text in (*self._remarks, *grasp.remarks)),
+            *(f"{self._key}: {text}" for text in self._remarks),
             f"{self._key}: final state of J {release.cost:.4f}{nearest}; asked were "
             + "; ".join(release.checked_against),
             f"{self._key}: {postures:.0f} postures looked at on the way",
