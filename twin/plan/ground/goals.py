@@ -59,11 +59,7 @@ class Goals:
     """Collects goals clause by clause, and refuses what cannot be."""
 
     def __init__(self, vocabulary: Vocabulary) -> None:
-        """Begin without any.
-
-        Args:
-            vocabulary: Says what can move and what is open.
-        """
+        """Begin without any."""
         self.vocabulary = vocabulary
         self.found: list[dict[str, Any]] = []
         self.steps: list[tuple[str, ...]] = []

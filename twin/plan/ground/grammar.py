@@ -41,10 +41,6 @@ _SLOTS = {"inside": "container", "outside": "container", "on": "support"}
 def ground(text: str, vocabulary: Vocabulary) -> Grounding:
     """Turn an instruction into goals and their order.
 
-    Args:
-        text: What a person wrote.
-        vocabulary: What there is.
-
     Raises:
         GroundingError: When it is not understood whole, or cannot be done; never a guess.
     """

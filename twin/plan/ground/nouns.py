@@ -68,12 +68,7 @@ class Nouns:
     """Reads noun phrases and finds what they mean."""
 
     def __init__(self, vocabulary: Vocabulary, memory: Memory) -> None:
-        """Collect the words that mean something here.
-
-        Args:
-            vocabulary: What there is.
-            memory: What has been spoken of; it is written to.
-        """
+        """Collect the words that mean something here; the memory is written to."""
         self.vocabulary, self.memory = vocabulary, memory
         things = vocabulary.things.values()
         self._ids = {key.lower(): key for key in vocabulary.things}
@@ -97,11 +92,6 @@ class Nouns:
 
     def read(self, tokens: Sequence[Token], at: int, slot: str) -> tuple[NounPhrase, int]:
         """Read the noun phrase that begins here, and say where it ends.
-
-        Args:
-            tokens: The instruction.
-            at: Where.
-            slot: What it is asked for, see ``resolve``.
 
         Raises:
             GroundingError: A word of it means nothing here, or there is none.
