@@ -103,7 +103,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     (
         "plan",
-        "twin.cli:plan",
+        "twin.plan.cli:plan",
         "Plan from words, or for a cell that asks over zenoh.",
         "runs/monday --task 'put the cube into the box' --dry",
     ),

@@ -12,7 +12,7 @@ NUM_STATES = 1000
 
 
 def main() -> None:
-    """Time every kind in NumPy beside torch with derivatives, and every hostile reply."""
+    """Time every kind, and every hostile reply."""
     sys.path.insert(0, str(ROOT / "tests" / "twin" / "plan" / "constrain"))
     kinds, details = evaluated()
     replies = judged()
@@ -24,43 +24,22 @@ def main() -> None:
     )
 
 
-def evaluated() -> tuple[list[Target], dict[str, dict[str, float]]]:
-    import torch
-    from block_scene import EXAMPLES, around, blocks, of_torch
+def evaluated() -> tuple[list[Target], dict[str, float]]:
+    from block_scene import EXAMPLES, around, blocks
 
     from twin.plan.constrain.kinds import compile_constraint
 
-    torch.set_num_threads(1)
     details = {}
     for name, (record, start, _) in EXAMPLES.items():
         constraint = compile_constraint(record, blocks())
         states = around(start, NUM_STATES, np.random.default_rng(0))
-        tensors = of_torch(states)
-        inputs = [tensors.T_base_tcp, *tensors.Ts_base_object.values()]
-
-        def derived(constraint=constraint, tensors=tensors, inputs=inputs) -> None:  # noqa: ANN001
-            found = constraint.violation(tensors).sum()
-            torch.autograd.grad(found, inputs, allow_unused=True)
-
         plain = cpu_seconds(lambda c=constraint, s=states: c.violation(s), repeats=5)
-        per_state = 1e6 / NUM_STATES
-        details[name] = {
-            "numpy": statistics.median(plain) * per_state,
-            "torch, with derivative": statistics.median(cpu_seconds(derived, repeats=3))
-            * per_state,
-        }
-    slowest = max(details, key=lambda name: details[name]["numpy"])
-    middle = statistics.median(row["numpy"] for row in details.values())
-    autograd = statistics.median(row["torch, with derivative"] for row in details.values())
-    told = f"torch with derivative {autograd:.2f}"
+        details[name] = statistics.median(plain) * 1e6 / NUM_STATES
+    slowest = max(details, key=lambda name: details[name])
+    middle = statistics.median(details.values())
     return [
-        Target(what="median kind, NumPy", measured=middle, limit=5.0, unit="us", reference=told),
-        Target(
-            what=f"slowest kind, NumPy ({slowest})",
-            measured=details[slowest]["numpy"],
-            limit=200.0,
-            unit="us",
-        ),
+        Target(what="median kind", measured=middle, limit=5.0, unit="us"),
+        Target(what=f"slowest kind ({slowest})", measured=details[slowest], limit=200.0, unit="us"),
     ], details
 
 

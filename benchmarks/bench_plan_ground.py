@@ -14,7 +14,7 @@ from pathlib import Path
 from measure import ROOT, Target, report_targets
 
 from twin.plan.ground.grammar import ground
-from twin.plan.ground.vocabulary import GroundingError, Vocabulary, vocabulary_from_labels
+from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 
 TESTS = ROOT / "tests" / "twin" / "plan" / "ground"
 SHARED = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -34,7 +34,7 @@ def cpu_s(scene: Vocabulary, text: str) -> float:
 
 def main() -> None:
     sys.path.insert(0, str(TESTS))
-    from spoken_scenes import SCENES, as_meant
+    from spoken_scenes import SCENES, as_meant, vocabulary_from_labels
 
     rows = [
         [part.strip() for part in line.split(" | ")]

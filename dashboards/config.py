@@ -7,9 +7,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.wire.config import DEFAULT_ENDPOINT
-from twin.plan.config import MODEL_POLICY
 
 BUILT_IN_POLICY = "perturbed"
 """Of the cell's own planner; the others are asked on the wire."""

@@ -27,6 +27,7 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import cores
 from bridge.sources.standin.settings import CONDITION_OF
 from bridge.task.find import chosen_task_file
+from bridge.task.model_policy import server_of
 from bridge.task.plan import STUDY_ARMS
 from bridge.task.protocol import (
     SEEDS_PER_SESSION,
@@ -153,9 +154,7 @@ def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
     )
     if config.model:
-        from twin.plan.ground.model_client import ModelConfig  # noqa: PLC0415  # NumPy
-
-        ModelConfig(url=config.model, model=config.model_name)  # refuses secrets in the address
+        server_of(config.model)  # refuses secrets in the address
     protocol = Protocol(
         tasks=tasks,
         policies=policies,

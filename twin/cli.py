@@ -5,7 +5,6 @@ from pathlib import Path
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.gate.config import GateConfig
-from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.replay.config import ReplayRunConfig
 from twin.scene.settings import RebuildConfig, RenderConfig
 
@@ -13,8 +12,6 @@ OUTPUT = Output()
 REPLAY = ReplayRunConfig()
 REBUILD = RebuildConfig()
 RENDER = RenderConfig()
-LIVE_PLAN = LivePlanConfig()
-PLAN = PlanConfig()
 CALIBRATE = CalibrateConfig()
 
 
@@ -66,78 +63,6 @@ def gate(
     from twin.gate.service import run_gate
 
     return run_gate(run, config, output)
-
-
-def plan(
-    run: Path,
-    /,
-    *,
-    task: str | None = None,
-    dry: bool = False,
-    live: bool = False,
-    words: PlanConfig = PLAN,
-    config: LivePlanConfig = LIVE_PLAN,
-    output: Output = OUTPUT,
-) -> int:
-    """Plan a task from words, have the twin judge the plan, and write it into the run's plans/.
-
-    With --live, plan for a cell that asks over zenoh; stop with Ctrl-C.
-    Exit code 2, with what could be meant, where the instruction is not understood whole; 3 where
-    the twin accepted no candidate. Nothing is sent to a cell.
-    Example: robot-gst plan runs/today --task "put the cube into the box"
-
-    Args:
-        run: Run folder; its episodes and its scene say which objects there are, and where.
-        task: The instruction in English, or the name or file of a task.
-        dry: Say what was understood and write nothing; without it plans go into the run's
-            plans/ and their task into tasks/.
-        live: Answer a cell's requests.
-        words: How an instruction is planned.
-        config: Settings of --live; its robot counts without it too.
-        output: How to talk.
-    """
-    from bridge.episode.run_folder import RunFolder
-    from bridge.errors import UsageError
-    from twin.plan.ground.run_tasks import keep, understand
-
-    if live and (task is not None or dry):
-        message = (
-            "--live answers a cell, whose requests name their task: leave --task and --dry out."
-        )
-        raise UsageError(message)
-    if live:
-        from twin.plan.live import run_planner
-
-        return run_planner(run, config, output, words)
-    if task is None:
-        message = (
-            'say what to plan: robot-gst plan RUN --task "put the cube into the box", or --live to '
-            "answer a cell's requests."
-        )
-        raise UsageError(message)
-    folder = RunFolder.open(run)
-    understood = understand(folder, task)
-    if dry and words.model:
-        message = "--dry asks no model, because it ends before the start is known. Leave one out."
-        raise UsageError(message)
-    if dry:
-        output.result({**understood.to_json(), "file": None}, "\n".join(understood.lines()))
-        return 0
-    from twin.gate.twin_process import judge_of
-    from twin.plan.model_stages import client_of
-    from twin.plan.once import plan_once, proposer_of, start_of
-
-    proposer_of(words.policy)
-    if words.model:
-        client_of(folder, words)
-    start = start_of(folder, understood.file.task(), words, config.robot)
-    judge = judge_of(folder.path, start.problem.scene)
-    planned = plan_once(folder, understood, start, judge, words)
-    path = keep(folder, understood)
-    data = {**planned.to_json(), "file": None if path is None else str(path)}
-    wrote = [] if path is None else [f"wrote {path}"]
-    output.result(data, "\n".join([*planned.lines(), *wrote]))
-    return 0 if planned.path is not None else 3
 
 
 def rebuild(

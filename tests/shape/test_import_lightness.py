@@ -23,6 +23,7 @@ LIGHT_ROOMS = (
     "bridge.cli.recording",
     "bridge.cli.exchange",
     "twin.cli",
+    "twin.plan.cli",
     "evaluator.cli",
     "dashboards.cli",
     "dashboards.scene_file",

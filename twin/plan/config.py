@@ -7,10 +7,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.wire.config import DEFAULT_ENDPOINT
-
-MODEL_POLICY = "model"
-"""The policy of plans that keep what a vision-language model added to the stages."""
 
 
 @Parameter(name="*")

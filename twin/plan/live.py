@@ -21,12 +21,13 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot
 from bridge.task.find import Attached, find_task_file
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan_request import PlanAnswer, PlanRequest
 from bridge.task.task_file import Task
 from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
-from twin.plan.config import MODEL_POLICY, LivePlanConfig, PlanConfig
+from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.loop import straight
 from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose

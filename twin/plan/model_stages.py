@@ -1,8 +1,10 @@
-"""What a vision-language model adds to a task: constraints of its stages, and nothing else.
+"""What a vision-language model says of a task: goals of an instruction, constraints of stages.
 
-What counts as success and what may touch what stay those of the task file. A model cuts a task into
-stages of its own; what it asks joins the stage of the task in which the same object is grasped,
-carried or released.
+Of an instruction in words a model is asked first; where it says an object ends becomes the goals,
+which are checked and made into a task by the same rules as those of the grammar. Of a task that
+exists, what counts as success and what may touch what stay those of its file. A model cuts a task
+into stages of its own; what it asks joins the stage of the task in which the same object is
+grasped, carried or released.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,20 +19,28 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.plan import Stage
-from bridge.task.task_file import Task
+from bridge.task.task_file import Task, TaskFile
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.constrain.relations import PLACES, predicate_of
 from twin.plan.constrain.schema import Vocabulary
+from twin.plan.ground.derive import derive_task
+from twin.plan.ground.goals import Goals, Grounding, ordered
 from twin.plan.ground.marks import draw_marks
 from twin.plan.ground.model_client import (
     BY_GRAMMAR,
+    READ_INSTEAD,
+    Answer,
     ModelConfig,
     Question,
     ask_model,
 )
-from twin.plan.ground.vocabulary import vocabulary_of
-from twin.plan.loop.tau import goals_of, stages_of
+from twin.plan.ground.run_tasks import UnderstoodTask
+from twin.plan.ground.vocabulary import GroundingError, vocabulary_of
+from twin.plan.ground.vocabulary import Vocabulary as Things
+from twin.plan.loop.tau import stages_of
 from twin.plan.problem import Problem
+from twin.plan.usable_start import refuse_unusable
 from twin.scene.localise.episode import first_execution_ns
 from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.store.calibration import read_calibration
@@ -40,8 +50,6 @@ REPLIES = "model_replies"
 """Folder of the run's ``derived/`` with replies that were taken."""
 LOG = "log.jsonl"
 """In it: every request with what came of it."""
-_PLACES = ("inside", "on", "outside", "beside", "between", "moved")
-"""Kinds that say where an object ends: those are the task file's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +59,8 @@ class Asked:
     problem: Problem
     """Its task has the constraints that were added; as it was where the grammar answered."""
     answered_by: str
+    understood: UnderstoodTask | None
+    """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
     model: str
     """The server's name for it."""
     address: str
@@ -76,9 +86,8 @@ class Asked:
             why: What no plan keeps.
         """
         remark = f"no plan keeps what the model added, so its constraints were left out: {why}"
-        return replace(
-            self, problem=problem, answered_by=BY_GRAMMAR, remarks=(*self.remarks, remark)
-        )
+        who = BY_GRAMMAR if self.understood is None else self.answered_by
+        return replace(self, problem=problem, answered_by=who, remarks=(*self.remarks, remark))
 
     def to_json(self) -> dict[str, Any]:
         """The same as data."""
@@ -101,32 +110,138 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
         config: Names the model and says whether an image may leave.
     """
     task = problem.scene.task
-    instances = ((read_record(run) or {}).get("semantics") or {}).get("instances", ())
-    things = vocabulary_of(task, instances).things
+    vocabulary = Vocabulary.of_task(
+        task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
+    )
+    question = _question(run, episode, problem, vocabulary, task.instruction)
+    client = replace(client_of(run, config), keep_refused=episode is None)
+    answer = ask_model(question, client, lambda: stages_in(task))
+    if answer.answered_by == BY_GRAMMAR:
+        return _asked(question, answer, config, problem)
+    added, left_out = with_added(problem, answer.stages)
+    return _asked(question, answer, config, added, left_out=left_out)
+
+
+def ask_for_goals(
+    run: RunFolder, episode: str, words: str, base: TaskFile, problem: Problem, config: PlanConfig
+) -> Asked:
+    """Ask the model of the settings what an instruction wants; ``understood`` is the task of it.
+
+    Args:
+        run: See ``ask_about``.
+        episode: Shows the start.
+        words: The instruction.
+        base: The task file of the objects that the episode shows.
+        problem: The start; of its task only the objects count.
+        config: Names the model and says whether an image may leave.
+    """
+    vocabulary = Vocabulary.of_task(
+        problem.scene.task,
+        num_keypoints=len(problem.keypoints),
+        cameras=problem.cameras,
+        objects_alone=True,
+    )
+    question = _question(run, episode, problem, vocabulary, words)
+    answer = ask_model(question, client_of(run, config), tuple)
+    if answer.answered_by == BY_GRAMMAR:
+        return _asked(question, answer, config, problem)
+    try:
+        things = vocabulary_of(base.task(), _instances(run))
+        grounding = goals_in(answer.stages, words, things, f"{config.model_name} said so")
+        file = derive_task(grounding, [base], by="model")
+        derived = retasked(problem, file.task())
+        refuse_unusable(derived)
+    except GstError as error:
+        remarks = (f"its goals cannot be used: {error}", READ_INSTEAD)
+        answer = replace(answer, answered_by=BY_GRAMMAR)
+        return _asked(question, answer, config, problem, left_out=remarks)
+    understood = UnderstoodTask(file=file, grounding=grounding)
+    added, left_out = with_added(derived, answer.stages)
+    return _asked(question, answer, config, added, left_out=left_out, understood=understood)
+
+
+def retasked(problem: Problem, task: Task) -> Problem:
+    """The same start with another task about the same objects; their calibrated masses stay."""
+    task = replace(task, objects=problem.scene.task.objects)
+    return replace(problem, scene=replace(problem.scene, task=task))
+
+
+def goals_in(
+    stages: Sequence[Stage], words: str, vocabulary: Things, explanation: str
+) -> Grounding:
+    """The goals in a model's stages: where each object ends that is let go, in that order.
+
+    Args:
+        stages: Judged by ``twin.plan.constrain.reply``.
+        words: The instruction.
+        vocabulary: Says what can move and what is open.
+        explanation: Who says so.
+
+    Raises:
+        GroundingError: When it is not said where an object ends, or it cannot end there.
+    """
+    goals = Goals(vocabulary)
+    for stage in stages:
+        if stage.release is None:
+            continue
+        mine = [goal for record in stage.subgoal if (goal := predicate_of(record)) is not None]
+        mine = [goal for goal in mine if goal["object"] == stage.release]
+        if not mine:
+            message = f"no subgoal says where {stage.release} is to end"
+            raise GroundingError("unknown_clause", message, candidates=PLACES)
+        goals.add_clause(mine)
+    goals.edges += [(number, number + 1) for number in range(len(goals.steps) - 1)]
+    goals.is_order_given = len(goals.steps) > 1
+    if not goals.steps:
+        raise GroundingError("empty", "no stage lets anything go.")
+    found = goals.checked()
+    return Grounding(
+        text=words,
+        goals=tuple(found),
+        order=ordered(goals, found),
+        is_order_given=goals.is_order_given,
+        explanation=(explanation,),
+    )
+
+
+def _instances(run: RunFolder) -> Sequence[Mapping[str, Any]]:
+    """What the run's scene says its objects look like."""
+    semantics: Mapping[str, Any] = (read_record(run) or {}).get("semantics") or {}
+    return list(semantics.get("instances", ()))
+
+
+def _question(
+    run: RunFolder, episode: str | None, problem: Problem, vocabulary: Vocabulary, words: str
+) -> Question:
+    things = vocabulary_of(problem.scene.task, _instances(run)).things
     image, marks = (None, {}) if episode is None else marked_view(run, episode, problem)
-    question = Question(
-        task=task.instruction,
-        vocabulary=Vocabulary.of_task(
-            task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
-        ),
+    return Question(
+        task=words,
+        vocabulary=vocabulary,
         labels={key: thing.describe() for key, thing in things.items()},
         image_u8=image,
         marks=marks,
         keypoints=[(each.object_id, each.name) for each in problem.keypoints],
     )
-    client = replace(client_of(run, config), keep_refused=episode is None)
-    answer = ask_model(question, client, lambda: stages_in(task))
-    remarks = answer.remarks
-    if answer.answered_by != BY_GRAMMAR:
-        problem, left_out = with_added(problem, answer.stages)
-        remarks += left_out
+
+
+def _asked(
+    question: Question,
+    answer: Answer,
+    config: PlanConfig,
+    problem: Problem,
+    *,
+    left_out: tuple[str, ...] = (),
+    understood: UnderstoodTask | None = None,
+) -> Asked:
     return Asked(
         problem=problem,
         answered_by=answer.answered_by,
+        understood=understood,
         model=config.model_name,
         address=config.model,
-        images_sent=config.send_images and image is not None,
-        remarks=remarks,
+        images_sent=config.send_images and question.image_u8 is not None,
+        remarks=(*answer.remarks, *left_out),
     )
 
 
@@ -217,6 +332,8 @@ def with_added(problem: Problem, stages: tuple[Stage, ...]) -> tuple[Problem, tu
         ids, verbs = stages_of(task, held), _verbs(stage, held, stages)
         for kind, names in (("subgoal", verbs[-1:]), ("path", verbs)):
             for record in getattr(stage, kind):
+                if kind == "subgoal" and predicate_of(record) in task.success:
+                    continue  # asked already
                 why = _misfit(problem, record, kind)
                 if kind == "subgoal" and verbs[-1] not in ids:
                     why = f"the task has no stage of its own to {verbs[-1]} {held}"
@@ -243,9 +360,7 @@ def _verbs(stage: Stage, held: str, stages: tuple[Stage, ...]) -> tuple[str, ...
 
 def _misfit(problem: Problem, record: Mapping[str, Any], kind: str) -> str:
     """Why a constraint cannot be added; empty: it can."""
-    if kind == "subgoal" and record["kind"] in _PLACES:
-        if record in goals_of(problem.scene.task, str(record.get("obj"))):
-            return "the task file asks it already"
+    if kind == "subgoal" and record["kind"] in PLACES:
         return "where objects end is the task file's to say"
     try:
         compile_constraint(record, problem)

@@ -26,10 +26,11 @@ from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.ground.run_tasks import UnderstoodTask
+from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
+from twin.plan.ground.vocabulary import GroundingError
 from twin.plan.live import PROPOSERS
 from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
-from twin.plan.model_stages import Asked, ask_about
+from twin.plan.model_stages import Asked, ask_about, ask_for_goals, client_of, retasked
 from twin.plan.problem import CameraView, Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
@@ -247,16 +248,77 @@ def _is_stationary(tree: TransformTree, frame: str, moved: bool) -> bool | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planned:
-    """What came of an instruction."""
+class Begun:
+    """The task, from where, and what a model said of it."""
 
     understood: UnderstoodTask
     start: Start
+    asked: Asked | None = None
+    """None: nobody was asked."""
+
+    def lines(self) -> list[str]:
+        """Everything for a person."""
+        asked = [] if self.asked is None else ["", *self.asked.lines()]
+        return [*self.understood.lines(), "", *self.start.lines(), *asked]
+
+    def to_json(self) -> dict[str, Any]:
+        """The same as data."""
+        return {
+            **self.understood.to_json(),
+            "start": self.start.to_json(),
+            "model": None if self.asked is None else self.asked.to_json(),
+        }
+
+
+def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
+    """Find out what is to be done and from where; a model is asked first where one is given.
+
+    Args:
+        run: With the episodes.
+        words: The instruction, or the name or file of a task.
+        config: May name the episode and the model.
+        robot: See ``start_of``.
+
+    Raises:
+        GroundingError: When neither a model nor the grammar understands the instruction.
+        NoPlanError: See ``start_of``.
+    """
+    proposer_of(config.policy)
+    if config.model:
+        client_of(run, config)
+    if not config.model or names_task(words):
+        understood = understand(run, words)
+        start = start_of(run, understood.file.task(), config, robot)
+        asked = None
+        if config.model:
+            asked = ask_about(run, start.episode.path.stem, start.problem, config)
+        return Begun(understood=understood, start=start, asked=asked)
+    base = shown_task_file(run, config.episode)
+    start = start_of(run, base.task(), config, robot)
+    episode = start.episode.path.stem
+    asked = ask_for_goals(run, episode, words, base, start.problem, config)
+    if asked.understood is not None:
+        problem = retasked(start.problem, asked.understood.file.task())
+        start = replace(start, problem=problem)
+        return Begun(understood=asked.understood, start=start, asked=asked)
+    try:
+        understood = understand(run, words)
+    except GroundingError as error:
+        told = "; ".join(asked.remarks)
+        raise GroundingError(error.kind, f"{error} The model: {told}.") from error
+    start = start_of(run, understood.file.task(), config, robot)
+    return Begun(understood=understood, start=start, asked=replace(asked, problem=start.problem))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """What came of an instruction."""
+
+    begun: Begun
+    """With what a model said, as far as plans keep it."""
     attempts: Sequence[Attempt]
     path: Path | None
     """Where the accepted plan lies; None: none was accepted."""
-    asked: Asked | None = None
-    """What a model said; None: nobody was asked."""
 
     @property
     def last(self) -> Attempt:
@@ -265,13 +327,10 @@ class Planned:
 
     def lines(self) -> list[str]:
         """Everything for a person."""
-        told = [*self.understood.lines(), "", *self.start.lines()]
-        if self.asked is not None:
-            told += ["", *self.asked.lines()]
-        told += ["", "constraints:"]
+        told = [*self.begun.lines(), "", "constraints:"]
         plan = self.last.candidate.plan
         for stage in plan.stages:
-            told += _explained(self.start.problem, plan, stage)
+            told += _explained(self.begun.start.problem, plan, stage)
         told += ["", "candidates:"]
         told += [f"  {_attempt_line(each)}" for each in self.attempts]
         told += ["", "where the numbers come from:"]
@@ -287,9 +346,7 @@ class Planned:
     def to_json(self) -> dict[str, Any]:
         """The same as data."""
         return {
-            **self.understood.to_json(),
-            "start": self.start.to_json(),
-            "model": None if self.asked is None else self.asked.to_json(),
+            **self.begun.to_json(),
             "plan": None if self.path is None else str(self.path),
             "attempts": [
                 {
@@ -308,31 +365,26 @@ class Planned:
             "constraints": [
                 line
                 for stage in self.last.candidate.plan.stages
-                for line in _explained(self.start.problem, self.last.candidate.plan, stage)
+                for line in _explained(self.begun.start.problem, self.last.candidate.plan, stage)
             ],
         }
 
 
 def plan_once(
-    run: RunFolder,
-    understood: UnderstoodTask,
-    start: Start,
-    judge: Callable[[Plan], Verdict],
-    config: PlanConfig,
+    run: RunFolder, begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
 ) -> Planned:
     """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay.
 
     Args:
         run: The accepted plan goes into its ``plans/``, those refused before beside it.
-        understood: The task.
-        start: From where.
+        begun: The task, and from where.
         judge: The twin, as a gate asks it.
         config: Policy, rounds and seed.
 
     Raises:
         NoPlanError: There is no candidate at all, not even without what a model added.
     """
-    asked = ask_about(run, start.episode.path.stem, start.problem, config) if config.model else None
+    understood, start, asked = begun.understood, begun.start, begun.asked
     try:
         attempts = _attempts(
             understood, start.problem if asked is None else asked.problem, judge, config, asked
@@ -344,7 +396,7 @@ def plan_once(
         attempts = _attempts(understood, start.problem, judge, config, asked)
     paths = [_kept(run, start, each) for each in attempts]
     path = paths[-1] if attempts[-1].verdict.accepted is True else None
-    return Planned(understood=understood, start=start, attempts=attempts, path=path, asked=asked)
+    return Planned(begun=replace(begun, asked=asked), attempts=attempts, path=path)
 
 
 def _kept(run: RunFolder, start: Start, attempt: Attempt) -> Path:

@@ -15,7 +15,6 @@ from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
-from twin.scene.shape.sdf import SdfGrid
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +30,6 @@ class Shape:
     """Below this height in the object frame nobody saw the surface."""
     error_m: float = 0.0
     """How far the surface may be off."""
-    sdf: SdfGrid | None = None
-    """Distances to it in its own frame, where the rebuilt scene has them."""
     parts_m: Mapping[str, Float[np.ndarray, "num_points 3"]] = field(default_factory=dict)
     """Points of its parts in its own frame, by their names in the rebuilt scene."""
     keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
@@ -87,7 +84,7 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """Many hypothetical states at once, NumPy float64 or torch: what constraints are asked about.
+    """Many hypothetical states at once: what constraints are asked about.
 
     Everything is batched over its first axis, ``num_states``.
     """
@@ -119,7 +116,6 @@ class Grasp:
     """Length of the straight approach along the tool's z axis."""
     contacts_m: Float[np.ndarray, "2 3"] | None = None
     """Where the pads meet the surface, object frame; None: not known."""
-    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,6 +140,5 @@ class TimedPath:
 
     times_s: Float[np.ndarray, " num_points"]
     joints_rad: Float[np.ndarray, "num_points num_joints"]
-    length_rad: float
     work: Mapping[str, float] = field(default_factory=dict)
     """Counted steps: nodes, checks, halvings; never seconds."""

@@ -15,7 +15,6 @@ from bridge.geometry import se3
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
 from twin.plan.constrain.kinds import outer_reach
-from twin.plan.grasp.search import GraspConfig
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
@@ -24,6 +23,8 @@ from twin.replay.run_job import START_KNOWN_NS, recorded_start
 _AGAIN = "Record the start again: robot-gst record RUN; a live cell asks again."
 _RIGID = 1e-3
 """By how much a rotation may differ from one."""
+MOST_UNCERTAIN_M = 0.010
+"""Standard deviation of a position beyond which nothing is planned."""
 _ON_TOP_M = 0.006
 """What lies on something begins so little under its top, or higher."""
 _PLACES = 25
@@ -48,15 +49,14 @@ def refuse_unusable(problem: Problem) -> None:
             _refuse(f"the pose of {name} is not made of numbers", "Localise it again.")
         if np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > _RIGID:
             _refuse(f"the pose of {name} has a rotation that is none", "Localise it again.")
-    most_m = GraspConfig().most_uncertain_m
     for name, covariance in scene.covariances.items():
         if not np.isfinite(covariance).all():
             _refuse(f"the covariance of {name} is not made of numbers", "Localise it again.")
         sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3]).max(), 0.0)))
-        if sigma_m > most_m:
+        if sigma_m > MOST_UNCERTAIN_M:
             _refuse(
                 f"the position of {name} is known to {sigma_m * 1e3:.0f} mm, and at most "
-                f"{most_m * 1e3:.0f} mm are good enough",
+                f"{MOST_UNCERTAIN_M * 1e3:.0f} mm are good enough",
                 "Localise it again, nearer or with more frames.",
             )
     for name in _handled(problem):

@@ -31,6 +31,7 @@ from bridge.task.verdict import Factor, Verdict
 from twin.gate import twin_process
 from twin.plan import model_stages, once
 from twin.plan.constrain.kinds import compile_constraint
+from twin.plan.constrain.relations import constraint_of, predicate_of
 from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
 from twin.plan.loop.nominal import SINGLE, PlanProposer
@@ -42,6 +43,7 @@ HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 TOP = {"obj": "cube", "anchor": "top"}
 LOW = {"kind": "height", "a": TOP, "min": -0.01, "max": 0.5}
 NEVER = {"kind": "height", "a": TOP, "min": 0.9}
+INSIDE = {"kind": "inside", "obj": "cube", "container": "box"}
 
 
 def problem_of_test() -> Problem:
@@ -53,12 +55,12 @@ def problem_of_test() -> Problem:
     )
 
 
-def reply(*path: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """A reply with these constraints on the way."""
-    record: dict[str, Any] = valid_reply()
+def reply(*path: dict[str, Any], task: str = TASK) -> dict[str, Any]:
+    """A reply that puts the cube into the box, with these constraints on the way."""
+    record: dict[str, Any] = valid_reply() | {"task": task}
     for stage in record["stages"]:
-        stage |= {"subgoal": [], "path": [], **more}
-    record["stages"][1]["path"] = list(path)
+        stage |= {"subgoal": [], "path": []}
+    record["stages"][1] |= {"subgoal": [INSIDE], "path": list(path)}
     return record
 
 
@@ -94,9 +96,13 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
 
 
 def planned(
-    run: RunFolder, server: Server, capsys: pytest.CaptureFixture[str], *more: str
+    run: RunFolder,
+    server: Server,
+    capsys: pytest.CaptureFixture[str],
+    *more: str,
+    task: str = TASK,
 ) -> tuple[dict[str, Any], Plan]:
-    command = ["plan", str(run.path), "--task", TASK, "--policy", "single", "--json"]
+    command = ["plan", str(run.path), "--task", task, "--policy", "single", "--json"]
     asked = ["--model", server.url, "--model-name", "stub", *more]
     assert robot_gst.run([*command, *asked]) == 0, capsys.readouterr().err
     data = json.loads(capsys.readouterr().out)
@@ -115,6 +121,8 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
     assert plan.grounding_source == "model"
     assert [LOW in stage.path for stage in plan.stages] == [False, True, True]
     task = TaskFile.read(Path(data["file"])).task()
+    assert task.derived is not None
+    assert task.derived["by"] == "model"
     assert [dict(item) for item in task.success] == [
         dict(item) for item in plan.stages[-1].terminal
     ]
@@ -139,6 +147,99 @@ def test_an_image_leaves_where_that_is_asked_for(
     assert len(images_in(server.asked[0])) == 1
 
 
+def understood(
+    run: RunFolder, server: Server, capsys: pytest.CaptureFixture[str], words: str
+) -> dict[str, Any]:
+    """What ``--dry`` prints."""
+    asked = ["--model", server.url, "--model-name", "stub"]
+    command = ["plan", str(run.path), "--task", words, "--dry", "--json", *asked]
+    assert robot_gst.run(command) == 0, capsys.readouterr().err
+    assert not run.tasks_dir.exists()
+    assert not run.plans_dir.exists()
+    return dict(json.loads(capsys.readouterr().out))
+
+
+@pytest.mark.parametrize("words", ["Leg den roten Würfel in die Kiste", "tidy the cube away"])
+def test_a_model_is_asked_before_the_grammar_refuses(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], words: str
+) -> None:
+    with serving(says(json.dumps(reply(LOW, task=words)))) as server:
+        data = understood(run, server, capsys, words)
+    assert len(server.asked) == 1
+    sent = json.loads(server.asked[0]["messages"][1]["content"])
+    assert sent["instruction"] == data["instruction"] == words
+    assert sent["scene"]["contacts"] is None
+    assert [each["movable"] for each in sent["scene"]["objects"]] == [True, False]
+    assert data["grounding"]["goals"] == [{"kind": "inside", "object": "cube", "container": "box"}]
+    assert [stage.get("grasp") for stage in data["stages"]] == ["cube", None, None]
+    assert data["model"]["answered_by"] == data["derived"]["by"] == "model"
+
+
+@pytest.mark.parametrize(
+    ("goal", "said"),
+    [
+        ({"kind": "height", "a": TOP, "min": 0.0}, "no subgoal says where cube is to end"),
+        ({"kind": "beside", "obj": "box", "reference": "cube"}, "unknown"),
+        ({"kind": "moved", "obj": "cube", "by": 9.0, "way": "left"}, "makes no sense"),
+        ({"kind": "inside", "obj": "cube", "container": "cube"}, "unknown"),
+    ],
+)
+def test_goals_that_cannot_be_are_left_to_the_grammar(
+    run: RunFolder, capsys: pytest.CaptureFixture[str], goal: dict[str, Any], said: str
+) -> None:
+    record = reply()
+    record["stages"][1]["subgoal"] = [goal]
+    with serving(says(json.dumps(record))) as server:
+        data = understood(run, server, capsys, TASK)
+    assert data["model"]["answered_by"] == data["derived"]["by"] == "grammar"
+    assert any(said in remark for remark in data["model"]["remarks"])
+    assert data["success"][0]["kind"] == "inside"
+
+
+def test_where_nobody_understands_both_say_why(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with serving(says("Sure!")) as server:
+        command = ["plan", str(run.path), "--task", "juggle the cube"]
+        asked = ["--model", server.url, "--model-name", "stub"]
+        assert robot_gst.run([*command, *asked]) == 2
+    said = capsys.readouterr().err
+    assert "nobody here can 'juggle'" in said
+    assert "refused the reply (model, repaired)" in said
+    assert not run.tasks_dir.exists()
+
+
+PLACES = (
+    {"kind": "inside", "obj": "cube", "container": "box", "margin": 0.01},
+    {"kind": "on", "obj": "cube", "support": "table", "tol": 0.01},
+    {"kind": "outside", "obj": "cube", "container": "box"},
+    {"kind": "beside", "obj": "cube", "reference": "box", "min_gap": 0.01, "max_gap": 0.02},
+    {"kind": "beside", "obj": "cube", "reference": "box", "direction": "left"},
+    {"kind": "between", "obj": "cube", "first": "box", "second": "lid", "tol": 0.02},
+    {"kind": "moved", "obj": "cube", "by": 0.1, "way": "left", "tol": 0.02},
+    {"kind": "moved", "obj": "cube", "at_least": 0.1, "vector": [1.0, 0.0, 0.0]},
+)
+
+
+@pytest.mark.parametrize("record", PLACES)
+def test_a_goal_and_its_constraint_say_the_same_both_ways(record: dict[str, Any]) -> None:
+    predicate = predicate_of(record)
+    assert predicate is not None
+    assert constraint_of(predicate, problem_of_test().scene.task) == record
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"kind": "inside", "obj": "cube", "container": "box", "frac": 0.9},
+        {"kind": "inside", "a": TOP, "container": "box"},
+        {"kind": "upright", "obj": "cube", "max_deg": 5.0},
+    ],
+)
+def test_what_no_predicate_says_is_no_goal(record: dict[str, Any]) -> None:
+    assert predicate_of(record) is None
+
+
 def test_garbage_leaves_it_to_the_grammar(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -155,7 +256,7 @@ def test_what_no_plan_keeps_is_left_out_and_said(
 ) -> None:
     with serving(says("no"), says(json.dumps(reply(NEVER)))) as server:
         data, plan = planned(run, server, capsys)
-    assert data["model"]["answered_by"] == plan.grounding_source == "grammar"
+    assert data["model"]["answered_by"] == plan.grounding_source == "model, repaired"
     assert any("no plan keeps what the model added" in text for text in data["model"]["remarks"])
     assert not any(stage.path for stage in plan.stages)
 
@@ -166,8 +267,8 @@ def test_a_models_stages_find_those_of_the_task() -> None:
     task = problem.scene.task
     record = reply()
     grasp, place = record["stages"]
-    inside = {"kind": "inside", "obj": "cube", "container": "box"}
-    grasp["subgoal"], place["subgoal"], place["path"] = [LOW], [inside], [NEVER]
+    outside = {"kind": "outside", "obj": "cube", "container": "box"}
+    grasp["subgoal"], place["subgoal"], place["path"] = [LOW], [INSIDE, outside], [NEVER]
     lift = {**place, "id": "lift", "subgoal": [NEVER], "path": [LOW], "allowed_contacts": []}
     del lift["release"]
     record["stages"] = [grasp, lift, place]
@@ -175,9 +276,10 @@ def test_a_models_stages_find_those_of_the_task() -> None:
     changed, remarks = model_stages.with_added(problem, stages)
     found = [(each.get("subgoal"), each.get("path")) for each in changed.scene.task.stages]
     assert found == [([LOW], None), (None, [LOW, NEVER])]  # this task carries as it releases
-    assert len(remarks) == 2
+    assert len(remarks) == 3
     assert "height of stage lift: the task has no stage of its own to carry cube" in remarks[0]
-    assert "inside of stage place" in remarks[1]
+    assert "inside of stage place" in remarks[1]  # with another margin than the task's
+    assert "outside of stage place" in remarks[2]
     assert changed.scene.task.success == task.success
     carry = {"id": "carry", "carry": "cube", "text": "", "allowed_contacts": []}
     three = replace(task, stages=(task.stages[0], carry, task.stages[1]))
@@ -202,7 +304,7 @@ def test_a_plan_keeps_what_is_asked_of_a_keypoint_where_it_lets_go(
     problem = replace(problem_of_test(), keypoints=(TOP_CORNER,))
     monkeypatch.setattr(sys.modules[__name__], "problem_of_test", lambda: problem)
     wanted = reply()
-    wanted["stages"][1]["subgoal"] = [NEAR]
+    wanted["stages"][1]["subgoal"] = [INSIDE, NEAR]
     with serving(says(json.dumps(wanted))) as server:
         data, plan = planned(run, server, capsys)
     assert data["model"]["answered_by"] == "model"
@@ -240,7 +342,6 @@ def test_keypoints_and_cameras_change_no_plan_that_names_none() -> None:
         (["--send-images"], "--model URL"),
         (["--policy", "model"], "--model URL"),
         (["--model", "nowhere", "--model-name", "m"], "must begin with http"),
-        (["--model", "http://127.0.0.1:9/v1", "--model-name", "m", "--dry"], "asks no model"),
     ],
 )
 def test_half_a_model_is_wrong_use(

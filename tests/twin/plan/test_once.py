@@ -31,7 +31,7 @@ from dashboards.rerun_view import export_rrd, run_of
 from dashboards.rerun_viewer import episode_of
 from twin.plan.config import PlanConfig
 from twin.plan.ground.run_tasks import UnderstoodTask
-from twin.plan.once import Planned, Start, cameras_at, plan_once, start_of
+from twin.plan.once import Begun, Planned, Start, cameras_at, plan_once, start_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
@@ -67,7 +67,8 @@ def planned(run: RunFolder, answers: list[bool]) -> Planned:
     left = iter(answers)
     understood = UnderstoodTask(file=FILE, grounding=None)
     config = PlanConfig(policy="geometric", rounds=len(answers))
-    return plan_once(run, understood, start, lambda plan: verdict(plan, next(left)), config)
+    begun = Begun(understood=understood, start=start)
+    return plan_once(run, begun, lambda plan: verdict(plan, next(left)), config)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +124,8 @@ def test_where_plans_begin_is_said(steered: tuple[RunFolder, Planned]) -> None:
     _, done = steered
     assert "  arm: as recorded" in done.lines()
     assert done.to_json()["start"]["arm"] == "as recorded"
-    home = replace(done, start=replace(done.start, from_home="no joint states were recorded"))
+    start = replace(done.begun.start, from_home="no joint states were recorded")
+    home = replace(done, begun=replace(done.begun, start=start))
     assert "  arm: its home posture, for no joint states were recorded" in home.lines()
 
 

@@ -10,7 +10,7 @@ from bridge.geometry.mesh import sample_triangles
 from bridge.task.relations import AXES
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array, like, namespace
+from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.schema import BASE
 from twin.plan.problem import Problem, State
 
@@ -24,7 +24,7 @@ Point = Callable[[State], Array]
 
 def pose_of(state: State, object_id: str) -> Array:
     """Poses of an object, ``(num_states, 4, 4)``, or one for all states."""
-    return like(state.Ts_base_object[object_id], state.T_base_tcp)
+    return state.Ts_base_object[object_id]
 
 
 def half_extents_m(model: ObjectModel) -> Float[np.ndarray, "3"]:
@@ -45,13 +45,13 @@ def box_pose(state: State, object_id: str, problem: Problem) -> Array:
         return T
     shift = np.eye(4)
     shift[:3, 3] = _middle_m(model)
-    return T @ like(shift, T)
+    return T @ shift
 
 
 def heights(state: State, object_id: str, problem: Problem) -> tuple[Array, Array]:
     """Of the lowest and of the highest point of the box around an object [m]."""
     T = box_pose(state, object_id, problem)
-    reach = (abs(T[:, 2, :3]) * like(half_extents_m(problem.model(object_id)), T)).sum(-1)
+    reach = (abs(T[:, 2, :3]) * half_extents_m(problem.model(object_id))).sum(-1)
     return T[:, 2, 3] - reach, T[:, 2, 3] + reach
 
 
@@ -82,19 +82,19 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
     if "xyz" in spec:
         p, frame = np.array(spec["xyz"], dtype=np.float64) + offset, spec.get("frame", BASE)
         if frame == BASE:
-            return lambda state: like(p, state.T_base_tcp)[None], f"the point {millimetres(p)}"
+            return lambda state: p[None], f"the point {millimetres(p)}"
         return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
     ids = [spec["kp"]] if "kp" in spec else list(spec["mean"])
     points = [problem.keypoints[index] for index in ids]
 
     def mean(state: State) -> Array:
         places = [
-            like(point.p_m, state.T_base_tcp)[None]
+            point.p_m[None]
             if point.object_id is None
             else _at(pose_of(state, point.object_id), point.p_m)
             for point in points
         ]
-        return sum(places) / len(places) + like(offset, state.T_base_tcp)
+        return sum(places) / len(places) + offset
 
     called = [f"{k} ({words})" if (words := problem.keypoints[k].words) else f"{k}" for k in ids]
     words = f"keypoint {called[0]}"
@@ -104,7 +104,7 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
 
 
 def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
-    return arrays.carried(T, like(p_m, T)[None])[:, 0]
+    return arrays.carried(T, p_m[None])[:, 0]
 
 
 def millimetres(p_m: Float[np.ndarray, " num"]) -> str:
@@ -142,7 +142,7 @@ def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
             f"{spec['obj']}'s {name} axis",
         )
     axis = sign * np.eye(3)[column]
-    return lambda state: like(axis, state.T_base_tcp)[None, None], f"the base frame's {name} axis"
+    return lambda state: axis[None, None], f"the base frame's {name} axis"
 
 
 def surface_points(
@@ -168,8 +168,7 @@ def surface_points(
 
 def quantile(values: Array, share: float) -> Array:
     """The value that this share of each row does not exceed."""
-    xp = namespace(values)
     count = values.shape[-1]
     index = min(max(int(np.ceil(share * count)) - 1, 0), count - 1)
-    ordered = np.sort(values, axis=-1) if xp is np else xp.sort(values, axis=-1)[0]
+    ordered = np.sort(values, axis=-1)
     return ordered[..., index]

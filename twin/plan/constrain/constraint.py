@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.plan.constrain.arrays import Array, namespace
+from twin.plan.constrain.arrays import Array
 from twin.plan.problem import State
 
 Measure = Callable[[State], Array]
@@ -91,16 +91,15 @@ class Constraint:
 
         The violation is the greatest. Least squares over the parts sees what the others need.
         """
-        xp = namespace(state.T_base_tcp)
         found = [
             term.excess(state) * (1.0 if term.unit == self.unit else self.scale / SCALES[term.unit])
             for term in self.terms
         ]
-        return xp.stack(found, axis=-1)
+        return np.stack(found, axis=-1)
 
     def violation(self, state: State) -> Array:
         """Return f of each state, ``(num_states,)``: above 0 violated, by so much of ``unit``."""
-        return namespace(state.T_base_tcp).amax(self.parts(state), axis=-1)
+        return np.amax(self.parts(state), axis=-1)
 
     def explain(self, state: State) -> str:
         """Say what is asked and what the first of the states has, in words with numbers."""
@@ -123,7 +122,7 @@ def worst_along(constraint: Constraint, states: State, *, times_s: Array | None 
         return constraint.along(states, times_s)
     num_states, num_steps = states.T_base_tcp.shape[:2]
     found = constraint.violation(flattened(states)).reshape(num_states, num_steps)
-    return namespace(found).amax(found, axis=-1)
+    return np.amax(found, axis=-1)
 
 
 def flattened(states: State) -> State:
@@ -132,16 +131,15 @@ def flattened(states: State) -> State:
     Args:
         states: As ``worst_along`` takes them.
     """
-    xp = namespace(states.T_base_tcp)
     num_states, num_steps = states.T_base_tcp.shape[:2]
 
     def flat(Ts: Array) -> Array:
-        return xp.broadcast_to(Ts, (num_states, num_steps, 4, 4)).reshape(-1, 4, 4)
+        return np.broadcast_to(Ts, (num_states, num_steps, 4, 4)).reshape(-1, 4, 4)
 
     return State(
         Ts_base_object={name: flat(Ts) for name, Ts in states.Ts_base_object.items()},
         T_base_tcp=flat(states.T_base_tcp),
-        width_m=xp.broadcast_to(states.width_m, (num_states, num_steps)).reshape(-1),
+        width_m=np.broadcast_to(states.width_m, (num_states, num_steps)).reshape(-1),
     )
 
 

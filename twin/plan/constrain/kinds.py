@@ -16,7 +16,7 @@ from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array, like, namespace, norm
+from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
     Point,
     Record,
@@ -151,8 +151,7 @@ def _align(record: Record, problem: Problem) -> Constraint:
 
     def off(state: State) -> Array:
         pairs = arrays.angle(a(state)[:, :, None], b(state)[:, None], undirected=undirected)
-        xp = namespace(pairs)
-        return xp.amin(xp.amin(pairs, axis=2), axis=1)
+        return np.amin(np.amin(pairs, axis=2), axis=1)
 
     term = Term(
         what=f"the angle between {a_name} and {b_name}",
@@ -169,7 +168,7 @@ def _relpose(record: Record, problem: Problem) -> Constraint:
     T_wanted = se3.transform_from(q, np.array(record["p"], dtype=np.float64))
 
     def reached(state: State) -> Array:
-        T = like(T_wanted, state.T_base_tcp)[None]
+        T = T_wanted[None]
         return T if reference == BASE else pose_of(state, reference) @ T
 
     return Constraint.of(record, *_near_pose(f"{obj} from its place", obj, reached, record))
@@ -209,8 +208,8 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
 
         def over_table(state: State) -> Array:
             T = pose_of(state, obj)
-            z = arrays.carried(T, like(points, T))[..., 2]
-            return namespace(T).amin(z, axis=-1) - height
+            z = arrays.carried(T, points)[..., 2]
+            return np.amin(z, axis=-1) - height
 
         return over_table
     if against == SCENE:
@@ -224,20 +223,19 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
 
         def over_scene(state: State) -> Array:
             T = pose_of(state, obj)
-            found = arrays.grid_distance(grid, arrays.carried(T, like(points, T)))
-            return namespace(T).amin(found, axis=-1)
+            found = grid.distance(arrays.carried(T, points))
+            return np.amin(found, axis=-1)
 
         return over_scene
     others = surface_points(problem, against)
 
     def between(state: State) -> Array:
         T, T_other = pose_of(state, obj), pose_of(state, against)
-        xp = namespace(state.T_base_tcp)
-        there = arrays.seen_from(T_other, arrays.carried(T, like(points, T)))
-        back = arrays.seen_from(T, arrays.carried(T_other, like(others, T_other)))
-        return xp.minimum(
-            xp.amin(_panel_distance(problem.model(against), there), axis=-1),
-            xp.amin(_panel_distance(problem.model(obj), back), axis=-1),
+        there = arrays.seen_from(T_other, arrays.carried(T, points))
+        back = arrays.seen_from(T, arrays.carried(T_other, others))
+        return np.minimum(
+            np.amin(_panel_distance(problem.model(against), there), axis=-1),
+            np.amin(_panel_distance(problem.model(obj), back), axis=-1),
         )
 
     return between
@@ -248,8 +246,8 @@ def _panel_distance(model: ObjectModel, points: Array) -> Array:
     centres, sizes = zip(*model.panels(), strict=True)
     return arrays.boxes_distance(
         points,
-        [like(centre, points) for centre in centres],
-        [like(np.array(size) / 2, points) for size in sizes],
+        centres,
+        [np.array(size) / 2 for size in sizes],
     )
 
 
@@ -262,7 +260,7 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
 
         def points(state: State) -> Array:
             T = pose_of(state, obj)
-            return arrays.carried(T, like(surface, T))
+            return arrays.carried(T, surface)
     else:
         point, name = point_of(record["a"], problem)
 
@@ -271,7 +269,7 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
 
     def least(state: State) -> Array:
         found = distance(state, points(state))
-        return namespace(found).amin(found, axis=-1)
+        return np.amin(found, axis=-1)
 
     return Constraint.of(
         record,
@@ -289,7 +287,7 @@ def _region(spec: Record, problem: Problem) -> tuple[Callable[[State, Array], Ar
         low, high = (np.array(spec["box"][key], dtype=np.float64) for key in ("min", "max"))
 
         def of_box(state: State, points: Array) -> Array:
-            centre, half = like((low + high) / 2, points), like((high - low) / 2, points)
+            centre, half = (low + high) / 2, (high - low) / 2
             return arrays.box_distance(points, half, centre)
 
         return of_box, f"the box from {millimetres(low)} to {millimetres(high)}"
@@ -297,7 +295,7 @@ def _region(spec: Record, problem: Problem) -> tuple[Callable[[State, Array], Ar
         centre = np.array(spec["sphere"]["centre"], dtype=np.float64)
         radius = spec["sphere"]["radius"]
         return (
-            lambda state, points: norm(points - like(centre, points)) - radius,
+            lambda state, points: norm(points - centre) - radius,
             f"the sphere of {radius * 1e3:.0f} mm around {millimetres(centre)}",
         )
     over = spec["over"]
@@ -306,7 +304,7 @@ def _region(spec: Record, problem: Problem) -> tuple[Callable[[State, Array], Ar
     def of_column(state: State, points: Array) -> Array:
         """Of an upright column over the box around an object that stands upright."""
         q = arrays.seen_from(box_pose(state, over, problem), points)[..., :2]
-        return arrays.box_distance(q, like(half[:2], points))
+        return arrays.box_distance(q, half[:2])
 
     return of_column, f"what is over {over}"
 
@@ -342,11 +340,11 @@ def _speed(record: Record, problem: Problem) -> Constraint:
     def along(states: State, times_s: Array | None) -> Array:
         num_states, num_steps = states.T_base_tcp.shape[:2]
         if times_s is None or num_steps < 2:
-            return like(np.full(num_states, -limit), states.T_base_tcp)
+            return np.full(num_states, -limit)
         p = point(flattened(states)).reshape(num_states, num_steps, 3)
         seconds = times_s[1:] - times_s[:-1]
         speeds = norm(p[:, 1:] - p[:, :-1]) / seconds
-        return namespace(p).amax(speeds, axis=-1) - limit
+        return np.amax(speeds, axis=-1) - limit
 
     term = Term(what=f"the speed of {name}", measure=_nothing, high=limit, unit="m/s")
     return replace(Constraint.of(record, term), along=along)
@@ -367,7 +365,6 @@ def _hold(record: Record, problem: Problem) -> Constraint:
     def along(states: State, times_s: Array | None) -> Array:
         num_states, num_steps = states.T_base_tcp.shape[:2]
         steps = flattened(states)
-        xp = namespace(steps.T_base_tcp)
         T_tcp, T_object = steps.T_base_tcp, pose_of(steps, obj)
         R_in_hand = T_tcp[:, :3, :3].swapaxes(1, 2) @ T_object[:, :3, :3]
         p_in_hand = arrays.seen_from(T_tcp, T_object[:, None, :3, 3])[:, 0]
@@ -376,7 +373,7 @@ def _hold(record: Record, problem: Problem) -> Constraint:
         slid = norm(p - p[:, :1]) - limits["tol"]
         turned = arrays.turn(R[:, :1].swapaxes(2, 3) @ R) - np.radians(limits["tol_deg"])
         scale = SCALES["m"] / SCALES["rad"]
-        return xp.amax(xp.maximum(slid, turned * scale), axis=-1)
+        return np.amax(np.maximum(slid, turned * scale), axis=-1)
 
     what = f"the way {obj} has slid in the hand"
     term = Term(what=what, measure=_nothing, high=limits["tol"])
@@ -393,9 +390,7 @@ def _reach(record: Record, problem: Problem) -> Constraint:
         record,
         Term(
             what="the distance of the tool from the arm's first joint",
-            measure=lambda state: norm(
-                state.T_base_tcp[:, :3, 3] - like(p_shoulder, state.T_base_tcp)
-            ),
+            measure=lambda state: norm(state.T_base_tcp[:, :3, 3] - p_shoulder),
             high=length_m - record.get("margin", 0.0),
         ),
     )
@@ -436,23 +431,22 @@ def _visible(record: Record, problem: Problem) -> Constraint:
     def hidden(state: State) -> Array:
         """Of each point: how far out of the picture or behind something; negative in view."""
         T = pose_of(state, obj)
-        xp = namespace(T)
-        p = arrays.carried(T, like(points, T))
-        T_camera = like(view.T_base_camera, T)[None]
+        p = arrays.carried(T, points)
+        T_camera = view.T_base_camera[None]
         if view.T_tcp_camera is not None:
-            T_camera = state.T_base_tcp @ like(view.T_tcp_camera, T)
+            T_camera = state.T_base_tcp @ view.T_tcp_camera
         lens_m = T_camera[:, None, :3, 3]
         each = 0.0 * state.T_base_tcp[:, :1, 0]  # of what stands still there is one
-        found = [xp.amax(arrays.seen_from(T_camera, p) @ like(planes.T, T), axis=-1) + each]
+        found = [np.amax(arrays.seen_from(T_camera, p) @ planes.T, axis=-1) + each]
         for other in (key for key in others if key in state.Ts_base_object):
             T_other = pose_of(state, other)
             for centre, size in problem.model(other).panels():
                 shift = np.eye(4)
                 shift[:3, 3] = centre
-                half = like(np.array(size) / 2, T)
-                T_panel = T_other @ like(shift, T)
+                half = np.array(size) / 2
+                T_panel = T_other @ shift
                 found.append(arrays.blocked_length(lens_m, p, T_panel, half) + each)
-        return quantile(xp.amax(xp.stack(found, axis=-1), axis=-1), share)
+        return quantile(np.amax(np.stack(found, axis=-1), axis=-1), share)
 
     term = Term(
         what=f"{share:.0%} of the surface of {obj} out of the view of {name}",

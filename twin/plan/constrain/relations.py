@@ -24,7 +24,7 @@ from bridge.task.relations import (
 )
 from bridge.task.task_file import Task
 from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array, like, namespace, norm
+from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
     Point,
     Record,
@@ -57,7 +57,7 @@ def _on(record: Record, problem: Problem) -> Constraint:
 
 def _top(state: State, support: str, problem: Problem) -> Array:
     if support == TABLE:
-        return like(problem.scene.table_height_m, state.T_base_tcp)
+        return problem.scene.table_height_m
     return heights(state, support, problem)[1]
 
 
@@ -67,14 +67,13 @@ def _over_support(record: Record, problem: Problem, support: str, margin: float)
 
     def over(state: State) -> Array:
         T_object, T = box_pose(state, obj, problem), box_pose(state, support, problem)
-        xp = namespace(state.T_base_tcp)
         top = heights(state, support, problem)[1]
         x, y = T_object[:, 0, 3], T_object[:, 1, 3]
-        contact = xp.stack([x, y, top + 0.0 * x], axis=-1)
-        excess = abs(arrays.seen_from(T, contact[:, None])[:, 0]) - like(half, T)
+        contact = np.stack([x, y, top + 0.0 * x], axis=-1)
+        excess = abs(arrays.seen_from(T, contact[:, None])[:, 0]) - half
         up = abs(T[:, 2, :3])
-        upward = up == xp.amax(up, axis=-1)[:, None]  # the face that looks up is no edge
-        return xp.amax(xp.where(upward, -np.inf, excess), axis=-1)
+        upward = up == np.amax(up, axis=-1)[:, None]  # the face that looks up is no edge
+        return np.amax(np.where(upward, -np.inf, excess), axis=-1)
 
     return Term(
         what=f"the middle of {obj} beyond the edge of {support}", measure=over, high=-margin
@@ -105,7 +104,7 @@ def _share_inside(record: Record, problem: Problem, margin: float) -> Term:
     points = surface_points(problem, obj)
     excess = _cavity_excess(
         record["container"],
-        lambda state: arrays.carried(pose_of(state, obj), like(points, state.T_base_tcp)),
+        lambda state: arrays.carried(pose_of(state, obj), points),
         problem,
     )
     return Term(
@@ -123,8 +122,8 @@ def _cavity_excess(container: str, points: Point, problem: Problem) -> Callable[
 
     def excess(state: State) -> Array:
         T = pose_of(state, container)
-        q = arrays.seen_from(T, points(state)) - like(centre, T)
-        return namespace(T).amax(abs(q) - like(inner / 2, T), axis=-1)
+        q = arrays.seen_from(T, points(state)) - centre
+        return np.amax(abs(q) - inner / 2, axis=-1)
 
     return excess
 
@@ -147,7 +146,7 @@ def _outline_gap(a: str, b: str, problem: Problem) -> Callable[[State], Array]:
 
     def gap(state: State) -> Array:
         T_a, T_b = (box_pose(state, name, problem) for name in (a, b))
-        return arrays.footprint_gap(T_a, like(half_a, T_a), T_b, like(half_b, T_b))
+        return arrays.footprint_gap(T_a, half_a, T_b, half_b)
 
     return gap
 
@@ -168,9 +167,9 @@ def _beside(record: Record, problem: Problem) -> Constraint:
 
         def off(state: State) -> Array:
             way = (box_pose(state, obj, problem) - box_pose(state, reference, problem))[:, :2, 3]
-            side = like((x, y), way)
+            side = np.array((x, y))
             across = way[:, 0] * side[1] - way[:, 1] * side[0]
-            return namespace(way).arctan2(norm(across[:, None]), (way * side).sum(-1))
+            return np.arctan2(norm(across[:, None]), (way * side).sum(-1))
 
         terms.append(
             Term(
@@ -197,8 +196,7 @@ def _common_height(a: str, b: str, problem: Problem) -> Callable[[State], Array]
     def measure(state: State) -> Array:
         low_a, high_a = heights(state, a, problem)
         low_b, high_b = heights(state, b, problem)
-        xp = namespace(low_a)
-        return xp.minimum(high_a, high_b) - xp.maximum(low_a, low_b)
+        return np.minimum(high_a, high_b) - np.maximum(low_a, low_b)
 
     return measure
 
@@ -219,7 +217,7 @@ def _between(record: Record, problem: Problem) -> Constraint:
         """How far a box extends along a horizontal unit vector."""
         T = box_pose(state, name, problem)
         shares = (along[:, None] @ T[:, :2, :3])[:, 0]
-        return (abs(shares) * like(half_extents_m(problem.model(name)), T)).sum(-1)
+        return (abs(shares) * half_extents_m(problem.model(name))).sum(-1)
 
     def before(state: State) -> Array:
         along, _, offset = line(state)
@@ -257,11 +255,10 @@ def _upright(record: Record, problem: Problem) -> Constraint:
         R = pose_of(state, obj)[:, :3, :3]
         if not is_cube:
             up = R[:, :, 2]
-            return namespace(R).arctan2(norm(up[:, :2]), up[:, 2])
+            return np.arctan2(norm(up[:, :2]), up[:, 2])
         up = abs(R[:, 2])  # of each axis, either way up
-        xp = namespace(R)
         flat = norm(R[:, :2].swapaxes(1, 2))
-        return xp.amin(xp.arctan2(flat, up), axis=-1)
+        return np.amin(np.arctan2(flat, up), axis=-1)
 
     return Constraint.of(
         record,
@@ -282,12 +279,11 @@ def _stable(record: Record, problem: Problem) -> Constraint:
     def beyond(state: State) -> Array:
         """How far the plumb line through the middle leaves the face that looks down."""
         down = -pose_of(state, obj)[:, 2, :3]  # in the object frame
-        xp = namespace(down)
         steep = abs(down)
-        lower = steep == xp.amax(steep, axis=-1)[:, None]
-        length = xp.where(lower, like(half, down) / xp.where(lower, steep, 1.0), 0.0).sum(-1)
-        aside = abs(down) * length[:, None] - like(half, down)
-        return xp.amax(xp.where(lower, -np.inf, aside), axis=-1)
+        lower = steep == np.amax(steep, axis=-1)[:, None]
+        length = np.where(lower, half / np.where(lower, steep, 1.0), 0.0).sum(-1)
+        aside = abs(down) * length[:, None] - half
+        return np.amax(np.where(lower, -np.inf, aside), axis=-1)
 
     what = f"the plumb line of {obj} beyond its own lower face"
     terms = [Term(what=what, measure=beyond, high=-margin)]
@@ -306,12 +302,12 @@ def _moved(record: Record, problem: Problem) -> Constraint:
     direction = None if named is None else direction_of(named)
 
     def way(state: State) -> Array:
-        return pose_of(state, obj)[:, :3, 3] - like(start, state.T_base_tcp)
+        return pose_of(state, obj)[:, :3, 3] - start
 
     def length(state: State) -> Array:
         if direction is None:
             return norm(way(state))
-        return (way(state) * like(direction, state.T_base_tcp)).sum(-1)
+        return (way(state) * direction).sum(-1)
 
     terms = []
     if "at_least" in record or "at_most" in record:
@@ -330,7 +326,7 @@ def _near_point(obj: str, target: Float[np.ndarray, " num"], tol: float) -> Term
     """An object's origin near a point of the base frame; near one of two numbers from above."""
 
     def off(state: State) -> Array:
-        return norm(pose_of(state, obj)[:, : len(target), 3] - like(target, state.T_base_tcp))
+        return norm(pose_of(state, obj)[:, : len(target), 3] - target)
 
     return Term(what=f"the distance of {obj} from {millimetres(target)}", measure=off, high=tol)
 
@@ -347,6 +343,8 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
 }
 """By the name of the kind."""
 
+PLACES = ("inside", "on", "outside", "beside", "between", "moved")
+"""Kinds that say where an object ends."""
 _KEYS = {
     "object": "obj",
     "margin_m": "margin",
@@ -383,6 +381,26 @@ def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
         if "by" in record:
             record.setdefault("tol", MOVED_TOLERANCE_M)
     return record
+
+
+def predicate_of(record: Record) -> dict[str, Any] | None:
+    """Write a constraint about where an object ends as the success predicate that decides the same.
+
+    The other way round of ``constraint_of``; None: no predicate says it.
+
+    Args:
+        record: That fits the schema of constraints.
+    """
+    if record["kind"] not in PLACES or "obj" not in record or "frac" in record:
+        return None
+    names = {value: key for key, value in _KEYS.items()} | {"way": "direction"}
+    names["vector"] = "direction"
+    found = {names.get(key, key): value for key, value in record.items()}
+    if "min_gap" in found or "max_gap" in found:
+        low, high = BESIDE_GAP_M
+        low, high = found.pop("min_gap", low), found.pop("max_gap", high)
+        found["gap_m"] = [low, max(low, high)]
+    return found
 
 
 def _aligned(predicate: Record, task: Task) -> dict[str, Any]:

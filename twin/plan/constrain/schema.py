@@ -46,22 +46,31 @@ class Vocabulary:
     """Pairs that may touch at some time, from the task file; None: no task file says so yet."""
 
     @staticmethod
-    def of_task(task: Task, *, num_keypoints: int = 0, cameras: Iterable[str] = ()) -> "Vocabulary":
+    def of_task(
+        task: Task,
+        *,
+        num_keypoints: int = 0,
+        cameras: Iterable[str] = (),
+        objects_alone: bool = False,
+    ) -> "Vocabulary":
         """Read off a task file what may be named.
 
         Args:
             task: Its stages say which bodies may touch.
             num_keypoints: How many points have numbers.
             cameras: Their names.
+            objects_alone: What the task does with its objects is not asked for: whatever is not
+                fixed may be moved, and contacts are not known yet.
         """
         pairs = (pair for stage in task.stages for pair in stage.get("allowed_contacts", ()))
+        free = tuple(key for key, model in task.objects.items() if not model.fixed)
         return Vocabulary(
             objects=tuple(task.objects),
-            movable=task.manipulated,
+            movable=free if objects_alone else task.manipulated,
             containers=tuple(key for key, model in task.objects.items() if _has_cavity(model)),
             cameras=tuple(sorted(cameras)),
             num_keypoints=num_keypoints,
-            allowed_contacts=frozenset(frozenset(pair) for pair in pairs),
+            allowed_contacts=None if objects_alone else frozenset(map(frozenset, pairs)),
         )
 
     @cache  # noqa: B019  # as many as there are tasks

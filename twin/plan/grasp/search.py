@@ -12,9 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bridge.errors import refuse_outside
 from bridge.geometry import se3
-from bridge.task.check import nearest
 from twin.errors import TwinError
 from twin.physics.config import PhysicsConfig
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
@@ -65,63 +63,38 @@ class NoGraspError(TwinError):
         super().__init__(f"no grasp of {object_id}: {found}. {hint}")
 
 
+FRICTION = 0.5
+"""Least friction coefficient between pads and object that a grasp must hold with."""
+CONE_RAD = float(np.arctan(FRICTION))
+"""Half the opening of the friction cone."""
+APPROACHES_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
+"""Turns about the closing line, from the approach nearest to straight down."""
+MOST_TILT_RAD = 0.9
+"""Of the approach from straight down."""
+DEPTHS_M = (0.0, -0.005, 0.012)
+"""How far the tool centre point goes beyond the closing line."""
+PREGRASP_M = 0.08
+"""Length of the straight approach."""
+ROBOT_ERROR_M = 0.0015
+"""Standard deviation of the tool in any direction."""
+SAME_M, SAME_RAD = 0.01, 0.1745
+"""Grasps nearer than this to a better one, and turned by less than ten degrees, are it."""
+SEED = 0
+"""Of all that is drawn."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class GraspConfig:
     """How grasps are searched."""
 
     samples: int = 800
     """Points of the surface that closing lines start from."""
-    friction: float = 0.5
-    """Least friction coefficient between pads and object that a grasp must hold with."""
     clearance_m: float = 0.003
     """Between each pad and the object, and between the hand and anything else [m]."""
-    approaches_rad: tuple[float, ...] = (0.0, -0.35, 0.35, -0.7, 0.7)
-    """Turns about the closing line, from the approach nearest to straight down [rad]."""
-    most_tilt_rad: float = 0.9
-    """Of the approach from straight down [rad]."""
-    depths_m: tuple[float, ...] = (0.0, -0.005, 0.012)
-    """How far the tool centre point goes beyond the closing line [m]."""
-    pregrasp_m: float = 0.08
-    """Length of the straight approach [m]."""
-    most_uncertain_m: float = 0.010
-    """Standard deviation of the position beyond which nothing is grasped [m]."""
-    robot_error_m: float = 0.0015
-    """Standard deviation of the tool in any direction [m]."""
     least_margin: float = 1.0
     """Standard deviations that a grasp must bear."""
-    merge_m: float = 0.01
-    """Grasps nearer than this to a better one, and turned by less than ``merge_rad``, are it."""
-    merge_rad: float = 0.1745
-    """Ten degrees."""
     most: int = 100
     """Grasps that are returned."""
-    seed: int = 0
-    """Of all that is drawn."""
-
-    def __post_init__(self) -> None:
-        """Refuse what searches nothing."""
-        refuse_outside(
-            self,
-            {
-                "samples": (1, 100_000),
-                "friction": (0.01, 10.0),
-                "clearance_m": (0.0, 0.1),
-                "most_tilt_rad": (0.0, np.pi),
-                "pregrasp_m": (0.0, 1.0),
-                "most_uncertain_m": (0.0, 1.0),
-                "robot_error_m": (0.0, 0.1),
-                "least_margin": (-100.0, 100.0),
-                "merge_m": (0.0, 1.0),
-                "merge_rad": (0.0, np.pi),
-                "most": (1, 100_000),
-                "seed": (0, 2**63),
-            },
-        )
-
-    @property
-    def cone_rad(self) -> float:
-        """Half the opening of the friction cone."""
-        return float(np.arctan(self.friction))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,12 +219,11 @@ class GraspSearcher:
         open_m: float,
     ) -> tuple[OpenHand, _Candidates, tuple[Grasp, ...]]:
         """Search with the hand opened so far."""
-        config = self.config
         T = self.problem.scene.Ts_base_object[object_id]
         pairs, rejected = self._pairs(object_id, part_points_m, open_m)
-        hand = open_hand(self.problem.robot, open_m, config.pregrasp_m)
+        hand = open_hand(self.problem.robot, open_m, PREGRASP_M)
         found = self._hands_on(pairs, T, hand, rejected)
-        points = self._surface(object_id).points(_TARGET_POINTS, config.seed)
+        points = self._surface(object_id).points(_TARGET_POINTS, SEED)
         self._past_table(found, T, hand)
         self._past_object(found, points, hand)
         self._past_neighbours(found, object_id, T, hand)
@@ -260,44 +232,12 @@ class GraspSearcher:
 
     def _refuse(self, object_id: str) -> None:
         """Say what makes a search pointless."""
-        scene = self.problem.scene
-        refusal: tuple[str, str, str] | None = None
-        if object_id not in scene.task.objects:
-            known = ", ".join(scene.task.objects)
-            refusal = (
-                "unknown",
-                f"task {scene.task.name} has no such object",
-                f"It has: {known}.{nearest(object_id, scene.task.objects)}",
-            )
-        elif object_id in scene.containers() or scene.task.objects[object_id].fixed:
-            refusal = ("fixed", "it is fixed", "Choose an object that may be moved.")
-        elif object_id not in scene.Ts_base_object:
-            why = scene.reasons.get(object_id, "it was not looked for")
-            refusal = ("not_localised", f"it was not localised ({why})", "Localise it first.")
-        elif not np.isfinite(scene.Ts_base_object[object_id]).all():
-            refusal = ("not_localised", "its pose is not made of numbers", "Localise it again.")
-        else:
-            refusal = self._uncertain(object_id) or self._covered(object_id)
-            refusal = refusal or self._too_heavy(object_id)
+        refusal = self._covered(object_id) or self._too_heavy(object_id)
         if refusal is not None:
             cause, found, hint = refusal
             raise NoGraspError(
                 object_id=object_id, cause=cause, found=found, hint=hint, rejected={}
             )
-
-    def _uncertain(self, object_id: str) -> tuple[str, str, str] | None:
-        covariance = self._covariance(object_id)
-        if not np.isfinite(covariance).all():
-            return ("uncertain", "its covariance is not made of numbers", "Localise it again.")
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]).max()))
-        if sigma_m <= self.config.most_uncertain_m:
-            return None
-        return (
-            "uncertain",
-            f"its position is known to {sigma_m * 1e3:.0f} mm, and at most "
-            f"{self.config.most_uncertain_m * 1e3:.0f} mm are good enough",
-            "Localise it again, nearer or with more frames.",
-        )
 
     def _covered(self, object_id: str) -> tuple[str, str, str] | None:
         """Whether something lies on it: lifting it would throw that down."""
@@ -311,7 +251,7 @@ class GraspSearcher:
         middle = own[:, :2].mean(axis=0)
         reach_m = float(np.linalg.norm(own[:, :2] - middle, axis=1).max())
         for name, T in scene.movable().items():
-            if name == object_id or not np.isfinite(T).all():
+            if name == object_id:
                 continue
             centre, radius_m = self._surface(name).ball
             away = se3.apply(T, centre[None])[0, :2] - middle
@@ -326,7 +266,7 @@ class GraspSearcher:
     def _too_heavy(self, object_id: str) -> tuple[str, str, str] | None:
         model = self.problem.model(object_id)
         weight_N = model.mass_kg * PhysicsConfig().gravity_m_s2 * _SAFETY
-        held_N = 2 * self.config.friction * self._grip_N()
+        held_N = 2 * FRICTION * self._grip_N()
         if weight_N <= held_N:
             return None
         return (
@@ -366,16 +306,16 @@ class GraspSearcher:
         pairs = antipodal_pairs(
             self._surface(object_id),
             count=config.samples,
-            cone_rad=config.cone_rad,
+            cone_rad=CONE_RAD,
             hint_m=self.problem.model(object_id).grasp_m,
-            seed=config.seed,
+            seed=SEED,
         )
 
         def keep(pairs: Pairs, mask: Bool[np.ndarray, " num_pairs"], cause: str) -> Pairs:
             _count(rejected, cause, int((~mask).sum()))
             return pairs.chosen(mask)
 
-        pairs = keep(pairs, pairs.cosines >= np.cos(config.cone_rad), "cone")
+        pairs = keep(pairs, pairs.cosines >= np.cos(CONE_RAD), "cone")
         pairs = keep(pairs, pairs.widths_m <= open_m - 2 * config.clearance_m, "width")
         seen = pairs.lowest_m >= shape.trusted_from_m
         if np.isfinite(shape.trusted_from_m):
@@ -400,17 +340,16 @@ class GraspSearcher:
         rejected: dict[str, int],
     ) -> _Candidates:
         """Put hands onto closing lines, from several directions and at several depths."""
-        config = self.config
         down = -T_base_object[2, :3]
         y = pairs.axes
         steep = down - y * (y @ down)[:, None]
         length = np.linalg.norm(steep, axis=1)
         z0 = steep / np.maximum(length, 1e-9)[:, None]
         rows: list[tuple[Float[np.ndarray, "num_pairs 4 4"], Int[np.ndarray, " num_pairs"]]] = []
-        for turn in config.approaches_rad:
+        for turn in APPROACHES_RAD:
             z = np.cos(turn) * z0 + np.sin(turn) * np.cross(y, z0)
             R = np.stack([np.cross(y, z), y, z], axis=-1)
-            for depth in config.depths_m:
+            for depth in DEPTHS_M:
                 Ts = np.tile(np.eye(4), (len(y), 1, 1))
                 Ts[:, :3, :3] = R
                 Ts[:, :3, 3] = pairs.middles_m + depth * z
@@ -426,7 +365,7 @@ class GraspSearcher:
             cosines=pairs.cosines[ids],
         )
         found = _Candidates(lines=lines, rejected=rejected)
-        level = (Ts_all[:, :3, 2] @ down >= np.cos(config.most_tilt_rad)) & (length[ids] > 1e-6)
+        level = (Ts_all[:, :3, 2] @ down >= np.cos(MOST_TILT_RAD)) & (length[ids] > 1e-6)
         found.keep(level, "tilt")
         return found
 
@@ -453,7 +392,7 @@ class GraspSearcher:
         """Reject hands that another object is in the way of, wherever it may be off to."""
         scene, T_object_base = self.problem.scene, se3.invert(T_base_object)
         for name, T in scene.Ts_base_object.items():
-            if name == object_id or not np.isfinite(T).all():
+            if name == object_id:
                 continue
             sigma_m = float(np.sqrt(np.abs(np.diag(self._covariance(name))[:3]).max()))
             margin_m = self.config.clearance_m + sigma_m
@@ -463,7 +402,7 @@ class GraspSearcher:
             near = np.flatnonzero(hand.passes(centres, radius_m, margin_m))
             if not len(near):
                 continue
-            points = se3.apply(T_object_other, surface.points(_NEIGHBOUR_POINTS, self.config.seed))
+            points = se3.apply(T_object_other, surface.points(_NEIGHBOUR_POINTS, SEED))
             hits = hand.hits(in_tools(found.lines.chosen(near), points), margin_m)
             clear: Bool[np.ndarray, " num_candidates"] = np.ones(len(found), dtype=bool)
             clear[near] = ~(hits["fingers"] | hits["palm"])
@@ -479,7 +418,7 @@ class GraspSearcher:
         """How much each grasp bears; those that bear too little are rejected."""
         config, model = self.config, self.problem.model(object_id)
         T = self.problem.scene.Ts_base_object[object_id]
-        twist_Nm = 2 * config.friction * self._grip_N() * _TWIST_SHARE * hand.pad_half_m
+        twist_Nm = 2 * FRICTION * self._grip_N() * _TWIST_SHARE * hand.pad_half_m
         weight_N = max(model.mass_kg * PhysicsConfig().gravity_m_s2, 1e-9)
         low_m = hand.lowest_m(T @ found.lines.Ts_object_tcp)
         slack = slacks(
@@ -488,14 +427,14 @@ class GraspSearcher:
             hand,
             in_tools(found.lines, points_m),
             over_table_m=low_m - self.problem.scene.table_height_m,
-            cone_rad=config.cone_rad,
+            cone_rad=CONE_RAD,
             lever_m=twist_Nm / weight_N,
         )
         error_m = self.problem.shapes[object_id].error_m
         doubt = Doubt(
             covariance=self._covariance(object_id),
-            other_m=float(np.hypot(config.robot_error_m, error_m)),
-            robot_m=config.robot_error_m,
+            other_m=float(np.hypot(ROBOT_ERROR_M, error_m)),
+            robot_m=ROBOT_ERROR_M,
             middle_m=_MIDDLE_SHARE * max(model.size_m),
         )
         margin = margins(slack, found.lines, T, doubt)
@@ -513,11 +452,11 @@ class GraspSearcher:
         """Take the surest that the arm reaches, leaving out what is like one that was taken."""
         config, lines = self.config, found.lines
         T = self.problem.scene.Ts_base_object[object_id]
-        arm = self._reach.prepared(T @ lines.Ts_object_tcp, hand, config.pregrasp_m)
+        arm = self._reach.prepared(T @ lines.Ts_object_tcp, hand, PREGRASP_M)
         taken: list[Grasp] = []
         kept: list[int] = []
         for index in np.argsort(-margin, kind="stable").tolist():
-            if kept and _is_like(lines, index, kept, config, hand.symmetric):
+            if kept and _is_like(lines, index, kept, hand.symmetric):
                 continue
             way = arm.first(index)
             if not isinstance(way, Reached):
@@ -533,7 +472,7 @@ class GraspSearcher:
                     open_m=hand.open_m,
                     margin=float(margin[index]),
                     joints_rad=way.joints_rad,
-                    pregrasp_m=config.pregrasp_m,
+                    pregrasp_m=PREGRASP_M,
                     contacts_m=_contacts(lines, index),
                 )
             )
@@ -598,12 +537,10 @@ def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:
     return np.stack([lines.middles_m[index] - half, lines.middles_m[index] + half])
 
 
-def _is_like(
-    lines: Lines, index: int, kept: list[int], config: GraspConfig, symmetric: bool
-) -> bool:
+def _is_like(lines: Lines, index: int, kept: list[int], symmetric: bool) -> bool:
     """Whether a grasp is near one that was taken; of a symmetric hand also turned half."""
     Ts = lines.Ts_object_tcp
-    near = np.linalg.norm(Ts[kept, :3, 3] - Ts[index, :3, 3], axis=1) < config.merge_m
+    near = np.linalg.norm(Ts[kept, :3, 3] - Ts[index, :3, 3], axis=1) < SAME_M
     if not near.any():
         return False
     R = Ts[np.array(kept)[near], :3, :3]
@@ -611,6 +548,6 @@ def _is_like(
     hands = [one, one * np.array([-1.0, -1.0, 1.0])] if symmetric else [one]
     for hand in hands:
         cosine = (np.einsum("nij,ij->n", R, hand) - 1) / 2
-        if (cosine > np.cos(config.merge_rad)).any():
+        if (cosine > np.cos(SAME_RAD)).any():
             return True
     return False

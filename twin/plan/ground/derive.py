@@ -59,7 +59,6 @@ def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "gr
         "rules": RULES_VERSION,
         "tasks": sorted({table["name"] for table in tables}),
         "explanation": list(grounding.explanation),
-        "remarks": list(grounding.remarks),
     }
     text = "\n".join(
         [
@@ -106,7 +105,7 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
     and the hand; the release what the object is put onto or into, and the hand a container's walls.
 
     Args:
-        grounding: Objects in their order, goals, limits on the way.
+        grounding: Objects in their order, and goals.
         objects: Tables of the task file, by id.
     """
     lies_on = {key: TABLE for key, about in objects.items() if not about.get("fixed", False)}
@@ -122,32 +121,25 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
         lands = [pair for pair in _rest(key, lies_on) if pair != hand]
         if any(goal["kind"] == "inside" for goal in goals):
             lands.append([GRIPPER, target])
-        path = [limit for limit in grounding.path if limit.object_id == key]
-        part = grounding.grasp_parts.get(key)
         end = f"_{key}" if len(grounding.order) > 1 else ""
         where = _where(goals)
-        limits = [dict(limit.constraint) for limit in path]
-        late = [dict(limit.constraint) for limit in path if not limit.until_release]
         stages += [
             {
                 "id": f"grasp{end}",
-                "text": f"Grasp {key}" + (f" by its {part}." if part else "."),
+                "text": f"Grasp {key}.",
                 "grasp": key,
-                **({"part": part} if part else {}),
                 "allowed_contacts": [*others, *starts_on, hand],
             },
             {
                 "id": f"carry{end}",
                 "text": f"Carry {key} {where}.",
                 "carry": key,
-                **({"path": _once(limits)} if limits else {}),
                 "allowed_contacts": [*others, hand],
             },
             {
                 "id": f"release{end}",
                 "text": f"Let {key} go {where}.",
                 "release": key,
-                **({"path": _once(late)} if late else {}),
                 "allowed_contacts": [*others, hand, *lands],
             },
         ]
@@ -163,10 +155,6 @@ def _rest(key: str, lies_on: Mapping[str, str]) -> list[list[str]]:
             [other, key] for other, where in lies_on.items() if where == place != key != other
         ]
     return pairs
-
-
-def _once(limits: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [limit for index, limit in enumerate(limits) if limit not in limits[:index]]
 
 
 def _target(goals: Sequence[Mapping[str, Any]]) -> str:
@@ -193,8 +181,6 @@ def _where(goals: Sequence[Mapping[str, Any]]) -> str:
                 told.append(f"next to {goal['reference']}{f' ({side.strip()})' if side else ''}")
             case "between":
                 told.append(f"between {goal['first']} and {goal['second']}")
-            case "aligned":
-                told.append(f"aligned with {goal['reference']}")
             case "upright":
                 told.append("upright")
             case "moved":

@@ -1,30 +1,16 @@
 """What an instruction asks for, whether it can be, and in which order it is done."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bridge.task.check import REFERENCES, TABLE
-from bridge.task.relations import direction_of
 from bridge.task.summary import describe_predicate
-from twin.plan.ground.noun_phrases import Choice
+from twin.plan.ground.nouns import Choice
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 
 PLACES = {"inside": "container", "on": "support"}
 """Relations of which an object can have only one, with the key of what it is in or on."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PathLimit:
-    """Something that holds while an object is carried, as a record of the constraint schema."""
-
-    object_id: str
-    constraint: Mapping[str, Any]
-    until_release: bool
-    """It ends before the object is let go; else it holds until then."""
-    words: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,27 +24,20 @@ class Grounding:
     """Objects in the order in which they are moved."""
     is_order_given: bool
     """The instruction asks for that order, or its relations do; else another one is as good."""
-    path: tuple[PathLimit, ...] = ()
-    grasp_parts: Mapping[str, str] = field(default_factory=dict)
-    """By object: the part it is to be taken by."""
     choices: tuple[Choice, ...] = ()
-    remarks: tuple[str, ...] = ()
     explanation: tuple[str, ...] = ()
     """What each phrase means, and why."""
 
     def lines(self) -> list[str]:
-        """The goals, the order, the limits on the way and what they were made of, in words."""
+        """The goals, the order and what they were made of, in words."""
         order = ", then ".join(self.order)
         told = "" if self.is_order_given or len(self.order) < 2 else " (any order will do)"
         return [
             "goals, when at the end",
             *(f"  {describe_predicate(goal)}" for goal in self.goals),
             f"moved: {order}{told}",
-            *(f"on the way: {limit.words}" for limit in self.path),
-            *(f"taken by: {key} by its {part}" for key, part in self.grasp_parts.items()),
             "understood",
             *(f"  {line}" for line in self.explanation),
-            *(f"remark: {text}" for text in self.remarks),
         ]
 
     def to_json(self) -> dict[str, Any]:
@@ -68,20 +47,10 @@ class Grounding:
             "goals": [dict(goal) for goal in self.goals],
             "order": list(self.order),
             "is_order_given": self.is_order_given,
-            "path": [
-                {
-                    "object": limit.object_id,
-                    "constraint": dict(limit.constraint),
-                    "until_release": limit.until_release,
-                }
-                for limit in self.path
-            ],
-            "grasp_parts": dict(self.grasp_parts),
             "choices": [
                 {"count": item.count, "among": list(item.among), "chosen": list(item.chosen)}
                 for item in self.choices
             ],
-            "remarks": list(self.remarks),
             "explanation": list(self.explanation),
         }
 
@@ -90,11 +59,7 @@ class Goals:
     """Collects goals clause by clause, and refuses what cannot be."""
 
     def __init__(self, vocabulary: Vocabulary) -> None:
-        """Begin without any.
-
-        Args:
-            vocabulary: Says what can move and what is open.
-        """
+        """Begin without any."""
         self.vocabulary = vocabulary
         self.found: list[dict[str, Any]] = []
         self.steps: list[tuple[str, ...]] = []
@@ -137,12 +102,27 @@ class Goals:
                 "inside it, not on it. Say 'into'."
             )
             raise GroundingError("impossible", message, candidates=[support])
-        if not things[object_id].movable:
-            movable = ", ".join(self.vocabulary.movable()) or "nothing here"
-            message = f"{told} is fixed: nothing can move it. What can be moved: {movable}."
-            raise GroundingError("fixed_object", message, candidates=[object_id])
+        self.refuse_fixed([object_id])
 
-    def merged(self) -> list[dict[str, Any]]:
+    def refuse_fixed(self, ids: Iterable[str]) -> None:
+        """Refuse to move what cannot be.
+
+        Raises:
+            GroundingError: Naming it, and what can be moved.
+        """
+        for key in ids:
+            if not self.vocabulary.things[key].movable:
+                told, movable = (
+                    self.vocabulary.describe([key]),
+                    ", ".join(self.vocabulary.movable()),
+                )
+                message = (
+                    f"{told} is fixed: nothing can move it. What can be moved: "
+                    f"{movable or 'nothing here'}."
+                )
+                raise GroundingError("fixed_object", message, candidates=[key])
+
+    def checked(self) -> list[dict[str, Any]]:
         """All goals, none of which rules out another.
 
         Raises:
@@ -153,12 +133,7 @@ class Goals:
             by_object.setdefault(goal["object"], []).append(goal)
         for key, goals in by_object.items():
             self._refuse_contradiction(key, goals)
-        merged = [goal for goal in self.found if goal["kind"] != "moved"]
-        for key, goals in by_object.items():
-            ways = [goal for goal in goals if goal["kind"] == "moved"]
-            if ways:
-                merged.append(ways[0] if len(ways) == 1 else self._joined(key, ways))
-        return merged
+        return self.found
 
     def _refuse_contradiction(self, key: str, goals: Sequence[Mapping[str, Any]]) -> None:
         kinds = {goal["kind"] for goal in goals}
@@ -176,25 +151,11 @@ class Goals:
             or ("moved" in kinds and places - {("on", TABLE)})
             or (inside | supports) & set(sides)
             or any(len(found - {""}) > 1 for found in sides.values())
+            or sum(goal["kind"] == "moved" for goal in goals) > 1
         ):
             told = "; ".join(describe_predicate(goal) for goal in goals)
             message = f"{key} cannot end as asked, all at once: {told}. Leave one of them out."
             raise GroundingError("contradiction", message, candidates=[key])
-
-    def _joined(self, key: str, ways: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """One movement of several: 10 cm to the left and 5 cm forwards."""
-        if not all("by_m" in way for way in ways):
-            message = f"{key} is to move in several directions. Say how far in each."
-            raise GroundingError("contradiction", message, candidates=[key])
-        steps = [way["by_m"] * direction_of(way["direction"]) for way in ways]
-        directions = [step / np.linalg.norm(step) for step in steps]
-        if any(abs(float(a @ b)) > 0.1 for i, a in enumerate(directions) for b in directions[:i]):
-            message = f"{key} is to move along one line twice. Say once where it is to end."
-            raise GroundingError("contradiction", message, candidates=[key])
-        whole = np.sum(steps, axis=0)
-        length = float(np.linalg.norm(whole))
-        direction = [round(float(part), 6) for part in whole / length]
-        return {"kind": "moved", "object": key, "by_m": round(length, 6), "direction": direction}
 
 
 def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:

@@ -1,399 +1,377 @@
-"""The grammar: from the words of an instruction to goals, in order, with limits on the way.
+"""A small grammar of English: from the words of an instruction to goals, in order.
 
-An instruction is read from left to right, once. Whatever is not understood is an error that names
-it; adjectives without a meaning here are the one thing that is passed over, with a remark.
+An instruction is cut into words, read from left to right once, clause by clause, and every word has
+to be used: one that is not is an error that names it. Nothing is guessed.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from twin.plan.ground import noun_phrases
-from twin.plan.ground.arguments import ANY, PARTICLES, Clause
-from twin.plan.ground.arrangements import IN_ORDER, ArrangementReader
-from twin.plan.ground.goals import PLACES, Grounding, PathLimit, ordered
-from twin.plan.ground.noun_phrases import NounPhrase
+from bridge.task.relations import SIDES
+from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
+from twin.plan.ground.nouns import Memory, NounPhrase, Nouns, with_shared_noun
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 from twin.plan.ground.words import (
-    ADVERBS,
-    BELONGS,
-    COMMA,
-    CONJUNCTIONS,
-    ENSURE,
-    LAYERS,
-    LENGTH,
+    BY_COLOUR,
+    CARRIED,
+    ENDS_THERE,
+    GAP,
+    KNOWN,
     NEGATIONS,
     POLITE,
-    PUSHED,
-    QUESTIONS,
     RELATIONS,
-    SEQUENCES,
-    STOP,
-    THROWN,
+    SIGNS,
+    THEN,
+    UNSUPPORTED_RELATIONS,
     UNSUPPORTED_VERBS,
     VERBS,
     WAYS,
-    WORD,
     printable,
+    tokens_of,
 )
-from twin.scene.semantics.language import colour_of, part_of, singular
+
+GAP_TOLERANCE_M = 0.005
+"""Of a gap that is given by one number."""
+MOST_M = 1.5
+"""Farther nothing is moved."""
+_SLOTS = {"inside": "container", "outside": "container", "on": "support"}
 
 
 def ground(text: str, vocabulary: Vocabulary) -> Grounding:
-    """Turn an instruction into goals, their order, and limits on the way.
-
-    Args:
-        text: What a person wrote.
-        vocabulary: What there is.
+    """Turn an instruction into goals and their order.
 
     Raises:
         GroundingError: When it is not understood whole, or cannot be done; never a guess.
     """
-    return Reader(text, vocabulary).read()
+    return _Reader(text, vocabulary).read()
 
 
-class Reader(ArrangementReader):
-    """Reads one instruction, clause by clause."""
+@dataclass(kw_only=True)
+class _Clause:
+    """One verb with what it moves, and where to."""
+
+    verb: str
+    themes: tuple[str, ...]
+    goals: list[dict[str, Any]] = field(default_factory=list)
+    by_colour: bool = False
+    into: tuple[str, ...] = ()
+    """Containers that are sorted into."""
+
+    def add(self, kind: str, **about: Any) -> None:
+        """Ask for one relation of everything that is moved."""
+        self.goals += [{"kind": kind, "object": key, **about} for key in self.themes]
+
+
+class _Reader:
+    """Reads one instruction."""
+
+    def __init__(self, text: str, vocabulary: Vocabulary) -> None:
+        self.tokens, self.at = tokens_of(text), 0
+        self.vocabulary, self.memory = vocabulary, Memory()
+        self.nouns, self.goals = Nouns(vocabulary, self.memory), Goals(vocabulary)
+        self.text, self.verb = text, ""
+        self.held: dict[str, str] = {}
+        """What was taken and has not been put anywhere, with the words that said so."""
 
     def read(self) -> Grounding:
         """Read all clauses."""
-        then = before = False
-        last = None
+        self._refuse_words()
         while True:
-            joined = self._between_clauses()
-            then, before = then or joined == "then", before or joined == "before"
-            if self.at >= len(self.tokens):
+            is_then = self._between()
+            if self.at == len(self.tokens):
                 break
-            start, known = self.at, len(self.goals.steps)
+            known = len(self.goals.steps)
             self._clause()
-            if self.at == start:
-                raise self._unknown(start)
-            self._end_of_clause(start)
-            if len(self.goals.steps) > known:
-                if last is not None and (then or before):
-                    edge = (last, known) if then else (known, last)
-                    self.goals.edges.append(edge)
-                    self.goals.is_order_given = True
-                last, then, before = len(self.goals.steps) - 1, False, False
-        return self._finish()
-
-    def _between_clauses(self) -> str:
-        """Skip signs and words without effect; say whether they order what follows."""
-        joined = ""
-        while self.at < len(self.tokens):
-            start = self.at
-            if self._kind() in (STOP, COMMA):
-                self.at += 1
-            elif CONJUNCTIONS.match(self.tokens, self.at) and self._kind() == WORD:
-                self._take(CONJUNCTIONS)
-            elif self._word() in ("but", "however", "yet"):
-                self.at += 1
-            elif RELATIONS.match(self.tokens, self.at) and self._word() in ("next", "first"):
-                break
-            elif (meaning := SEQUENCES.match(self.tokens, self.at)) is not None:
-                joined = meaning[0] if meaning[0] != "first" else joined
-                self.at = meaning[1]
-            elif self._is_polite():
-                self._take(POLITE)
-            elif (adverb := self._leading_adverb()) is not None:
-                self.manner.append(adverb)
-            if self.at == start:
-                break
-        return joined
-
-    def _leading_adverb(self) -> str | None:
-        """Slowly put ...: how, said before the verb."""
-        found = ADVERBS.match(self.tokens, self.at)
-        if found is None or found[0] not in ("slowly", "fast", ""):
-            return None
-        joined = CONJUNCTIONS.match(self.tokens, found[1])
-        after = joined[1] if joined else found[1]
-        if VERBS.match(self.tokens, after) is None and ADVERBS.match(self.tokens, after) is None:
-            return None
-        self.at = found[1]
-        return found[0]
-
-    def _is_polite(self) -> bool:
-        polite = POLITE.match(self.tokens, self.at)
-        if polite is None:
-            return False
-        ensure = ENSURE.match(self.tokens, self.at)
-        return ensure is None or polite[1] > ensure[1]
-
-    def _end_of_clause(self, start: int) -> None:
-        """Raise where words are left that belong to nothing."""
-        if self.at >= len(self.tokens) or self._kind() in (STOP, COMMA):
-            return
-        if CONJUNCTIONS.match(self.tokens, self.at) or SEQUENCES.match(self.tokens, self.at):
-            return
-        if self._word() in ("before", "after", "while", "whilst", "but"):
-            return
-        self._refuse_word()
-        raise self._unknown(start, f"is not understood from '{self._word()}' on")
-
-    def _finish(self) -> Grounding:
-        for key, word in self.grasped.items():
-            if not any(goal["object"] == key for goal in self.goals.found):
-                message = f"'{word}' {key}: say where it is to go; holding it is not an end."
-                raise GroundingError("unsupported_verb", message)
-        if not self.goals.found:
-            if self.limits:
-                message = f"'{printable(self.text)}' says how, and not what is to be done."
-                raise GroundingError("unknown_clause", message)
-            message = "the instruction asks for nothing. Say what is to be put where."
-            raise GroundingError("empty", message)
-        found = self.goals.merged()
-        order = ordered(self.goals, found)
+            if is_then and 0 < known < len(self.goals.steps):
+                self.goals.edges.append((known - 1, known))
+                self.goals.is_order_given = True
+        for key, words in self.held.items():
+            message = f"'{words}': say where {key} is to go; holding it is no end."
+            raise GroundingError("unsupported_verb", message)
+        found = self.goals.checked()
+        if not found:
+            raise GroundingError("empty", f"the instruction asks for nothing. {KNOWN}")
         return Grounding(
             text=self.text,
             goals=tuple(found),
-            order=order,
+            order=ordered(self.goals, found),
             is_order_given=self.goals.is_order_given,
-            path=tuple(self._spread(order)),
-            grasp_parts=dict(self.parts),
             choices=tuple(self.memory.choices),
-            remarks=tuple(dict.fromkeys(self.memory.remarks)),
             explanation=tuple(dict.fromkeys(self.memory.explanation)),
         )
 
-    def _spread(self, order: Sequence[str]) -> list[PathLimit]:
-        """Limits said before any object was named hold for all."""
-        spread = []
-        for limit in self.limits:
-            for key in order if limit.object_id == ANY else [limit.object_id]:
-                constraint = {
-                    name: key if value == ANY else value for name, value in limit.constraint.items()
-                }
-                words = limit.words.replace(ANY, key)
-                spread.append(replace(limit, object_id=key, constraint=constraint, words=words))
-        return list({(limit.words): limit for limit in spread}.values())
+    def _refuse_words(self) -> None:
+        """Words that turn what is said round; whatever they stand beside, it is not read."""
+        words = [token.text for token in self.tokens]
+        if "or" in words:
+            raise GroundingError("alternative", "'or' leaves open what is wanted. Say which.")
+        no = [w for w in words if w in NEGATIONS or w.startswith("non-") or w.endswith("n't")]
+        if no:
+            message = f"'{printable(no[0])}' says what is not wanted. Say what is."
+            raise GroundingError("negated", message)
+
+    def _match(self, phrases: Iterable[str]) -> str:
+        """The longest of these phrases that begins here, and go on behind it; empty: none."""
+        for length in (5, 4, 3, 2, 1):
+            words = self.tokens[self.at : self.at + length]
+            phrase = " ".join(token.text for token in words)
+            if len(words) == length and phrase in phrases:
+                self.at += length
+                return phrase
+        return ""
+
+    def _rest(self, start: int, count: int = 6) -> str:
+        return printable(" ".join(token.text for token in self.tokens[start : start + count]))
+
+    def _unknown(self, start: int, what: str = "is not understood") -> GroundingError:
+        message = f"'{self._rest(start)}' {what}. {KNOWN}"
+        return GroundingError("unknown_clause", message)
+
+    def _word(self) -> str:
+        """The word that comes next; empty at the end."""
+        return self.tokens[self.at].text if self.at < len(self.tokens) else ""
+
+    def _between(self) -> bool:
+        """Skip what divides clauses; say whether one is to come after the other."""
+        is_then, start = False, -1
+        while self.at != start:
+            start = self.at
+            if self._word() in SIGNS:
+                self.at += 1
+            is_then |= bool(self._match(THEN))
+            self._match(("and", "first", *POLITE))
+        return is_then
 
     def _clause(self) -> None:
         start = self.at
-        if self._path_clause():
-            return
-        if self._word() in ("before", "after"):
-            return self._ordered_clauses()
-        self._refuse_word()
-        if self._word() in QUESTIONS:
-            raise self._unknown(start, "is a question or a statement, and not a task")
-        ensure = ENSURE.match(self.tokens, self.at)
-        if ensure is not None and ensure[1] > start:
-            self.at = ensure[1]
-            return self._declarative(start, ensured=True)
-        if VERBS.match(self.tokens, self.at) is not None:
-            return self._verb_clause()
-        if self.memory.themes and self._continues():
-            clause = Clause(verb=self.verb, themes=self.memory.themes)
-            self._arguments(clause)
-            return self._close(clause, start) if clause.goals or self.at == start else None
-        self._refuse_verb(start)
-        return self._declarative(start, ensured=False)
-
-    def _path_clause(self) -> bool:
-        themes = self.memory.themes or (ANY,)
-        if VERBS.match(self.tokens, self.at) and self._word() in ("leave", "carry", "carrying"):
-            return False
-        found = self.paths.read(self.at, themes, self.destination)
-        if found is None:
-            return False
-        self.limits += found.limits
-        self.at = found.at
-        return True
-
-    def _ordered_clauses(self) -> None:
-        """After putting A there, put B here; before you put A there, put B here."""
-        word, start = self._word(), self.at
-        self.at += 1
-        later = len(self.goals.steps) > 0
-        self._subject()
-        known = len(self.goals.steps)
-        self._clause()
-        if len(self.goals.steps) == known:
+        word = self._match(VERBS)
+        verb = VERBS.get(word, "")
+        if word in CARRIED:
+            self.memory.explanation.append(f"'{word}': it is carried there and let go")
+        if not verb:
+            self._refuse_verb()
+            verb = self.verb
+        clause = _Clause(verb=verb, themes=self._themes())
+        self.memory.themes = clause.themes
+        if self._match(ENDS_THERE):
+            clause.verb = "put"
+        if not clause.verb:
             raise self._unknown(start)
-        self.goals.is_order_given = True
-        if later:  # this was the second half of a sentence
-            pair = (known - 1, known)
-        else:
-            while self._kind() == COMMA or self._word() == "then":
-                self.at += 1
-            self._between_clauses()
-            self._clause()
-            if len(self.goals.steps) < known + 2:
-                raise self._unknown(start)
-            pair = (known + 1, known)
-        self.goals.edges.append(pair if word == "before" else pair[::-1])
+        self._places(clause, start)
+        self._close(clause, start)
+        self.verb = verb or clause.verb
 
-    def _subject(self) -> None:
-        """Skip "you" and "having"."""
-        while self._word() in ("you", "having", "you've", "have", "that"):
-            self.at += 1
-
-    def _continues(self) -> bool:
-        """Whether what follows is said of the last objects: a relation, a length, an adverb."""
-        return (
-            RELATIONS.match(self.tokens, self.at) is not None
-            or ADVERBS.match(self.tokens, self.at) is not None
-            or WAYS.match(self.tokens, self.at) is not None
-            or self._kind() == LENGTH
-        )
-
-    def _refuse_verb(self, start: int) -> None:
-        """Raise where the clause begins with a verb that nobody here can do."""
-        word = self._word()
-        stems = {word, singular(word), word.removesuffix("ing"), word.removesuffix("ing") + "e"}
-        if stems & UNSUPPORTED_VERBS and not self._is_thing(word):
-            can = "put, move, take out, stack, sort, pack"
-            message = f"'{word}' is nothing this robot can do. It can {can}."
+    def _refuse_verb(self) -> None:
+        """Raise unless a clause without a verb may begin here."""
+        here = self.tokens[self.at]
+        behind = self.tokens[self.at + 1 :]
+        is_unknown = not self.nouns.is_one(here.text)
+        if here.text in UNSUPPORTED_VERBS or (
+            is_unknown and behind and behind[0].text == "the" and self._names_thing(self.at + 1)
+        ):
+            message = f"nobody here can '{printable(here.text)}'. {KNOWN}"
             raise GroundingError("unsupported_verb", message)
-        if self._is_thing(word) or RELATIONS.match(self.tokens, start) is not None:
-            return
-        at, self.at = self.at, self.at + 1
-        phrase = noun_phrases.read(self.tokens, self.at) if self._kind(-1) == WORD else None
-        self.at = at
-        if phrase is None or colour_of(word) or part_of(word):
-            return
-        begins = self.tokens[at + 1].text in ("the", "a", "an", "all", "every", "both", "it")
-        nouns = {name for thing in self.vocabulary.things.values() for name in thing.names}
-        if begins and (phrase[0].pronoun or set(phrase[0].words[-1:]) & nouns):
-            message = f"'{word}' is no verb that is known here."
-            raise GroundingError("unsupported_verb", message)
-        if begins:
-            raise self._unknown(start)
+        if is_unknown:
+            raise self._unknown(self.at)
 
-    def _is_thing(self, word: str) -> bool:
-        known = self.vocabulary.nouns()
-        return singular(word) in known and VERBS.match(self.tokens, self.at) is None
+    def _names_thing(self, at: int) -> bool:
+        try:
+            phrase, _ = self.nouns.read(self.tokens, at, "theme")
+        except GroundingError:
+            return False
+        return bool(self.nouns.fitting(phrase))
 
-    def _declarative(self, start: int, *, ensured: bool) -> None:
-        phrases = self._theme_phrases()
-        stacks = not ensured and self.verb == "stack" and bool(self.goals.found)
-        follows = BELONGS.match(self.tokens, self.at) is not None or self._continues()
-        if not phrases or not (follows or stacks or self._kind() == COMMA):
-            raise self._unknown(start)
-        belongs = self._take(BELONGS)
-        if belongs == "is" and not ensured:
-            raise self._unknown(start, "is a statement, and not a task")
-        themes = self._resolved(phrases)
-        if self._word() in NEGATIONS:
-            self._refuse_word()
-        if belongs is not None:
-            self._take(VERBS)
-        if belongs is None and stacks:
-            layer = self._take(LAYERS)
-            ends = self.at >= len(self.tokens) or self._kind() in (STOP, COMMA)
-            ends = ends or CONJUNCTIONS.match(self.tokens, self.at) is not None
-            if layer == "top" or (layer is None and ends):
-                return self._on_top(themes)
-        clause = Clause(verb=self.verb or "put", themes=themes)
-        self.memory.themes = themes
-        self._arguments(clause)
-        if not clause.goals:
-            raise self._unknown(start, "does not say what is to be done")
-        return self._close(clause, start)
+    def _themes(self) -> tuple[str, ...]:
+        """What is moved: one phrase, or several with "and" between."""
+        return tuple(dict.fromkeys(key for ids in self._list("theme") for key in ids))
 
-    def _on_top(self, themes: tuple[str, ...]) -> None:
-        lower = self.memory.themes[-1]
-        clause = Clause(verb="stack", themes=themes)
-        for key in themes:
-            clause.goals.append({"kind": "on", "object": key, "support": lower})
-            lower = key
-        self.goals.is_order_given = True
-        self._close(clause, self.at)
+    def _list(self, slot: str, besides: Sequence[str] = ()) -> list[tuple[str, ...]]:
+        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+        phrases = [phrase]
+        while self._joins_noun():
+            phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+            phrases.append(phrase)
+        shared = with_shared_noun(phrases)
+        return [self.nouns.resolve(each, slot, besides=besides) for each in shared]
 
-    def _verb_clause(self) -> None:
-        start, word = self.at, self._word()
-        verb = self._take(VERBS) or ""
-        self._remark_on(word)
-        if verb == "build":
-            return self._build(start)
-        if verb == "empty":
-            return self._empty(start)
-        if self._word() in PARTICLES and RELATIONS.match(self.tokens, self.at) is None:
+    def _joins_noun(self) -> bool:
+        """Whether a comma or "and", and then another noun phrase, come next; skips the former."""
+        start = self.at
+        if self._word() == ",":
             self.at += 1
-        phrases = self._theme_phrases()
-        if phrases:
-            themes = self._resolved(phrases)
-        elif self.memory.themes and verb in ("put", "move") and self._continues():
-            themes = self.memory.themes
-        else:
-            raise self._unknown(start, "does not say what is to be moved")
-        self.verb = verb
-        self.memory.themes = themes
-        clause = Clause(verb=verb, themes=themes)
-        if verb == "sort":
-            return self._sort(clause, start)
-        if verb == "stack":
-            return self._stack(clause, start)
-        self._arguments(clause)
-        if verb == "take" and not clause.goals and not clause.sources:
-            self.grasped |= {key: word for key in themes if key not in self.grasped}
+        self._match(("and",))
+        if self.at > start and self.nouns.is_one(self._word()):
+            return True
+        self.at = start
+        return False
+
+    def _places(self, clause: _Clause, start: int) -> None:
+        """Read where everything goes, until the clause ends."""
+        while self._word() and not self._ends():
+            before = self.at
+            self._place(clause)
+            self._match(POLITE)
+            if self.at == before:
+                raise self._unknown(start, f"is not understood from '{self._rest(before, 1)}' on")
+            joined = self.at
+            self.at += self._word() == ","
+            self._match(("and",))
+            if not self._begins_place():
+                self.at = joined
+
+    def _ends(self) -> bool:
+        here = self.at
+        ended = self.tokens[here].is_sign or bool(self._match(("and", *THEN)))
+        self.at = here
+        return ended
+
+    def _begins_place(self) -> bool:
+        here = self.at
+        begins = bool(self._match((*RELATIONS, *WAYS, "upright")))
+        self.at = here
+        return begins
+
+    def _place(self, clause: _Clause) -> None:
+        """One relation, movement or remark about the end."""
+        length = self._length()
+        relation = RELATIONS.get(self._match(RELATIONS), "")
+        if relation in SIDES or relation == "beside":
+            return self._beside(clause, relation, length)
+        way = "" if relation else WAYS.get(self._match(WAYS), "")
+        if way:
+            return self._moved(clause, way, length or self._length())
+        if length is not None:
+            raise self._unknown(self.at - 1, "says how far, and not from what or which way")
+        if relation:
+            return self._relation(clause, relation)
+        if self._match(("upright",)):
+            return clause.add("upright")
+        if self._match(BY_COLOUR):
+            clause.by_colour = True
             return None
-        if verb == "pack" and not any(goal["kind"] in PLACES for goal in clause.goals):
-            self._into_the_only_container(clause)
-        return self._close(clause, start)
+        here = self.tokens[self.at].text
+        if here == "to" and self.at + 1 < len(self.tokens):
+            message = f"'{self._rest(self.at, 4)}': into, onto or next to it?"
+            candidates = ("into", "onto", "next to")
+            raise GroundingError("ambiguous_relation", message, candidates=candidates)
+        if here in UNSUPPORTED_RELATIONS:
+            message = f"the relation '{here}' is not known. {KNOWN}"
+            raise GroundingError("unsupported_relation", message)
+        return None
 
-    def _remark_on(self, word: str) -> None:
-        """Say how a verb is done that asks for more than putting down."""
-        if any(word.startswith(stem[:4]) for stem in THROWN):
-            self.memory.remarks.append(f"'{word}' is done by letting go close above")
-        if any(word.startswith(stem[:4]) for stem in PUSHED):
-            self.memory.remarks.append(f"'{word}' is done by lifting and putting down")
+    def _length(self) -> tuple[float, float] | None:
+        """A length, with or without "by" before it."""
+        at = self.at + (self._word() == "by")
+        found = self.tokens[at].length_m if at < len(self.tokens) else None
+        self.at = self.at if found is None else at + 1
+        return found
 
-    def _stack(self, clause: Clause, start: int) -> None:
-        """Stack A on B; stack A, B and C; stack the cubes in the order A, B, C."""
-        if self._word() == ":":
-            self.at += 1
-            return self._tower(start, ())
-        if self._take(IN_ORDER) is not None:
-            return self._tower(start, (), expected=clause.themes)
-        self._arguments(clause)
-        if not clause.goals:
-            return self._tower(start, clause.themes)
-        return self._close(clause, start)
+    def _one(self, clause: _Clause, slot: str) -> str:
+        """The one thing that a relation is to."""
+        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+        return self._single(phrase, clause, slot)
 
-    def _theme_phrases(self) -> list[NounPhrase]:
-        """The objects of a clause as they are said: one noun phrase or several."""
-        phrases = []
-        while True:
-            found = noun_phrases.read(self.tokens, self.at)
-            if found is None:
-                break
-            phrases.append(found[0])
-            self.at = found[1]
-            comma = self._kind() == COMMA
-            following = self.at + comma
-            joined = CONJUNCTIONS.match(self.tokens, following)
-            following = joined[1] if joined else following
-            if not (comma or joined) or not self._goes_on(following):
-                break
-            self.at = following
-        self._refuse_word()
-        return phrases
+    def _single(self, phrase: NounPhrase, clause: _Clause, slot: str) -> str:
+        ids = self.nouns.resolve(phrase, slot, besides=clause.themes)
+        if len(ids) != 1:
+            told = self.vocabulary.describe(ids)
+            message = f"'{phrase.text}' is more than one thing: {told}. Name one."
+            raise GroundingError("ambiguous_object", message, candidates=ids)
+        return ids[0]
 
-    def _resolved(self, phrases: Sequence[NounPhrase]) -> tuple[str, ...]:
-        ids: dict[str, None] = {}
-        for phrase in noun_phrases.with_shared_noun(phrases):
-            resolved = self.resolver.resolve(phrase, "theme", besides=tuple(ids))
-            if resolved.part:
-                self._by_part(resolved.ids, resolved.part)
-            ids |= dict.fromkeys(resolved.ids)
-        return tuple(ids)
+    def _relation(self, clause: _Clause, relation: str) -> None:
+        if relation == "between":
+            ids = [key for ids in self._list("reference", clause.themes) for key in ids]
+            if len(ids) != 2:
+                message = f"it takes two things to be between, not {len(ids)}."
+                raise GroundingError("too_few_objects", message, candidates=ids)
+            return clause.add("between", first=ids[0], second=ids[1])
+        slot = _SLOTS[relation]
+        source = self.tokens[self.at - 1].text
+        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+        is_by_colour = relation == "inside" and bool(self._match(BY_COLOUR))
+        if is_by_colour or (relation == "inside" and clause.verb == "sort"):
+            clause.by_colour |= is_by_colour
+            clause.into = self.nouns.resolve(replace(phrase, every=True), slot)
+            return None
+        if source == "from" and self.nouns.is_table(phrase):
+            return None  # where it lies now
+        return clause.add(relation, **{slot: self._single(phrase, clause, slot)})
 
-    def _goes_on(self, at: int) -> bool:
-        """Whether another object of the same clause follows a comma or "and"."""
-        tokens = self.tokens
-        for table in (VERBS, SEQUENCES, ENSURE, POLITE):
-            if table.match(tokens, at) is not None:
-                return False
-        if at >= len(tokens) or tokens[at].text in UNSUPPORTED_VERBS:
-            return False
-        return noun_phrases.read(tokens, at) is not None
+    def _beside(self, clause: _Clause, relation: str, length: tuple[float, float] | None) -> None:
+        about: dict[str, Any] = {"reference": self._one(clause, "reference")}
+        if relation in SIDES:
+            about["direction"] = relation
+            self._say_directions()
+        if self._match(GAP):
+            length = self._length()
+            if length is None:
+                raise self._unknown(self.at - 1, "does not say how large the gap is")
+        if length is not None:
+            low, high = length
+            slack = GAP_TOLERANCE_M if low == high else 0.0
+            about["gap_m"] = [round(max(0.0, low - slack), 6), round(high + slack, 6)]
+        clause.add("beside", **about)
 
-    def _into_the_only_container(self, clause: Clause) -> None:
-        containers = self.vocabulary.containers()
-        if len(containers) != 1:
-            message = "it is not said what to pack into."
-            kind = "ambiguous_object" if containers else "impossible"
-            raise GroundingError(kind, message, candidates=containers)
-        clause.add("inside", container=containers[0])
-        self.memory.explanation.append(f"no container is named; {containers[0]} is the only one")
+    def _moved(self, clause: _Clause, way: str, length: tuple[float, float] | None) -> None:
+        self._say_directions()
+        if length is None:
+            self.goals.refuse_fixed(clause.themes)
+            raise self._unknown(
+                self.at - 1, "does not say how far: for example '10 cm to the left'"
+            )
+        low, high = (round(each, 6) for each in length)
+        if high > MOST_M:
+            message = f"{high:g} m is no distance that the arm can move something."
+            raise GroundingError("impossible", message, candidates=clause.themes)
+        about = {"by_m": low} if low == high else {"at_least_m": low, "at_most_m": high}
+        clause.add("moved", **about, direction=way)
+
+    def _say_directions(self) -> None:
+        told = "directions are as the robot sees them: forwards is away from its base"
+        self.memory.explanation.append(told)
+
+    def _close(self, clause: _Clause, start: int) -> None:
+        """Take over the goals of a clause that is read to its end."""
+        if clause.by_colour:
+            self._by_colour(clause)
+        elif not clause.goals and clause.verb == "pack":
+            clause.add("inside", container=self._only_container(start))
+        elif not clause.goals and clause.verb == "take":
+            self.held |= dict.fromkeys(clause.themes, self._rest(start))
+            return
+        elif not clause.goals or clause.verb == "sort":
+            self.goals.refuse_fixed(clause.themes)
+            raise self._unknown(start, "does not say where")
+        if clause.verb == "stack" and len(clause.themes) > 1:
+            message = f"which of {', '.join(clause.themes)} is to be below? Say one by one."
+            raise GroundingError("ambiguous_relation", message, candidates=clause.themes)
+        self.goals.add_clause(clause.goals)
+        for key in clause.themes:
+            if any(goal["kind"] in (*PLACES, "outside", "beside") for goal in clause.goals):
+                self.held.pop(key, None)
+
+    def _only_container(self, start: int) -> str:
+        where = self.vocabulary.containers()
+        if len(where) != 1:
+            message = f"'{self._rest(start)}': into what?"
+            kind = "ambiguous_object" if where else "unknown_object"
+            raise GroundingError(kind, message, candidates=where)
+        told = (
+            f"packed into {self.vocabulary.describe(where)}: nothing else here can be packed into"
+        )
+        self.memory.explanation.append(told)
+        return where[0]
+
+    def _by_colour(self, clause: _Clause) -> None:
+        """Each object goes into the container of its colour."""
+        things, containers = self.vocabulary.things, clause.into or self.vocabulary.containers()
+        for key in clause.themes:
+            colour = things[key].colour
+            fitting = [name for name in containers if things[name].colour == colour]
+            if len(fitting) != 1:
+                kind = "ambiguous_object" if fitting else "unknown_object"
+                message = f"{key} is {colour}: there is {len(fitting) or 'no'} such container."
+                raise GroundingError(kind, message, candidates=containers)
+            clause.goals.append({"kind": "inside", "object": key, "container": fitting[0]})

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -56,6 +53,11 @@ class UnderstoodTask:
         }
 
 
+def names_task(words: str) -> bool:
+    """Whether words are a task's name or its file, and no instruction."""
+    return len(words) <= MAX_NAME and _NAME.fullmatch(words) is not None
+
+
 def understand(run: RunFolder, words: str) -> UnderstoodTask:
     """Find the task a person names, or make one of their instruction; nothing is written.
 
@@ -67,7 +69,7 @@ def understand(run: RunFolder, words: str) -> UnderstoodTask:
         GroundingError: When the instruction is not understood or cannot be done.
         UsageError: When there is no such task, or nothing says what the scene holds.
     """
-    if len(words) <= MAX_NAME and _NAME.fullmatch(words):
+    if names_task(words):
         file = chosen_task_file(words, tasks_dir=run.tasks_dir)
         file.task()
         return UnderstoodTask(file=file, grounding=None)
@@ -82,8 +84,7 @@ def _shown(grounding: Grounding, base: Sequence[TaskFile]) -> Sequence[TaskFile]
     With several tasks in a run no episode shows the objects of all; only an instruction about
     objects of several tasks needs them.
     """
-    limits = [dict(limit.constraint) for limit in grounding.path]
-    text = json.dumps([[dict(goal) for goal in grounding.goals], grounding.order, limits])
+    text = json.dumps([[dict(goal) for goal in grounding.goals], grounding.order])
     about = {key for file in base for key in file.task().objects if f'"{key}"' in text}
     holding = [file for file in base if about <= set(file.task().objects)]
     return base if not holding else [min(holding, key=lambda file: len(file.task().objects))]
@@ -132,11 +133,32 @@ def task_files_of(run: RunFolder) -> list[TaskFile]:
     return own or files
 
 
+def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
+    """The task file whose objects an episode shows.
+
+    Args:
+        run: With the episodes.
+        episode: Its name; empty: the newest that was recorded with a task.
+
+    Raises:
+        UsageError: When no episode names a task that is there.
+    """
+    files = task_files_of(run)
+    known = {file.sha256: file for file in files}
+    for path in run.episodes()[::-1]:
+        if len(files) > 1 and episode in ("", path.stem):
+            try:
+                return known[streams.task_file(Episode.open(path)).sha256]
+            except (BridgeError, UsageError, KeyError):
+                continue  # another one may name its task
+    return files[0]
+
+
 def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
     """What the objects of task files are called in a run's scene.
 
     Args:
-        run: Whose ``scene.json`` holds labels, colours and parts; without one, the files' own.
+        run: Whose ``scene.json`` holds labels and colours; without one, the files' own.
         base: At least one.
 
     Raises:
@@ -148,32 +170,4 @@ def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
         raise UsageError("no task file to take objects from.")
     record = read_record(run) or {}
     instances = (record.get("semantics") or {}).get("instances", ())
-    return vocabulary_of(task, instances, cameras=standing_cameras(run))
-
-
-def standing_cameras(run: RunFolder) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """``T_base_camera`` of the cameras that stand still, as the newest readable episode has them.
-
-    A camera in the hand looks elsewhere as soon as the arm moves: what is left in it is not said.
-
-    Args:
-        run: With episodes.
-    """
-    for path in run.episodes()[::-1]:
-        try:
-            episode = Episode.open(path)
-            tree = streams.transform_tree(episode)
-            frames = {
-                camera_id: streams.camera_info(episode, camera_id).frame_id
-                for camera_id in streams.camera_ids(episode)
-            }
-            standing = {
-                camera_id: tree.T_root_frame(frame, 0)
-                for camera_id, frame in frames.items()
-                if len(tree.stamps_ns(frame)) == 1
-            }
-        except BridgeError:
-            continue  # nothing else of it is needed here
-        if standing:
-            return standing
-    return {}
+    return vocabulary_of(task, instances)

@@ -1,24 +1,19 @@
-"""What an instruction can be about: the things of a scene, what they are called, the cameras."""
+"""What an instruction can be about: the things of a scene, and what they are called."""
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from bridge.task.relations import SIDES, WAYS
 from bridge.task.task_file import BASKET, ObjectModel, Task
 from twin.errors import TwinError
-from twin.scene.semantics.colour import COLOUR_NAMES, colour_name
+from twin.scene.semantics.colour import colour_name
 from twin.scene.semantics.language import (
-    ANY_THING,
+    KIND_NAMES,
     colour_of,
     kind_of,
-    known_words,
     label_of,
-    names_of,
     spoken_name,
     words_of,
 )
@@ -33,10 +28,8 @@ KINDS = (
     "fixed_object",
     "impossible",
     "negated",
-    "no_such_part",
     "too_few_objects",
     "too_long",
-    "unknown_camera",
     "unknown_clause",
     "unknown_object",
     "unsupported_relation",
@@ -45,12 +38,10 @@ KINDS = (
 """Why an instruction is not planned."""
 AT_FAULT = ("contradiction", "cyclic", "fixed_object")
 """Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
-PARTS_OF_KIND = {
-    "container": ("rim", "floor", "walls"),
-    "animal": ("body", "head", "limbs"),
-    "other": (),
-}
-"""Parts that a thing of a kind has where nobody has looked."""
+ANY_THING = ("object", "thing", "item")
+ALSO_CALLED = {"cube": ("block", "brick"), "block": ("cube", "brick"), "brick": ("block", "cube")}
+"""Other nouns for the same, where nothing in the scene has that noun as its own. A bin is no mug:
+whatever is not here is an unknown object."""
 
 
 class GroundingError(TwinError):
@@ -62,7 +53,6 @@ class GroundingError(TwinError):
         """Remember the kind, one of ``KINDS``, and ids of what could be meant, or is at fault."""
         self.kind = kind
         self.candidates = tuple(candidates)
-        self.found = message
         choices = () if kind in AT_FAULT else self.candidates
         listed = f" There is: {', '.join(choices)}." if choices else ""
         super().__init__(f"{message}{listed}")
@@ -79,31 +69,25 @@ class Thing:
     """One of the names of ``twin.scene.semantics.colour``, or empty."""
     movable: bool
     container: bool
-    soft: bool = False
-    parts: tuple[str, ...] = ()
-    """Empty: nobody has looked; then those of its kind."""
     size_m: tuple[float, float, float] | None = None
     """Outer extents, where known: small and large compare them."""
+    shape: str = ""
+    """``cube`` where it is one, whatever it is called."""
     own_names: frozenset[str] = field(init=False)
     """Words of its id and of its label."""
     names: frozenset[str] = field(init=False)
-    """Whatever else the lexicon lets it be called."""
+    """Whatever else it may be called."""
 
     def __post_init__(self) -> None:
         """Work out its names once."""
-        words = set(words_of(spoken_name(self.id))) | set(words_of(self.label))
-        nouns = {word for word in words if colour_of(word) is None or word in known_words()}
-        object.__setattr__(self, "own_names", frozenset(nouns))
-        names = set(names_of(self.label)) | nouns
-        if self.container:
-            names |= set(names_of("open container"))
-        object.__setattr__(self, "names", frozenset(names))
-
-    @property
-    def known_parts(self) -> tuple[str, ...]:
-        """Parts that can be spoken of."""
-        kind = "container" if self.container else kind_of(self.label)
-        return self.parts or PARTS_OF_KIND[kind]
+        words = words_of(spoken_name(self.id)) + words_of(self.label)
+        own = {word for word in words if colour_of(word) is None}
+        names = own | set(ANY_THING) | set(KIND_NAMES[kind_of(self.label)])
+        names |= {other for word in own for other in ALSO_CALLED.get(word, ())}
+        object.__setattr__(self, "own_names", frozenset(own))
+        object.__setattr__(
+            self, "names", frozenset(names | ({"container"} if self.container else set()))
+        )
 
     def describe(self) -> str:
         """Its id and what it is."""
@@ -116,24 +100,6 @@ class Vocabulary:
     """Everything an instruction can name."""
 
     things: Mapping[str, Thing]
-    cameras: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """``T_base_camera`` by id, where calibrated: directions may be as a camera sees them."""
-
-    def as_seen(self, camera: str, direction: str) -> list[float]:
-        """A named direction of a camera's view, along the table in the base frame.
-
-        Args:
-            camera: One of ``cameras``.
-            direction: A side or a way, by its name.
-        """
-        R = self.cameras[camera][:3, :3]
-        ahead = R[:, 2] if np.linalg.norm(R[:2, 2]) > 0.5 else -R[:, 1]  # looking down: image up
-        right = np.array([ahead[1], -ahead[0], 0.0])
-        if right @ R[:, 0] < 0:  # hung upside down
-            right = -right
-        forwards, left, _ = {**SIDES, **WAYS}[direction]
-        way = forwards * np.array([ahead[0], ahead[1], 0.0]) - left * right
-        return [round(float(part), 6) for part in way / np.linalg.norm(way)]
 
     def movable(self) -> tuple[str, ...]:
         """Ids of what the robot can move."""
@@ -143,78 +109,38 @@ class Vocabulary:
         """Ids of what things can be put into."""
         return tuple(key for key, thing in self.things.items() if thing.container)
 
-    def nouns(self) -> set[str]:
-        """Every noun that means something here or in the lexicon."""
-        own = {name for thing in self.things.values() for name in thing.own_names}
-        return known_words() | own | set(ANY_THING)
-
-    def nearest(self, word: str) -> str:
-        """A hint at the known word that was probably meant, or nothing."""
-        known = sorted(self.nouns() | set(COLOUR_NAMES))
-        found = difflib.get_close_matches(word, known, n=1, cutoff=0.75)
-        return f" Did you mean {found[0]!r}?" if found else ""
-
     def describe(self, ids: Sequence[str]) -> str:
         """Name things with what they are."""
         return ", ".join(self.things[key].describe() if key in self.things else key for key in ids)
 
 
-def vocabulary_from_labels(scene: Mapping[str, Mapping[str, str]]) -> Vocabulary:
-    """Make a vocabulary of ids with ``label``, ``colour`` and ``role``.
-
-    Args:
-        scene: The role holds one or more of movable, fixed, soft, container. A label that ends in
-            a container's name makes a container.
-    """
-    things = {}
-    for key, about in scene.items():
-        roles = {word.strip() for word in about.get("role", "").split(",")}
-        label = about["label"]
-        things[key] = Thing(
-            id=key,
-            label=label,
-            colour=about.get("colour", ""),
-            movable="movable" in roles and "fixed" not in roles,
-            container="container" in roles or kind_of(label) == "container",
-            soft="soft" in roles,
-        )
-    return Vocabulary(things=things)
-
-
-def vocabulary_of(
-    task: Task,
-    instances: Sequence[Mapping[str, Any]] = (),
-    cameras: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
-) -> Vocabulary:
+def vocabulary_of(task: Task, instances: Sequence[Mapping[str, Any]] = ()) -> Vocabulary:
     """Make a vocabulary of a task's objects, called as the rebuilt scene calls them.
 
     Args:
         task: Says which objects there are, their colours, and what can be moved.
         instances: ``semantics.instances`` of ``scene.json``; an object that is not among them
             keeps its name and the colour of the task file.
-        cameras: ``T_base_camera`` by id.
     """
     seen = {str(item["object"]): item for item in instances if item.get("object")}
     things = {}
     for key, model in task.objects.items():
-        about = seen.get(key, {})
         is_container = model.shape == "open_box" or model.mesh == BASKET
         colour = colour_name(np.array(model.color_srgb) / 255)
-        by_task = label_of(key, colour, is_open=is_container, shape=_shape_word(model))
-        label = str(about.get("label") or by_task)
+        shape = _shape_word(model)
+        by_task = label_of(key, colour, is_open=is_container, shape=shape)
+        label = str(seen.get(key, {}).get("label") or by_task)
         spoken = next(filter(None, map(colour_of, words_of(label))), None)
-        colour = spoken or colour  # what it is called, whatever its colour looks like
         things[key] = Thing(
             id=key,
             label=label,
-            colour=colour,
+            colour=spoken or colour,  # what it is called, whatever its colour looks like
             movable=not model.fixed,
             container=is_container,
-            soft=model.soft is not None,
-            parts=tuple(str(part) for part in about.get("parts", ())),
             size_m=model.size_m,
+            shape=shape if shape == "cube" else "",
         )
-    return Vocabulary(things=things, cameras=cameras or {})
+    return Vocabulary(things=things)
 
 
 ALIKE = 1.15

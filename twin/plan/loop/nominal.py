@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.task.check import TABLE, nearest
+from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan
-from twin.plan.config import MODEL_POLICY
 from twin.plan.constrain.constraint import (
     SHOWN,
     Constraint,
@@ -49,7 +49,7 @@ from twin.plan.path.planner import (
 )
 from twin.plan.path.transfer import LIFT_M, Leg, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release, State
-from twin.plan.release.final_states import FinalStates, ReleaseConfig, final_states
+from twin.plan.release.final_states import ReleaseConfig, final_states
 from twin.plan.release.resting import NoFinalStateError
 from twin.replay.clearance.bodies import SCENE
 from twin.replay.config import ReplayConfig
@@ -368,7 +368,7 @@ class _Options:
     ) -> None:
         self._problem, self._key, self._policy = problem, key, policy
         self._seed, self._steer = seed, steer
-        searcher = GraspSearcher(problem, replace(policy.grasp, seed=policy.grasp.seed))
+        searcher = GraspSearcher(problem, policy.grasp)
         found = searcher.search(key, _part_points(problem, key))
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
@@ -438,20 +438,20 @@ class _Options:
 
     def _releases(self, grasp: Grasp) -> tuple[Release, ...]:
         try:
-            found = self._final_states(grasp)
+            releases = self._final_states(grasp)
         except NoFinalStateError as error:
             self.why = str(error)
             if error.cause in _HOPELESS:
                 raise
             return ()
-        steer, releases = self._steer, found.releases
+        steer = self._steer
         if steer is not None and steer.change == "release":
             releases = tuple(
                 each for each in releases if not steer.has_release_like(self._key, each.T_base_tcp)
             )
         return releases
 
-    def _final_states(self, grasp: Grasp) -> FinalStates:
+    def _final_states(self, grasp: Grasp) -> tuple[Release, ...]:
         problem, config = self._problem, self._policy.release
         relation = self._relation
         placed = relation is None or (relation[0] in _PLACED and relation[1] != TABLE)
@@ -470,7 +470,7 @@ class _Options:
         return (
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
-            *(f"{self._key}: {text}" for text in (*self._remarks, *grasp.remarks)),
+            *(f"{self._key}: {text}" for text in self._remarks),
             f"{self._key}: final state of J {release.cost:.4f}{nearest}; asked were "
             + "; ".join(release.checked_against),
             f"{self._key}: {postures:.0f} postures looked at on the way",

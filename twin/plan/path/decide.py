@@ -35,8 +35,6 @@ class PathRefusal:
     lacking_m: float
     """How much farther apart they should have been."""
     t_ns: int
-    by: str
-    """Who refused."""
     detail: str
 
 
@@ -117,7 +115,6 @@ def decide(
                     bodies=closest.links,
                     lacking_m=-closest.distance_m,
                     t_ns=int(stamps[index]),
-                    by="links",
                     detail=f"{closest.links[0]} touches {closest.links[1]}",
                 )
             )
@@ -128,7 +125,6 @@ def decide(
             bodies=(failure.bodies[0], failure.bodies[1]),
             lacking_m=limits.get(failure.cause, config.eps_col_m) - _least(monitor, failure.bodies),
             t_ns=failure.t_ns,
-            by="clearance",
             detail=failure.detail,
         )
         for failure in monitor.failures
@@ -170,9 +166,7 @@ def _by_audit(factor: Factor) -> PathRefusal:
     """What python-fcl found nearer than the monitor said."""
     first, second = factor.bodies[:2]
     detail = factor.detail or ""
-    return PathRefusal(
-        bodies=(first, second), lacking_m=AUDIT_STEP_M, t_ns=0, by="audit", detail=detail
-    )
+    return PathRefusal(bodies=(first, second), lacking_m=AUDIT_STEP_M, t_ns=0, detail=detail)
 
 
 def _result(

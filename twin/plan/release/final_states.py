@@ -11,14 +11,12 @@ others keep eps_col.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from bridge.errors import refuse_outside
 from bridge.geometry import se3
 from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.bodies import surface_points
@@ -36,7 +34,6 @@ from twin.plan.release.resting import (
     sideways_sigma_m,
     target_of,
 )
-from twin.plan.release.sampling import perturbed, sampling_record
 from twin.plan.stage.objective import ANGLE_RAD, CostTerm, StageProblem, Zeta
 from twin.plan.stage.solver import SolveConfig, StageCandidate, distinct, solve
 from twin.robot.collision import hulls_of
@@ -45,14 +42,27 @@ NEAR_M = 0.02
 """Margins above this are not told apart while a stage is solved."""
 
 
+TAU_P_M = 0.02
+"""Bound of the shifts of Eq. 8, along each axis."""
+TAU_R_RAD = ANGLE_RAD
+"""Bound of the turns of Eq. 9."""
+HAND_POINTS = 200
+"""Of the open hand's surface."""
+DROP_M, MOST_DROP_M = 0.004, 0.03
+"""Wanted between the underside and what the object will lie on; most of it, over a rim that the
+object may have to stay above."""
+MOST_TILT_RAD = float(np.deg2rad(12.0))
+"""Most that the object may lean from how it will rest."""
+MOST_TOOL_TILT_RAD = float(np.deg2rad(60.0))
+"""Most that the tool may lean from straight down where the object is let go."""
+OPEN_MORE_M = 0.01
+"""The hand opens at least this much wider than it held."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReleaseConfig:
     """How final states are looked for."""
 
-    tau_p_m: float = 0.02
-    """Bound of the shifts of Eq. 8, along each axis."""
-    tau_r_rad: float = ANGLE_RAD
-    """Bound of the turns of Eq. 9."""
     num_samples: int = 2048
     """Poses drawn, over all nominal ones."""
     num_nominal: int = 4
@@ -61,47 +71,12 @@ class ReleaseConfig:
     """Starts of the stage optimisation for each way to rest."""
     num_ways: int = 4
     """Ways to rest that are tried, those nearest to how the object lies now first."""
-    num_hand_points: int = 200
-    """Of the open hand's surface."""
     eps_col_m: float = 0.002
     """Least distance between what may not touch, the paper's epsilon_col."""
-    drop_m: float = 0.004
-    """Wanted between the underside and what the object will lie on."""
-    max_drop_m: float = 0.03
-    """Most of it, over a rim that the object may have to stay above."""
-    max_tilt_rad: float = float(np.deg2rad(12.0))
-    """Most that the object may lean from how it will rest."""
-    max_tool_tilt_rad: float = float(np.deg2rad(60.0))
-    """Most that the tool may lean from straight down where the object is let go."""
     sigmas: float = 2.0
     """Standard deviations of localisation that the object stays away from the edge of the area."""
-    open_more_m: float = 0.01
-    """The hand opens at least this much wider than it held."""
     max_releases: int = 16
     """Most final states."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that are none."""
-        refuse_outside(
-            self,
-            {
-                "tau_p_m": (0, 1),
-                "tau_r_rad": (0, np.pi),
-                "num_samples": (0, 1_000_000),
-                "num_nominal": (1, 64),
-                "num_starts": (1, 4096),
-                "num_ways": (1, 96),
-                "num_hand_points": (8, 10_000),
-                "eps_col_m": (0, 1),
-                "drop_m": (0, 1),
-                "max_drop_m": (0, 1),
-                "max_tilt_rad": (0, np.pi),
-                "max_tool_tilt_rad": (0, np.pi),
-                "sigmas": (0, 10),
-                "open_more_m": (0, 0.1),
-                "max_releases": (1, 4096),
-            },
-        )
 
     def solver(self) -> SolveConfig:
         """How the stage problem of one way to rest is solved: from above, hardly leaning."""
@@ -110,19 +85,9 @@ class ReleaseConfig:
             iterations=20,
             redraws=1,
             only_above=True,
-            spread_rad=self.max_tilt_rad,
+            spread_rad=MOST_TILT_RAD,
             max_candidates=self.max_releases,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class FinalStates:
-    """Where an object may be let go."""
-
-    releases: tuple[Release, ...]
-    """Distinct, the cheapest first."""
-    log: dict[str, Any] = field(default_factory=dict)
-    """How they were found: bounds, distributions, counts, what distances were asked."""
 
 
 def final_states(
@@ -131,11 +96,10 @@ def final_states(
     *,
     constraints: Sequence[Constraint] = (),
     near: Sequence[Float[np.ndarray, "4 4"]] | None = None,
-    allowed_contacts: Sequence[tuple[str, str]] | None = None,
     config: ReleaseConfig | None = None,
     seed: int = 0,
-) -> FinalStates:
-    """Find where a held object may be let go.
+) -> tuple[Release, ...]:
+    """Find where a held object may be let go: distinct final states, the cheapest first.
 
     Args:
         problem: The scene.
@@ -143,7 +107,6 @@ def final_states(
         constraints: What must hold there besides (Eq. 7).
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
             for; ``constraints`` then say what is wanted.
-        allowed_contacts: Pairs that may touch; None: those of the stage that releases the object.
         config: The defaults when None.
         seed: The same seed gives the same answer.
 
@@ -151,7 +114,7 @@ def final_states(
         NoFinalStateError: With its cause, and what is in the way.
     """
     config = ReleaseConfig() if config is None else config
-    search = ReleaseSearch(problem, grasp, constraints, allowed_contacts, config)
+    search = ReleaseSearch(problem, grasp, constraints, config)
     target = target_of(problem, grasp.object_id) if near is None else None
     if target is not None:
         search.check_size(target)
@@ -159,8 +122,8 @@ def final_states(
             problem,
             grasp,
             target,
-            drop_m=config.drop_m,
-            most_tilted_rad=config.max_tool_tilt_rad,
+            drop_m=DROP_M,
+            most_tilted_rad=MOST_TOOL_TILT_RAD,
         )[: config.num_ways]
     else:
         ways = list(near or ())
@@ -177,31 +140,20 @@ class ReleaseSearch:
         problem: Problem,
         grasp: Grasp,
         constraints: Sequence[Constraint],
-        allowed_contacts: Sequence[tuple[str, str]] | None,
         config: ReleaseConfig,
     ) -> None:
-        """Collect obstacles and points.
-
-        Args:
-            problem: The scene.
-            grasp: How the hand holds the object.
-            constraints: What must hold besides.
-            allowed_contacts: Pairs that may touch; None: those of the stage that releases it.
-            config: Settings.
-        """
+        """Collect obstacles and points."""
         self._problem, self._grasp, self._config = problem, grasp, config
         self._constraints = constraints
         hulls = hulls_of(problem.robot)
         gripper = problem.robot.record.gripper
         self._max_width_m = gripper.max_width_m
-        self._width_m = min(
-            max(grasp.open_m, grasp.width_m + config.open_more_m), gripper.max_width_m
-        )
+        self._width_m = min(max(grasp.open_m, grasp.width_m + OPEN_MORE_M), gripper.max_width_m)
         self._points_m = surface_points(problem, grasp.object_id)
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
-        self._hand_m = hand_points(hulls, self._width_m, config.num_hand_points)
+        self._hand_m = hand_points(hulls, self._width_m, HAND_POINTS)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
-        pairs = _release_contacts(problem, grasp.object_id, allowed_contacts)
+        pairs = _release_contacts(problem, grasp.object_id)
         names = self._obstacles.names
         self._allowed = allowed_with(grasp.object_id, pairs, names)
         self._hand_allowed = allowed_with(gripper.name, pairs, names)
@@ -260,7 +212,7 @@ class ReleaseSearch:
         return np.asarray(self._config.eps_col_m * (1.0 - allowed))
 
     def _not_open(self, state: State) -> Array:
-        return self._grasp.width_m + self._config.open_more_m / 2 - state.width_m
+        return self._grasp.width_m + OPEN_MORE_M / 2 - state.width_m
 
     def _placed(self, T_rest: Float[np.ndarray, "4 4"], target: Target) -> list[CostTerm]:
         """Inside of the area, at a small height, level."""
@@ -272,7 +224,7 @@ class ReleaseSearch:
         extents = np.ptp(self._outline_m @ T_rest[:2, :3].T @ R_area, axis=0)
         room = half - margin - extents / 2 * whole
         if target.relation == "at":
-            half, margin = half + config.tau_p_m, 0.0
+            half, margin = half + TAU_P_M, 0.0
         elif (room < 0).any():
             margin = max(0.0, margin + float(room.min()))  # as much as there is
         up = T_rest[:3, :3].T[:, 2]
@@ -288,11 +240,11 @@ class ReleaseSearch:
         def off_height(state: State) -> Array:
             T = state.Ts_base_object[name]
             over = (T[:, 2, :3] @ self._outline_m.T).min(axis=1) + T[:, 2, 3] - target.T_base[2, 3]
-            return np.maximum(over - config.max_drop_m - target.rim_m, config.drop_m / 2 - over)
+            return np.maximum(over - MOST_DROP_M - target.rim_m, DROP_M / 2 - over)
 
         def leaning(state: State) -> Array:
             z = state.Ts_base_object[name][:, :3, :3] @ up
-            return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2]) - config.max_tilt_rad
+            return np.arctan2(np.hypot(z[:, 0], z[:, 1]), z[:, 2]) - MOST_TILT_RAD
 
         return [
             CostTerm(name=f"{name} within {target.name}", violation=beyond),
@@ -302,7 +254,7 @@ class ReleaseSearch:
 
     def answer(
         self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
-    ) -> FinalStates:
+    ) -> tuple[Release, ...]:
         """Solve each way to rest, perturb the best, keep the distinct feasible ones.
 
         Args:
@@ -317,48 +269,28 @@ class ReleaseSearch:
         settings = config.solver()
         solved: list[tuple[StageProblem, StageCandidate]] = []
         nearest: list[tuple[StageProblem, StageCandidate]] = []
-        states = 0
         for stage in stages:
             solution = solve(stage, settings, seed=seed)
             solved += [(stage, candidate) for candidate in solution.candidates]
             nearest.append((stage, solution.nearest))
-            states += solution.work["states"]
         if not solved:
             raise self._nothing(*min(nearest, key=lambda pair: pair[1].cost))
         solved.sort(key=lambda pair: pair[1].cost)
         Ts = [candidate.T_base_tcp[None] for _, candidate in solved]
         costs = [np.array([candidate.cost]) for _, candidate in solved]
-        shares = []
         for stage, candidate in solved[: config.num_nominal]:
             count = config.num_samples // min(config.num_nominal, len(solved))
             drawn, cost = self._perturbed(stage, candidate, count, rng)
             Ts.append(drawn)
             costs.append(cost)
-            shares.append(len(drawn) / count if count else 1.0)
-        log = sampling_record(config.tau_p_m, config.tau_r_rad, seed) | {
-            "num_nominal": min(config.num_nominal, len(solved)),
-            "num_samples": config.num_samples,
-            "share_feasible": [round(share, 4) for share in shares],
-            "stage_states": states,
-            "eps_col_m": config.eps_col_m,
-            "allowed_to_touch": self._allowed_names(),
-            "checked_against": list(self._obstacles.describe()),
-        }
-        return FinalStates(
-            releases=self._releases(np.concatenate(Ts), np.concatenate(costs)), log=log
-        )
+        return self._releases(np.concatenate(Ts), np.concatenate(costs))
 
     def _perturbed(
         self, stage: StageProblem, nominal: StageCandidate, count: int, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "num 4 4"], Float[np.ndarray, " num"]]:
         """Draw poses around one and keep those that satisfy everything, with their J."""
-        config = self._config
         T = perturbed(
-            nominal.T_base_tcp,
-            tau_p_m=config.tau_p_m,
-            tau_r_rad=config.tau_r_rad,
-            count=count,
-            rng=rng,
+            nominal.T_base_tcp, tau_p_m=TAU_P_M, tau_r_rad=TAU_R_RAD, count=count, rng=rng
         )
         zeta = Zeta(T_base_tcp=T, width_m=np.full(count, nominal.width_m))
         free = np.ones(count, dtype=np.bool_)
@@ -372,7 +304,7 @@ class ReleaseSearch:
         self, Ts: Float[np.ndarray, "num 4 4"], costs: Float[np.ndarray, " num"]
     ) -> tuple[Release, ...]:
         order = np.argsort(costs, kind="stable")
-        chosen = distinct(Ts, order, SolveConfig(max_candidates=self._config.max_releases))
+        chosen = distinct(Ts, order, self._config.max_releases)
         Ts_object = Ts[chosen] @ self._T_tcp_object
         distances = self._obstacles.distances(self._points_m, Ts_object)
         counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
@@ -393,19 +325,11 @@ class ReleaseSearch:
         flags = zip(self._obstacles.names, self._allowed, strict=True)
         return [name for name, allowed in flags if allowed]
 
-    def _allowed_names(self) -> list[list[str]]:
-        gripper = self._problem.robot.record.gripper.name
-        touched = zip(self._obstacles.names, self._hand_allowed, strict=True)
-        return [
-            *([self._grasp.object_id, name] for name in self._may_touch()),
-            *([gripper, name] for name, allowed in touched if allowed),
-        ]
-
     def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
         """Say what was in the way where the least was."""
         told = "; ".join(
             f"{name}: by {f * SHOWN[term.unit][0]:.1f} {SHOWN[term.unit][1]}"
-            for (name, f), term in zip(nearest.violations.items(), stage.terms, strict=True)
+            for (name, f), term in zip(nearest.violations.items(), stage.subgoal, strict=True)
             if f > 0
         )
         near = ", ".join(self._in_the_way(nearest.T_base_tcp))
@@ -428,13 +352,40 @@ class ReleaseSearch:
         return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
 
 
-def _release_contacts(
-    problem: Problem, object_id: str, given: Sequence[tuple[str, str]] | None
-) -> list[tuple[str, str]]:
+def _release_contacts(problem: Problem, object_id: str) -> list[tuple[str, str]]:
     """Pairs that may touch where an object is let go: those of its release stage."""
-    if given is not None:
-        return list(given)
     for stage in problem.scene.task.stages:
         if stage.get("release") == object_id:
             return [(a, b) for a, b in stage.get("allowed_contacts", ())]
     return []
+
+
+def perturbed(
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    *,
+    tau_p_m: float,
+    tau_r_rad: float,
+    count: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "count 4 4"]:
+    """Draw end-effector poses around a nominal one, Eq. 8 and 9 of the paper.
+
+    The position moves by a vector uniform in a box. The paper bounds the rotation vector and says
+    neither how it is drawn nor in which frame; here its axis is uniform on the sphere, its angle
+    uniform in [0, tau_r], and it turns the tool in the tool's own frame (errata, resolution 7).
+
+    Args:
+        T_base_tcp: The nominal pose.
+        tau_p_m: Most of the shift along each axis.
+        tau_r_rad: Most of the turn.
+        count: How many.
+        rng: Where they come from.
+    """
+    shift = rng.uniform(-tau_p_m, tau_p_m, (count, 3))
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    turn = axis * rng.uniform(0.0, tau_r_rad, (count, 1))
+    T = np.repeat(T_base_tcp[None], count, axis=0)
+    T[:, :3, :3] = T[:, :3, :3] @ se3.rotation_from_vector(turn)
+    T[:, :3, 3] += shift
+    return T

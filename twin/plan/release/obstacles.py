@@ -1,8 +1,8 @@
 """What a carried object and the hand must stay away from, measured for many poses at once.
 
-Near receptacles their panels and the grids of objects decide, which are right to a millimetre or
-two. The static grid of a rebuilt scene has voxels of about 10 mm: it is made thicker by its own
-error, half the diagonal of a voxel, and what has a name is taken out of it first.
+Near receptacles their panels decide, which are right to a millimetre or two. The static grid of a
+rebuilt scene has voxels of about 10 mm: it is made thicker by its own error, half the diagonal of a
+voxel, and what has a name is taken out of it first.
 """
 
 from collections.abc import Collection, Sequence
@@ -34,7 +34,7 @@ TABLE_SIDE_M = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """One body that stands still: boxes, or a grid of distances."""
+    """One body that stands still: boxes, or the grid of what has no name."""
 
     name: str
     error_m: float
@@ -43,13 +43,6 @@ class Obstacle:
     """What its distances are made of, in words."""
     boxes: tuple[PanelBox, ...] = ()
     grid: GridLookup | None = None
-    T_grid_base: Float[np.ndarray, "4 4"] | None = None
-    """None: the grid is in the base frame."""
-
-    def in_grid(self, Ts_base_body: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-        """Poses in the frame of the grid."""
-        T = self.T_grid_base
-        return Ts_base_body if T is None else np.asarray(T @ Ts_base_body)
 
     def describe(self) -> str:
         """Name it with its source and its error."""
@@ -96,8 +89,7 @@ class Obstacles:
                 first, last = self._first[index : index + 2]
                 found[:, index] = to_boxes[:, first:last].min(axis=1)
             else:
-                Ts = obstacle.in_grid(Ts_base_body)
-                found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts)
+                found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts_base_body)
         return np.asarray(found - self._error_m)
 
     def margins(
@@ -121,8 +113,7 @@ class Obstacles:
         self._boxes.lower(found, keep[self._owner], points_m, Ts_base_body)
         for index, obstacle in enumerate(self.all):
             if obstacle.grid is not None:
-                Ts = obstacle.in_grid(Ts_base_body)
-                lower_by_grid(obstacle.grid, found, float(keep[index]), points_m, Ts)
+                lower_by_grid(obstacle.grid, found, float(keep[index]), points_m, Ts_base_body)
         return found
 
 
@@ -144,7 +135,9 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
         boxes = tuple(placed_panels(problem.model(name), T))
         if name in stationary:
             panels += boxes
-        found.append(_object(problem, name, T, boxes, exact=name in stationary))
+        what = "panels" if name in stationary else "its box"
+        source = f"{what} of the task file's size"
+        found.append(Obstacle(name=name, error_m=0.0, source=source, boxes=boxes))
     if scene.static_sdf is not None:
         foot = stationary_links(hulls)[1]
         grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
@@ -165,31 +158,6 @@ def _table(height_m: float) -> Obstacle:
     T[2, 3] = height_m - TABLE_SIDE_M / 2
     boxes = ((T, np.full(3, TABLE_SIDE_M)),)
     return Obstacle(name=TABLE, error_m=0.0, source="its plane", boxes=boxes)
-
-
-def _object(
-    problem: Problem,
-    name: str,
-    T_base_object: Float[np.ndarray, "4 4"],
-    boxes: tuple[PanelBox, ...],
-    *,
-    exact: bool,
-) -> Obstacle:
-    """An object by its own grid, where a scan made one; containers and others by their boxes."""
-    shape = problem.shapes[name]
-    if exact or shape.sdf is None:
-        what = "panels" if exact else "its box"
-        return Obstacle(
-            name=name, error_m=0.0, source=f"{what} of the task file's size", boxes=boxes
-        )
-    error_m = max(shape.error_m, shape.sdf.voxel_m / 2)
-    return Obstacle(
-        name=name,
-        error_m=error_m,
-        source=f"grid of {shape.sdf.voxel_m * 1e3:.1f} mm voxels of its scan",
-        grid=GridLookup(shape.sdf),
-        T_grid_base=se3.invert(T_base_object),
-    )
 
 
 def allowed_with(

@@ -3,23 +3,39 @@
 Levenberg-Marquardt (Levenberg 1944, Marquardt 1963) on SE(3) and the width, all starts in one
 batch, each with its own damping. Every state on the way that satisfies all constraints is a
 candidate, not only the last one: what is left of them, after those within 1 cm and 10 degrees of
-a cheaper one are dropped, are answers that differ. Work is counted in states, never in seconds.
+a cheaper one are dropped, are answers that differ.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bridge.errors import MissingDependencyError, refuse_outside
 from bridge.geometry import se3
-from twin.plan.stage.motion import moved
-from twin.plan.stage.objective import ANGLE_RAD, LENGTH_M, NUM_VARIABLES, StageProblem, Zeta
+from twin.plan.stage.objective import (
+    ANGLE_RAD,
+    LENGTH_M,
+    NUM_VARIABLES,
+    StageProblem,
+    Zeta,
+    moved,
+)
 
 UNITS = np.array([LENGTH_M] * 3 + [ANGLE_RAD] * 3 + [LENGTH_M])
 """What a step of one is: 1 cm, 10 degrees, 1 cm."""
+FREE_ITERATIONS = 12
+"""Most steps of a start that go to what the constraints allow before the regulariser draws."""
+SPREAD_M = 0.06
+"""Starts are drawn this far around the nominal position, along each axis."""
+SPREAD_TURN_RAD = float(np.pi)
+"""And turned about the vertical by up to this much."""
+DAMPING = 1e-2
+"""First damping of Levenberg and Marquardt."""
+LONGEST_STEP = 4.0
+"""Of a start in one iteration, in units of 1 cm and 10 degrees."""
+SETTLED = 1e-7
+"""A start whose cost falls by a smaller share is done."""
 _DIFFERENCE = 1e-4
 """Step of numeric derivatives, in units: 1 um, 0.001 degrees."""
 _NOTHING = 1e-10
@@ -37,56 +53,15 @@ class SolveConfig:
     num_starts: int = 32
     """Starts that are followed at once."""
     iterations: int = 30
-    """Most steps of each start,"""
-    free_iterations: int = 12
-    """of which at most this many go to what the constraints allow."""
+    """Most steps of each start."""
     redraws: int = 2
     """How often a start that ends where a constraint is violated is drawn anew."""
-    spread_m: float = 0.06
-    """Starts are drawn this far around the nominal position, along each axis."""
     only_above: bool = False
     """No start is drawn below the nominal position: what is put down comes from above."""
     spread_rad: float = 0.6
-    """And turned by up to this much."""
-    spread_turn_rad: float = float(np.pi)
-    """Before that, turned about the vertical by up to this much."""
-    damping: float = 1e-2
-    """First damping of Levenberg and Marquardt."""
-    longest_step: float = 4.0
-    """Of a start in one iteration, in units of 1 cm and 10 degrees."""
-    settled: float = 1e-7
-    """A start whose cost falls by a smaller share is done."""
-    same_m: float = 0.01
-    """Answers closer than this are one,"""
-    same_rad: float = ANGLE_RAD
-    """when they are also turned by less than this."""
+    """Starts are tilted by up to this much."""
     max_candidates: int = 16
     """Most answers."""
-    backend: Literal["numpy", "torch"] = "numpy"
-    """Who differentiates: NumPy by differences, torch exactly."""
-    device: str = "cpu"
-    """Of torch."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that are none."""
-        refuse_outside(
-            self,
-            {
-                "num_starts": (1, 4096),
-                "iterations": (1, 1000),
-                "free_iterations": (0, 1000),
-                "redraws": (0, 100),
-                "spread_m": (0, 2),
-                "spread_rad": (0, np.pi),
-                "spread_turn_rad": (0, np.pi),
-                "damping": (1e-12, 1e6),
-                "longest_step": (1e-3, 1e3),
-                "settled": (0, 1),
-                "same_m": (0, 1),
-                "same_rad": (0, np.pi),
-                "max_candidates": (1, 4096),
-            },
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,12 +89,8 @@ class StageSolution:
     """Feasible and distinct, the cheapest first; empty when none was found."""
     nearest: StageCandidate
     """The cheapest state of all, feasible or not: what it violates says what is in the way."""
-    costs: Float[np.ndarray, " num_starts"]
-    """J where each start ended."""
     feasible: Bool[np.ndarray, " num_starts"]
     """Whether each start ended with every constraint satisfied."""
-    work: Mapping[str, int] = field(default_factory=dict)
-    """Counted steps."""
 
 
 @dataclass
@@ -152,11 +123,11 @@ def draw_starts(problem: StageProblem, config: SolveConfig, seed: int) -> Zeta:
     """
     rng = np.random.default_rng(seed)
     num = config.num_starts
-    shift = rng.uniform(-1.0, 1.0, (num, 3)) * config.spread_m
+    shift = rng.uniform(-1.0, 1.0, (num, 3)) * SPREAD_M
     if config.only_above:
         shift[:, 2] = np.abs(shift[:, 2])
     about = np.zeros((num, 3))
-    about[:, 2] = rng.uniform(-config.spread_turn_rad, config.spread_turn_rad, num)
+    about[:, 2] = rng.uniform(-SPREAD_TURN_RAD, SPREAD_TURN_RAD, num)
     axis = rng.normal(size=(num, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     turn = axis * rng.uniform(0.0, config.spread_rad, (num, 1))
@@ -173,40 +144,28 @@ def solve(
     config: SolveConfig | None = None,
     *,
     seed: int = 0,
-    starts: Zeta | None = None,
 ) -> StageSolution:
     """Minimise J from all starts and keep the distinct feasible states.
 
     Args:
         problem: The stage.
         config: The defaults when None.
-        seed: Of the starts that are drawn; not used when they are given.
-        starts: Where to begin; None: drawn around the nominal state.
-
-    Raises:
-        ValueError: A start is not finite.
+        seed: Of the starts that are drawn.
     """
     config = SolveConfig() if config is None else config
-    drawn = starts is None
-    zeta = draw_starts(problem, config, seed) if starts is None else starts
-    if not (np.isfinite(zeta.T_base_tcp).all() and np.isfinite(zeta.width_m).all()):
-        message = "a start of the stage optimisation is not finite."
-        raise ValueError(message)
-    backend = backend_of(config)
-    ends = _descended(problem, config, backend, zeta)
-    for attempt in range(1, config.redraws + 1 if drawn else 1):
+    zeta = draw_starts(problem, config, seed)
+    ends = _descended(problem, config, zeta)
+    for attempt in range(1, config.redraws + 1):
         stuck = np.flatnonzero(~ends.feasible)
         if not len(stuck):
             break
         again = draw_starts(problem, config, seed + attempt * _NEXT_SEED)[stuck]
-        ends.replace(stuck, _descended(problem, config, backend, again))
+        ends.replace(stuck, _descended(problem, config, again))
     return ends.solution(problem, config)
 
 
-def _descended(
-    problem: StageProblem, config: SolveConfig, backend: "NumpyBackend | TorchBackend", zeta: Zeta
-) -> "_Ends":
-    descent = _Descent(problem, config, backend, zeta)
+def _descended(problem: StageProblem, config: SolveConfig, zeta: Zeta) -> "_Ends":
+    descent = _Descent(problem, zeta)
     while descent.iterations < config.iterations and descent.step():
         pass
     return descent.ends()
@@ -216,20 +175,15 @@ def _descended(
 class _Ends:
     """Where starts ended, and all they have seen."""
 
-    costs: Float[np.ndarray, " num_starts"]
     feasible: Bool[np.ndarray, " num_starts"]
     seen: _Seen
-    work: dict[str, int]
 
     def replace(self, rows: np.ndarray, others: "_Ends") -> None:
         """Put other starts in the place of some; nothing that was seen is lost."""
-        self.costs[rows], self.feasible[rows] = others.costs, others.feasible
+        self.feasible[rows] = others.feasible
         self.seen.states += others.seen.states
         self.seen.costs += others.seen.costs
         self.seen.violations += others.seen.violations
-        for name, count in others.work.items():
-            self.work[name] += count
-        self.work["redrawn"] += len(rows)
 
     def solution(self, problem: StageProblem, config: SolveConfig) -> StageSolution:
         """Keep what is feasible and distinct."""
@@ -247,13 +201,11 @@ class _Ends:
             )
 
         feasible = np.all(violations <= 0, axis=1)
-        chosen = distinct(zeta.T_base_tcp, order[feasible[order]], config)
+        chosen = distinct(zeta.T_base_tcp, order[feasible[order]], config.max_candidates)
         return StageSolution(
             candidates=tuple(candidate(index) for index in chosen),
             nearest=candidate(int(order[0])),
-            costs=self.costs,
             feasible=self.feasible,
-            work=self.work,
         )
 
 
@@ -264,22 +216,15 @@ class _Descent:
     regulariser draw it. So starts that are far apart arrive far apart, and come together later.
     """
 
-    def __init__(
-        self,
-        problem: StageProblem,
-        config: SolveConfig,
-        backend: "NumpyBackend | TorchBackend",
-        zeta: Zeta,
-    ) -> None:
+    def __init__(self, problem: StageProblem, zeta: Zeta) -> None:
         self.iterations = 0
-        self._problem, self._config, self._backend = problem, config, backend
+        self._problem = problem
         num = len(zeta)
         self._T, self._width = zeta.T_base_tcp.copy(), zeta.width_m.copy()
-        self._violations, self._r, self._J = backend.linearise(problem, zeta)
-        self._damping = np.full(num, config.damping)
+        self._violations, self._r, self._J = linearised(problem, zeta)
+        self._damping = np.full(num, DAMPING)
         self._drawn: Bool[np.ndarray, " num_starts"] = np.all(self._violations <= 0, axis=1)
         self._open: Bool[np.ndarray, " num_starts"] = np.isfinite(self._r).all(axis=1)
-        self._num_states = num * (NUM_VARIABLES + 1)
         self._seen = _Seen()
         self._seen.add(zeta, self._violations.copy(), np.square(self._r).sum(axis=1))
 
@@ -290,15 +235,14 @@ class _Descent:
             return False
         self.iterations += 1
         trial = self._trial(rows)
-        violations, r = self._backend.evaluate(self._problem, trial)
-        self._num_states += len(rows)
+        violations, r = _evaluated(self._problem, trial)
         self._seen.add(trial, violations, np.square(r).sum(axis=1))
         before, cost = self._cost(rows, self._r[rows]), self._cost(rows, r)
         better = cost < before  # what is not a number is not better
         won, lost = rows[better], rows[~better]
         self._damping[won] = np.maximum(self._damping[won] * 0.3, 1e-9)
         self._damping[lost] *= 5.0
-        done = better & (before - cost <= self._config.settled * before + _NOTHING)
+        done = better & (before - cost <= SETTLED * before + _NOTHING)
         done |= self._damping[rows] > _HOPELESS
         self._T[won], self._width[won] = trial.T_base_tcp[better], trial.width_m[better]
         self._violations[won], self._r[won] = violations[better], r[better]
@@ -306,17 +250,16 @@ class _Descent:
         again = won[self._open[won]]
         if len(again):
             here = Zeta(T_base_tcp=self._T[again], width_m=self._width[again])
-            _, self._r[again], self._J[again] = self._backend.linearise(self._problem, here)
-            self._num_states += len(again) * NUM_VARIABLES
+            _, self._r[again], self._J[again] = linearised(self._problem, here)
         return True
 
     def _draw(self, rows: np.ndarray, done: np.ndarray) -> None:
         """Let the regulariser draw starts that have arrived, or that came no further."""
         arrived = (self._violations[rows] <= 0).all(axis=1) | done
-        arrived |= self.iterations >= self._config.free_iterations
+        arrived |= self.iterations >= FREE_ITERATIONS
         first = arrived & ~self._drawn[rows]
         self._drawn[rows[first]] = True
-        self._damping[rows[first]] = self._config.damping
+        self._damping[rows[first]] = DAMPING
         self._open[rows[done & ~first]] = False
 
     def _cost(self, rows: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -338,7 +281,7 @@ class _Descent:
         g = np.einsum("nij,ni->nj", J, r)
         step = -np.linalg.solve(H, g[:, :, None])[:, :, 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
-        step *= np.minimum(1.0, self._config.longest_step / np.maximum(length, 1e-12))
+        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(length, 1e-12))
         step *= UNITS
         width = np.clip(self._width[rows] + step[:, 6], 0.0, self._problem.max_width_m)
         return Zeta(T_base_tcp=moved(self._T[rows], step), width_m=width)
@@ -346,120 +289,56 @@ class _Descent:
     def ends(self) -> _Ends:
         """Say where all starts are now."""
         return _Ends(
-            costs=np.square(self._r).sum(axis=1),
             feasible=np.asarray(np.all(self._violations <= 0, axis=1)),
             seen=self._seen,
-            work={"iterations": self.iterations, "states": self._num_states, "redrawn": 0},
         )
 
 
 def _names(problem: StageProblem) -> list[str]:
     """Names of the terms, numbered where one comes again."""
     found: list[str] = []
-    for term in problem.terms:
+    for term in problem.subgoal:
         same = sum(name.partition(" #")[0] == term.name for name in found)
         found.append(f"{term.name} #{same + 1}" if same else term.name)
     return found
 
 
-def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, config: SolveConfig) -> list[int]:
+def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, most: int) -> list[int]:
     """Go through poses in an order and keep those that differ from all that are kept.
 
     Args:
         Ts: The poses.
         order: Indices, the best first; others are left out.
-        config: What counts as the same, and how many are kept.
+        most: How many are kept.
     """
     kept: list[int] = []
     rest = np.asarray(order, dtype=np.int64)
-    while len(rest) and len(kept) < config.max_candidates:
+    while len(rest) and len(kept) < most:
         first = int(rest[0])
         kept.append(first)
-        near = np.linalg.norm(Ts[rest, :3, 3] - Ts[first, :3, 3], axis=1) <= config.same_m
+        near = np.linalg.norm(Ts[rest, :3, 3] - Ts[first, :3, 3], axis=1) <= LENGTH_M
         angle = se3.rotation_angle_rad(Ts[first, :3, :3].T @ Ts[rest, :3, :3])
-        near &= angle <= config.same_rad
+        near &= angle <= ANGLE_RAD
         near[0] = True
         rest = rest[~near]
     return kept
 
 
-def backend_of(config: SolveConfig) -> "NumpyBackend | TorchBackend":
-    """Return who evaluates, by its name; torch is loaded only then."""
-    return NumpyBackend() if config.backend == "numpy" else TorchBackend(config.device)
+def _evaluated(problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray]:
+    """The greatest violation of each term, and the residuals."""
+    violations = problem.violations(zeta)
+    greatest = np.stack([parts.max(axis=1) for parts in violations], axis=1)
+    return greatest, np.asarray(problem.residuals(zeta, violations))
 
 
-def _greatest(violations: list[np.ndarray]) -> Float[np.ndarray, "num_states num_terms"]:
-    """Of the parts of each term."""
-    return np.stack([parts.max(axis=1) for parts in violations], axis=1)
-
-
-class NumpyBackend:
-    """Forward differences: eight states in place of one, in one batch."""
-
-    def evaluate(self, problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray]:
-        """Violations and residuals."""
-        violations = problem.violations(zeta)
-        return _greatest(violations), np.asarray(problem.residuals(zeta, violations))
-
-    def linearise(
-        self, problem: StageProblem, zeta: Zeta
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Violations, residuals and their derivatives."""
-        num, blocks = len(zeta), NUM_VARIABLES + 1
-        step = np.zeros((blocks, num, NUM_VARIABLES))
-        step[np.arange(1, blocks), :, np.arange(NUM_VARIABLES)] = _DIFFERENCE
-        steps = step.reshape(-1, NUM_VARIABLES) * UNITS
-        T = moved(np.concatenate([zeta.T_base_tcp] * blocks), steps)
-        width = np.concatenate([zeta.width_m] * blocks) + steps[:, 6]
-        violations, r = self.evaluate(problem, Zeta(T_base_tcp=T, width_m=width))
-        r = r.reshape(blocks, num, -1)
-        return violations[:num], r[0].copy(), np.moveaxis(r[1:] - r[0], 0, 2) / _DIFFERENCE
-
-
-class TorchBackend:
-    """Exact derivatives of terms that are written for tensors, on any device of torch."""
-
-    def __init__(self, device: str) -> None:
-        """Load torch.
-
-        Args:
-            device: As torch names it.
-
-        Raises:
-            MissingDependencyError: It is not installed.
-        """
-        try:
-            import torch  # noqa: PLC0415  # only the extra [twin] brings it
-        except ImportError as error:
-            purpose = "exact derivatives of stage constraints"
-            raise MissingDependencyError(package="torch", extra="twin", purpose=purpose) from error
-        self._torch = torch
-        self._options: dict[str, Any] = {"dtype": torch.float64, "device": device}
-
-    def evaluate(self, problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray]:
-        """Violations and residuals."""
-        with self._torch.no_grad():
-            here = self._zeta(zeta)
-            violations = problem.violations(here)
-            r = problem.residuals(here, violations)
-        return _greatest([array.cpu().numpy() for array in violations]), r.cpu().numpy()
-
-    def linearise(
-        self, problem: StageProblem, zeta: Zeta
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Violations, residuals and their derivatives."""
-        torch, at = self._torch, self._zeta(zeta)
-        step = torch.zeros((len(zeta), NUM_VARIABLES), **self._options, requires_grad=True)
-        change = step * torch.as_tensor(UNITS, **self._options)
-        here = Zeta(T_base_tcp=moved(at.T_base_tcp, change), width_m=at.width_m + change[:, 6])
-        violations = problem.violations(here)
-        r = problem.residuals(here, violations)
-        # States do not look at each other: the sum over them has each one's own derivatives.
-        rows = [torch.autograd.grad(column.sum(), step, retain_graph=True)[0] for column in r.T]
-        J = torch.stack(rows, dim=1)
-        found = _greatest([array.detach().cpu().numpy() for array in violations])
-        return found, r.detach().cpu().numpy(), J.cpu().numpy()
-
-    def _zeta(self, zeta: Zeta) -> Zeta:
-        T = self._torch.as_tensor(zeta.T_base_tcp, **self._options)
-        return Zeta(T_base_tcp=T, width_m=self._torch.as_tensor(zeta.width_m, **self._options))
+def linearised(problem: StageProblem, zeta: Zeta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Violations, residuals and their derivatives by differences: eight states in place of one."""
+    num, blocks = len(zeta), NUM_VARIABLES + 1
+    step = np.zeros((blocks, num, NUM_VARIABLES))
+    step[np.arange(1, blocks), :, np.arange(NUM_VARIABLES)] = _DIFFERENCE
+    steps = step.reshape(-1, NUM_VARIABLES) * UNITS
+    T = moved(np.concatenate([zeta.T_base_tcp] * blocks), steps)
+    width = np.concatenate([zeta.width_m] * blocks) + steps[:, 6]
+    violations, r = _evaluated(problem, Zeta(T_base_tcp=T, width_m=width))
+    r = r.reshape(blocks, num, -1)
+    return violations[:num], r[0].copy(), np.moveaxis(r[1:] - r[0], 0, 2) / _DIFFERENCE

@@ -156,19 +156,6 @@ def around(
     )
 
 
-def of_torch(start: State) -> State:
-    """The same states as torch tensors that ask for derivatives."""
-    import torch
-
-    return State(
-        Ts_base_object={
-            key: torch.tensor(T, requires_grad=True) for key, T in start.Ts_base_object.items()
-        },
-        T_base_tcp=torch.tensor(start.T_base_tcp, requires_grad=True),
-        width_m=torch.tensor(start.width_m),
-    )
-
-
 CUBE, OPENING = {"obj": "cube", "anchor": "bottom"}, {"obj": "box", "anchor": "opening"}
 IN_BOX = state(cube=pose(0.5, 0.2, 0.03, 0.3))
 ON_BRICK = state(cube=pose(0.46, 0.01, 0.07, 0.5))

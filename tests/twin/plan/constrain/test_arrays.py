@@ -6,7 +6,6 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.relations import Box, footprint_gap_m
 from twin.plan.constrain import arrays
-from twin.scene.shape.sdf import SdfGrid
 
 pytestmark = pytest.mark.parity
 
@@ -29,23 +28,6 @@ def test_gaps_of_outlines_are_those_of_the_predicates() -> None:
         assert gap == pytest.approx(footprint_gap_m(*boxes), abs=1e-9)
     assert (found > 0).sum() > 50
     assert (found < 0).sum() > 50
-
-
-@pytest.mark.parametrize("closed", [True, False])
-def test_distances_in_a_grid_are_those_of_the_grid(closed: bool) -> None:
-    torch = pytest.importorskip("torch")
-    rng = np.random.default_rng(1)
-    values = rng.normal(size=(5, 6, 7)).astype(np.float32)
-    grid = SdfGrid(
-        values_m=values, origin_m=np.array([0.1, -0.2, 0.3]), voxel_m=0.02, closed=closed
-    )
-    points = grid.origin_m + rng.uniform(-0.05, 0.2, size=(40, 10, 3))
-    wanted = grid.distance(points)
-    np.testing.assert_allclose(arrays.grid_distance(grid, points), wanted, atol=1e-12)
-    found = arrays.grid_distance(grid, torch.tensor(points))
-    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-12)
-    points[0, 0, 1] = np.nan
-    assert np.isnan(arrays.grid_distance(grid, points)).sum() == 1
 
 
 def test_distances_to_a_box_are_those_to_its_nearest_point() -> None:

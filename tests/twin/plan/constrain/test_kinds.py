@@ -1,11 +1,10 @@
 """Laws of every kind of constraint: sign, unit, derivative, invariance, both libraries."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from block_scene import EXAMPLES, IN_BOX, START, around, blocks, of_torch, pose, state
+from block_scene import EXAMPLES, IN_BOX, START, around, blocks, pose, state
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
@@ -55,50 +54,21 @@ def test_f_is_at_most_zero_where_it_holds_and_above_zero_where_not(name: str) ->
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_both_libraries_say_the_same(name: str) -> None:
-    pytest.importorskip("torch")
+def test_many_states_are_judged_as_each_alone(name: str) -> None:
     constraint = made(name)
-    states = around(EXAMPLES[name][1], 200, np.random.default_rng(1))
+    states = around(EXAMPLES[name][1], 40, np.random.default_rng(1))
     f = constraint.violation(states)
-    assert f.shape == (200,)
-    found = constraint.violation(of_torch(states))
-    np.testing.assert_allclose(found.detach().numpy(), f, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_the_derivative_is_that_of_f(name: str) -> None:
-    torch = pytest.importorskip("torch")
-
-    constraint = made(name)
-    start = of_torch(around(EXAMPLES[name][2], 3, np.random.default_rng(2), far_m=0.01))
-    names = list(start.Ts_base_object)
-
-    def f(tcp: Any, *Ts: Any) -> Any:
-        objects = dict(zip(names, Ts, strict=True))
-        return constraint.violation(
-            State(Ts_base_object=objects, T_base_tcp=tcp, width_m=start.width_m)
+    assert f.shape == (40,)
+    for index in range(40):
+        one = State(
+            Ts_base_object={
+                key: Ts if len(Ts) == 1 else Ts[index : index + 1]
+                for key, Ts in states.Ts_base_object.items()
+            },
+            T_base_tcp=states.T_base_tcp[index : index + 1],
+            width_m=states.width_m[index : index + 1],
         )
-
-    inputs = (start.T_base_tcp, *start.Ts_base_object.values())
-    assert torch.autograd.gradcheck(f, inputs, eps=1e-7, atol=1e-5, fast_mode=True)
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_derivatives_are_finite_at_the_best_state(name: str) -> None:
-    torch = pytest.importorskip("torch")
-
-    constraint = made(name)
-    record, good, _ = EXAMPLES[name]
-    if record["kind"] == "relpose":
-        T = good.Ts_base_object["brick"][0] @ se3.transform_from(
-            np.array(record["q_wxyz"]), np.array(record["p"])
-        )
-        good = state(cube=T)
-    found = of_torch(good)
-    f = constraint.violation(found).sum()
-    inputs = [found.T_base_tcp, *found.Ts_base_object.values()]
-    for slope in torch.autograd.grad(f, inputs, allow_unused=True):
-        assert slope is None or bool(torch.isfinite(slope).all())
+        assert constraint.violation(one)[0] == pytest.approx(f[index], abs=1e-12)
 
 
 @pytest.mark.parametrize("name", RIGID)
@@ -217,8 +187,6 @@ def test_what_slides_in_the_hand_is_not_held() -> None:
     assert worst_along(constraint, carried(0.0))[0] == pytest.approx(-0.005)
     assert worst_along(constraint, carried(0.008))[0] == pytest.approx(0.003)
     assert constraint.violation(at_step(carried(0.008), 3))[0] < 0  # nothing slides in one state
-    parts = worst_along(constraint, of_torch(carried(0.008)))
-    assert parts[0].item() == pytest.approx(0.003)
 
 
 def test_a_speed_needs_times() -> None:

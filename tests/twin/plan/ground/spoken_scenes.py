@@ -5,9 +5,25 @@ from typing import Any
 
 from twin.plan.ground.goals import Grounding
 from twin.plan.ground.grammar import ground
-from twin.plan.ground.vocabulary import GroundingError, Vocabulary, vocabulary_from_labels
+from twin.plan.ground.vocabulary import GroundingError, Thing, Vocabulary
+from twin.scene.semantics.language import kind_of
 
 KEYS = ("object", "container", "support", "reference", "first", "second")
+
+
+def vocabulary_from_labels(scene: Mapping[str, Mapping[str, str]]) -> Vocabulary:
+    """A vocabulary of ids with ``label``, ``colour`` and ``role``, as the given file has them."""
+    things = {}
+    for key, about in scene.items():
+        roles = {word.strip() for word in about.get("role", "").split(",")}
+        things[key] = Thing(
+            id=key,
+            label=about["label"],
+            colour=about.get("colour", ""),
+            movable="movable" in roles and "fixed" not in roles,
+            container="container" in roles or kind_of(about["label"]) == "container",
+        )
+    return Vocabulary(things=things)
 
 
 def _thing(label: str, colour: str, role: str) -> dict[str, str]:

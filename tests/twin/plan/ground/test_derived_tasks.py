@@ -1,28 +1,19 @@
 """Task files made of instructions: valid, the same each time, by rules that know kinds only."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import robot_gst
 from bridge.data_files import datasets_folder
-from bridge.episode import schema
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    FrameTransform,
-    transforms_to_cdr,
-)
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import Task, TaskFile
 from twin.plan.ground.derive import derive_task
@@ -105,18 +96,6 @@ def test_a_stack_may_touch_what_it_stands_on_and_nothing_else() -> None:
     assert pairs(task, 2) == pairs(task, 1) | {frozenset(("cube", "lower"))}
 
 
-def test_limits_and_the_part_go_to_their_stages() -> None:
-    task = derived(
-        "Put the cube into the box, at least 5 cm away from its walls, keep it upright", CUBE
-    )
-    _, carry, release = task.stages
-    assert {way["kind"] for way in carry["path"]} == {"clearance", "upright"}
-    assert {way["kind"] for way in release["path"]} == {"upright"}
-    sloth = TaskFile.read(datasets_folder() / "tasks" / "sloth_into_basket.toml")
-    taken = derived("Grab the sloth by its arm and put it into the basket", sloth)
-    assert taken.stages[0]["part"] == "limbs"
-
-
 def test_the_same_instruction_gives_the_same_bytes_and_another_one_another_name() -> None:
     words = vocabulary_of(CUBE.task())
     first, again = (derive_task(ground("Put the cube in the box", words), [CUBE]) for _ in range(2))
@@ -127,11 +106,9 @@ def test_the_same_instruction_gives_the_same_bytes_and_another_one_another_name(
 
 TEXTS = (
     "put the cube left of the box",
-    "move the cube 10 cm to the right and 5 cm forwards",
+    "move the cube 10 cm to the right",
     "take the cube out of the box and put it on the table",
     "put the cube behind the box with a gap of 1 to 3 cm, upright",
-    "put the cube next to the box, aligned with the box",
-    "put the shiny cube into the box",
 )
 
 
@@ -144,13 +121,9 @@ def test_every_kind_of_goal_makes_a_valid_file(text: str) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.text(alphabet="aé\"\\'\n\t\x7f\x00🙂 ", max_size=20))
-def test_no_adjective_breaks_the_file(odd: str) -> None:
-    words = vocabulary_of(CUBE.task())
-    try:
-        found = ground(f"put the {odd} cube into the box", words)
-    except GroundingError:
-        return
-    derive_task(found, [CUBE])
+def test_no_words_break_the_file(odd: str) -> None:
+    found = ground("put the cube into the box", vocabulary_of(CUBE.task()))
+    assert derive_task(replace(found, text=f"put {odd}"), [CUBE]).task().instruction == f"put {odd}"
 
 
 @pytest.fixture
@@ -176,49 +149,6 @@ def test_the_objects_are_those_of_the_episodes(run: RunFolder, tmp_path: Path) -
     assert named.file.data == understood.file.data
     with pytest.raises(UsageError, match="says which objects"):
         understand(RunFolder.create(tmp_path / "other"), "put the red cube into the box")
-
-
-def write_cameras(run: RunFolder) -> np.ndarray:
-    """A trial with a camera that stands still and one that moves; the pose of the first."""
-    T = se3.look_at(np.array([1.2, -0.5, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    moving = [
-        FrameTransform(stamp_ns=ns, parent="base_link", child="wrist_optical", T_parent_child=T)
-        for ns in (1, 2)
-    ]
-    still = FrameTransform(stamp_ns=1, parent="base_link", child="side_optical", T_parent_child=T)
-    camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0)
-    with EpisodeWriter(run.episodes_dir / "c.mcap") as writer:
-        info = EpisodeInfo(id="c", kind="trial", task="cube_into_box", task_sha256=CUBE.sha256)
-        writer.describe(info)
-        writer.attach(ATTACHMENT, CUBE.data, media_type=MEDIA_TYPE, log_time_ns=1)
-        data = transforms_to_cdr([still, *moving])
-        writer.write("/tf", data, type_name=schema.TF_MESSAGE, log_time_ns=1)
-        for name in ("side", "wrist"):
-            seen = CameraInfo(stamp_ns=1, frame_id=f"{name}_optical", camera=camera)
-            image = CompressedColor(
-                stamp_ns=1, frame_id=f"{name}_optical", format="jpeg", data=b"none"
-            )
-            for tail, type_name, record in (
-                ("info", schema.CAMERA_INFO, seen),
-                ("image", schema.COMPRESSED_IMAGE, image),
-            ):
-                topic = f"/standin/cam/{name}/color/{tail}"
-                writer.write(topic, record.to_cdr(), type_name=type_name, log_time_ns=1)
-    return T
-
-
-def test_a_camera_that_stands_still_lends_its_left_and_right(run: RunFolder) -> None:
-    words = "put the cube right of the box as seen from the {} camera"
-    with pytest.raises(GroundingError, match="no camera whose place is known"):
-        understand(run, words.format("side"))
-    T = write_cameras(run)
-    grounding = understand(run, words.format("side")).grounding
-    assert grounding is not None
-    way = np.array(grounding.goals[0]["direction"])
-    right = T[:3, 0] * [1, 1, 0]
-    np.testing.assert_allclose(way, right / np.linalg.norm(right), atol=1e-6)
-    with pytest.raises(GroundingError, match="There is: side"):
-        understand(run, words.format("wrist"))
 
 
 def test_the_command_prints_what_was_understood(
@@ -266,11 +196,11 @@ def test_objects_that_only_another_task_shows_are_no_part_of_the_derived_one(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("put the green cube into the box", "no green cube here. There is: cube"),
-        ("   ", "the instruction is empty"),
+        ("put the green cube into the box", "no 'the green cube' here. There is: cube"),
+        ("   ", "the instruction asks for nothing"),
         ("put the box onto the cube", "nothing can move it. What can be moved: cube.\n"),
         ("put the cube into the box and take it out of the box", "Leave one of them out.\n"),
-        ("juggle the cube", "nothing this robot can do"),
+        ("juggle the cube", "nobody here can 'juggle'"),
         ("put the cube into the box; $(reboot)", "not understood"),
         ("no_such_task", "no task named"),
         ("x" * 10_000, "2000 is the most"),

@@ -7,7 +7,13 @@ import pytest
 from path_scene import Pairs, at, joints_at, tool_down
 
 from bridge.geometry import se3
-from twin.plan.path.planner import NoPathError, PathConfig, plan_straight, reversed_path
+from twin.plan.path.planner import (
+    CONTACT_M_S,
+    NoPathError,
+    PathConfig,
+    plan_straight,
+    reversed_path,
+)
 from twin.plan.path.transfer import contacts_of, nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release
 from twin.robot.config import IkConfig
@@ -50,7 +56,7 @@ def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> Non
     assert (np.diff(tips[:, 2, 3]) > 0).all()
     assert np.abs(np.diff(path.joints_rad, axis=0)).max() < 0.1
     speeds = np.linalg.norm(np.diff(tips[:, :3, 3], axis=0), axis=1) / np.diff(path.times_s)
-    assert speeds.max() <= 1.01 * CONFIG.contact_m_s
+    assert speeds.max() <= 1.01 * CONTACT_M_S
     back = reversed_path(path)
     assert np.array_equal(back.joints_rad[0], path.joints_rad[-1])
     assert back.times_s[0] == 0.0
