@@ -18,6 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
+from bridge.media.palette import style_sheet
 from dashboards import wording
 from dashboards.answers import kept
 from dashboards.comparison import judge
@@ -74,6 +75,7 @@ def create_app(
         *(() if door is None else pages.console()),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
+        Route("/static/colours.css", colours, middleware=SMALL),
         Mount("/static", StaticFiles(directory=HERE / "static"), middleware=SMALL),
     ]
     app = Starlette(
@@ -137,6 +139,11 @@ def share_link(run: str | None, episodes: Sequence[str]) -> str:
     """
     named = [*([] if run is None else [("run", run)]), *(("trial", name) for name in episodes)]
     return f"/share?{urlencode(named)}"
+
+
+def colours(_request: Request) -> Response:
+    """``/static/colours.css``: the palette that report and Rerun have too."""
+    return Response(style_sheet(), media_type="text/css")
 
 
 def _seconds(request: Request) -> float | None:

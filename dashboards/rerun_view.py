@@ -101,7 +101,7 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
             log_side(file, side, task)
         _log_plans(file, recording)
         file.always("about", _about(recording, outcome, sides, file.notes))
-        file.stream.send_blueprint(_layout(name, images))
+        file.stream.send_blueprint(_layout(name, sides, images))
     return Exported(
         path=out,
         episode=recording.info.id,
@@ -249,13 +249,18 @@ def _plan_text(plan: Plan) -> str:
     return ", ".join(words)
 
 
-def _layout(name: str, images: Sequence[str]) -> rrb.Blueprint:
+def _layout(name: str, sides: Sequence[Side], images: Sequence[str]) -> rrb.Blueprint:
     """Place 3D view and cameras on the left, series and text on the right."""
     eye = rrb.EyeControls3D(position=EYE_M, look_target=TARGET_M, eye_up=(0.0, 0.0, 1.0))
     space = rrb.Spatial3DView(origin="/", name=name, eye_controls=eye)
     pictures = rrb.Grid(*(rrb.Spatial2DView(origin=f"/{entity}") for entity in images))
     right = [
-        rrb.TimeSeriesView(origin="/", contents=[f"+ /**/{leaf}"], name=title)
+        rrb.TimeSeriesView(
+            origin="/",
+            contents=[f"+ /{side.prefix}/{leaf}" for side in sides],
+            name=title,
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
         for leaf, title in SERIES.items()
     ]
     text = rrb.Tabs(

@@ -263,3 +263,20 @@ def test_a_full_disk_is_one_clear_sentence_and_leaves_nothing(tmp_path: Path) ->
     ):
         file.always("about", rr.TextDocument("words" * 1000))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_every_view_of_the_layout_has_something_to_show(
+    exported: Exported, content: dict[str, dict[str, list[object]]]
+) -> None:
+    reader = rc.RrdReader(exported.path)
+    queries = [
+        query
+        for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks()
+        if str(chunk.entity_path).endswith("ViewContents")
+        for query in chunk.to_record_batch().column("ViewContents:query").to_pylist()
+    ]
+    series = [query for query in queries if any("recorded" in line for line in query)]
+    assert len(series) == 3
+    for query in series:
+        starts = [line.removeprefix("+ ").removesuffix("**") for line in query]
+        assert any(entity.startswith(start) for entity in content for start in starts), query
