@@ -23,7 +23,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
 from dashboards.recording import PageClock, Problems, Recording
-from twin.replay.rebuilt_scene import correction_of
+from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
@@ -252,12 +252,30 @@ def _replayed_side(
         order = [joints.names.index(name) for name in robot.joints]
         points = [robot.skeleton_m(row) for row in joints.at(own_ns)[:, order]]
         skeleton = se3.apply(gathering.T_root_base, np.stack(points))
-    bends = {}
-    soft = () if gathering.task is None else gathering.task.soft_objects
-    if soft:
-        from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
+    return Side(
+        name=trajectory,
+        span_s=(float(ends[0]), float(ends[1])),
+        Ts_base_object=objects,
+        skeleton_m=skeleton,
+        bends=_bends(gathering, replay, trajectory, own_ns, correction),
+    )
 
-    for name in soft:
+
+def _bends(
+    gathering: _Gathering,
+    replay: Recording,
+    trajectory: str,
+    own_ns: Int[np.ndarray, " num_samples"],
+    correction: Correction,
+) -> dict[str, Bend]:
+    """How the replay bends soft objects, at instants of its own clock."""
+    names = () if gathering.task is None else gathering.task.soft_objects
+    if not names:
+        return {}
+    from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
+
+    bends = {}
+    for name in names:
         track = replay.objects.get(name)
         nodes = gathering.problems.attempt(partial(read_soft_nodes, replay, name), None)
         if track is None or nodes is None:
@@ -265,13 +283,7 @@ def _replayed_side(
             continue
         rest_m, Ts = bend(nodes, track, own_ns, correction)
         bends[name] = Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
-    return Side(
-        name=trajectory,
-        span_s=(float(ends[0]), float(ends[1])),
-        Ts_base_object=objects,
-        skeleton_m=skeleton,
-        bends=bends,
-    )
+    return bends
 
 
 def _links(
