@@ -16,12 +16,11 @@ import numpy as np
 
 from bridge.episode.catalogue import Entry, label_episode, list_episodes, outcome_of
 from bridge.episode.catalogue_store import UNLABELLED
-from bridge.episode.metadata import STUDY_ARM_TAG, WITH, Outcome, study_arm_of
+from bridge.episode.metadata import CONDITION_OF, STUDY_ARM_TAG, WITH, Outcome, study_arm_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.settings import CONDITION_OF
 from bridge.task.find import find_task_file
 from bridge.task.protocol import PlannedTrial, Protocol
 from bridge.task.task_file import Task, TaskFile

@@ -50,7 +50,6 @@ class TopicLine:
     rate_hz: float
     spark: str
     """Points of a polyline of the last minute."""
-    seen: int
     lost: int | None
     """Messages of the episode that were sent and are not in it; None while nothing is recorded."""
     trouble: str
@@ -380,7 +379,6 @@ def _topics(status: Mapping[str, Any], rates: Mapping[str, deque[float]]) -> lis
                 topic=topic,
                 rate_hz=rate_hz.get(topic, 0.0),
                 spark=_spark(rates.get(topic, ())),
-                seen=int(seen.get(topic, 0)),
                 lost=lost,
                 trouble=trouble or (f"{lost} lost" if lost else ""),
             )

@@ -2,12 +2,11 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from bridge.errors import UsageError
 from bridge.geometry.trajectory import PoseTrajectory
@@ -39,6 +38,7 @@ class RerunFile:
             message = f"cannot write {self._part}: {error.strerror}. Choose another with --out."
             raise DashboardError(message) from error
         self.stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        self.stream.set_log_time_enabled(False)
         try:
             self.stream.save(self._part)
         except RuntimeError as error:  # what Rerun makes of everything that goes wrong
@@ -59,79 +59,34 @@ class RerunFile:
             self.notes.append(text)
 
     def rows(
-        self,
-        entity: str,
-        stamps_ns: Int[np.ndarray, " num_rows"],
-        columns: Iterable[Any],
+        self, entity: str, stamps_ns: Int[np.ndarray, " num_rows"], columns: Iterable[Any]
     ) -> None:
-        """Send component columns, one row per stamp of source time [ns].
-
-        Args:
-            entity: Path of the entity.
-            stamps_ns: Source time of each row.
-            columns: Component columns of as many rows, as Rerun's ``columns`` methods make them.
-        """
+        """Send component columns, one row per stamp of source time [ns]."""
         times = np.asarray(stamps_ns, dtype=np.int64).astype("datetime64[ns]")
         index = rr.TimeColumn(TIMELINE, timestamp=times)
         self.stream.send_columns(entity, [index], columns, strict=True)
 
-    def always(self, entity: str, *archetypes: Any) -> None:
+    def at(self, entity: str, stamp_ns: int, archetype: Any) -> None:
+        """Log something that holds from an instant of source time on [ns]."""
+        self.stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        self.stream.log(entity, archetype, strict=True)
+
+    def always(self, entity: str, archetype: Any) -> None:
         """Log something that holds at all times."""
-        for archetype in archetypes:
-            self.stream.log(entity, archetype, static=True, strict=True)
+        self.stream.log(entity, archetype, static=True, strict=True)
 
-    def scalars(
-        self,
-        entity: str,
-        stamps_ns: Int[np.ndarray, " num_rows"],
-        values: Float[np.ndarray, " num_rows"],
-        *,
-        name: str,
-        color: tuple[int, int, int],
-        width: float,
-    ) -> None:
-        """Send one number over time, with its name in the legend.
-
-        Args:
-            entity: Path of the series.
-            stamps_ns: Source time of each value.
-            values: The number at each stamp.
-            name: What the legend says.
-            color: Of the line: red, green, blue, each 0 to 255.
-            width: Of the line, in points.
-        """
-        self.always(entity, rr.SeriesLines(names=[name], colors=[color], widths=[width]))
-        values = np.asarray(values, dtype=np.float64)
-        self.rows(entity, stamps_ns, rr.Scalars.columns(scalars=values))
-
-    def poses(self, entity: str, track: PoseTrajectory) -> None:
-        """Send ``T_base_entity`` over time.
-
-        Args:
-            entity: Path of the entity.
-            track: ``T_base_entity`` over source time.
-        """
+    def poses(self, entity: str, track: PoseTrajectory, shift_ns: int = 0) -> None:
+        """Send ``T_base_entity`` over time; ``shift_ns`` brings its stamps to source time."""
         columns = rr.Transform3D.columns(
             translation=track.p_m, quaternion=np.roll(track.q_wxyz, -1, axis=1)
         )
-        self.rows(entity, track.stamps_ns, columns)
-
-    def place(self, entity: str, T_base_entity: Float[np.ndarray, "4 4"]) -> None:
-        """Log where an entity stands at all times; nothing where that is the base itself."""
-        if not np.array_equal(T_base_entity, np.eye(4)):
-            placed = rr.Transform3D(translation=T_base_entity[:3, 3], mat3x3=T_base_entity[:3, :3])
-            self.always(entity, placed)
+        self.rows(entity, track.stamps_ns + shift_ns, columns)
 
     def __enter__(self) -> "RerunFile":
         """Write inside the block."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Finish the file and give it its name; after an error remove what there is.
 
         Raises:

@@ -18,10 +18,8 @@ def episode_of(target: Path) -> Path:
     Raises:
         UsageError: When there is no such file or folder, or the run has no episode.
     """
-    if target.is_file() and target.suffix == ".json":
-        return _replay_of_plan(target)
     if target.is_file():
-        return target
+        return target if target.suffix != ".json" else _replay_of_plan(target)
     if not target.is_dir():
         hint = "Give an episode file or a run folder; robot-gst ls RUN lists episodes."
         raise PathNotFoundError(path=target, what="episode or run", hint=hint)
@@ -33,18 +31,12 @@ def episode_of(target: Path) -> Path:
 
 
 def _replay_of_plan(path: Path) -> Path:
-    """The twin's replay that lies beside a plan.
-
-    Raises:
-        UsageError: There is none, or the file is no plan.
-    """
     name = path.name.removesuffix(REFUSED_PLAN).removesuffix(".json")
     found = path.with_name(f"{name}{PLAN_REPLAY}")
     if not found.is_file():
         message = (
             f"beside {path} there is no {found.name}, the twin's replay that is shown with a plan. "
-            "Give a plan of a run's plans/, and make an older one again: robot-gst plan RUN --task "
-            '"...".'
+            'Give a plan of a run\'s plans/, or make it again: robot-gst plan RUN --task "...".'
         )
         raise UsageError(message)
     return found
@@ -68,15 +60,9 @@ def default_out(episode: Path) -> Path:
 
 
 def has_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Say whether a window can be opened: always on macOS and Windows, with X or Wayland else.
-
-    Args:
-        environment: Environment variables; ``DISPLAY`` and ``WAYLAND_DISPLAY`` are read.
-        platform: As ``sys.platform`` names it.
-    """
-    if platform in ("darwin", "win32"):
-        return True
-    return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
+    """Say whether a window can be opened: always on macOS and Windows, with X or Wayland else."""
+    is_named = bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
+    return is_named or platform in ("darwin", "win32")
 
 
 def viewer_arguments(path: Path) -> list[str]:

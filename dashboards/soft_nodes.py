@@ -1,9 +1,10 @@
-"""The nodes of a soft object as a replay wrote them, for the page's 3D view and for Rerun."""
+"""The nodes of a soft object as a replay wrote them, for the page's 3D view."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import PointCloudSample
@@ -11,8 +12,11 @@ from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from dashboards.recording import Recording
-from twin.scene.skinning import NUM_NODES
+from twin.replay.rebuilt_scene import Correction
+from twin.scene.skinning import NUM_NEIGHBOURS, NUM_NODES, node_rotations
 
+MAX_NODE_POSES = 40_000
+"""Of one soft object in one replay, 28 bytes each: with many nodes they are sampled less often."""
 MAX_NODES = 1500
 """A finer lattice is not drawn bent: the page tells no more parts than that from each other."""
 
@@ -76,6 +80,39 @@ def not_bent(name: str, trajectory: str | None) -> str:
         trajectory: Of the replay.
     """
     return f"{name}: as replayed ({trajectory}) drawn without being bent"
+
+
+def bend(
+    nodes: SoftNodes,
+    track: PoseTrajectory,
+    own_ns: Int[np.ndarray, " num_samples"],
+    found: Correction,
+) -> tuple[Float[np.ndarray, "num_nodes 3"], Float[np.ndarray, "num_states num_nodes 4 4"]]:
+    """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
+
+    Args:
+        nodes: Of the object.
+        track: Poses of the object as the robot finds it.
+        own_ns: The page's samples on the replay's clock, evenly spaced.
+        found: Takes what is replayed to where cameras see it.
+
+    Returns:
+        The nodes unbent [m], and ``T_base_node`` at each instant.
+    """
+    rest_m = nodes.rest_m
+    num_nodes = len(rest_m)
+    _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
+    count = int(np.clip(MAX_NODE_POSES // num_nodes, 2, len(own_ns)))
+    times_ns = np.linspace(own_ns[0], own_ns[-1], count)
+    Ts = np.tile(np.eye(4), (count, num_nodes, 1, 1))
+    for row, (time_ns, T) in enumerate(
+        zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
+    ):
+        seen_m = se3.apply(found.as_seen(T), nodes.at(time_ns))
+        R = node_rotations(rest_m, seen_m, around[:, 1:])
+        Ts[row, :, :3, :3] = R
+        Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)
+    return rest_m, Ts
 
 
 def _in_object(

@@ -7,10 +7,10 @@ where the replay has them, taken back to where cameras see them. Nothing is loca
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -23,7 +23,6 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
 from dashboards.recording import PageClock, Problems, Recording
-from dashboards.soft_nodes import SoftNodes, not_bent, read_soft_nodes
 from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
@@ -31,7 +30,6 @@ from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.render import poses_in_scene
-from twin.scene.skinning import NUM_NEIGHBOURS, node_rotations
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
 
@@ -40,8 +38,6 @@ RATE_HZ = 20.0
 MAX_SAMPLES = 600
 """A long trial is sampled less often."""
 RECORDED = "recorded"
-MAX_NODE_POSES = 40_000
-"""Of one soft object in one replay, 28 bytes each: with many nodes they are sampled less often."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,55 +252,38 @@ def _replayed_side(
         order = [joints.names.index(name) for name in robot.joints]
         points = [robot.skeleton_m(row) for row in joints.at(own_ns)[:, order]]
         skeleton = se3.apply(gathering.T_root_base, np.stack(points))
-    bends = {}
-    for name in () if gathering.task is None else gathering.task.soft_objects:
-        track = replay.objects.get(name)
-        nodes = _nodes(gathering, replay, name)
-        if track is None or nodes is None:
-            gathering.problems.texts.append(not_bent(name, trajectory))
-            continue
-        bends[name] = _bend(nodes, track, own_ns, correction)
     return Side(
         name=trajectory,
         span_s=(float(ends[0]), float(ends[1])),
         Ts_base_object=objects,
         skeleton_m=skeleton,
-        bends=bends,
+        bends=_bends(gathering, replay, trajectory, own_ns, correction),
     )
 
 
-def _nodes(gathering: _Gathering, replay: Recording, name: str) -> SoftNodes | None:
-    return gathering.problems.attempt(lambda: read_soft_nodes(replay, name), None)
-
-
-def _bend(
-    nodes: SoftNodes,
-    track: PoseTrajectory,
+def _bends(
+    gathering: _Gathering,
+    replay: Recording,
+    trajectory: str,
     own_ns: Int[np.ndarray, " num_samples"],
-    found: Correction,
-) -> Bend:
-    """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
+    correction: Correction,
+) -> dict[str, Bend]:
+    """How the replay bends soft objects, at instants of its own clock."""
+    names = () if gathering.task is None else gathering.task.soft_objects
+    if not names:
+        return {}
+    from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
 
-    Args:
-        nodes: Of the object.
-        track: Poses of the object as the robot finds it.
-        own_ns: The page's samples on the replay's clock, evenly spaced.
-        found: Takes what is replayed to where cameras see it.
-    """
-    rest_m = nodes.rest_m
-    num_nodes = len(rest_m)
-    _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
-    count = int(np.clip(MAX_NODE_POSES // num_nodes, 2, len(own_ns)))
-    times_ns = np.linspace(own_ns[0], own_ns[-1], count)
-    Ts = np.tile(np.eye(4), (count, num_nodes, 1, 1))
-    for row, (time_ns, T) in enumerate(
-        zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
-    ):
-        seen_m = se3.apply(found.as_seen(T), nodes.at(time_ns))
-        R = node_rotations(rest_m, seen_m, around[:, 1:])
-        Ts[row, :, :3, :3] = R
-        Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)
-    return Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
+    bends = {}
+    for name in names:
+        track = replay.objects.get(name)
+        nodes = gathering.problems.attempt(partial(read_soft_nodes, replay, name), None)
+        if track is None or nodes is None:
+            gathering.problems.texts.append(not_bent(name, trajectory))
+            continue
+        rest_m, Ts = bend(nodes, track, own_ns, correction)
+        bends[name] = Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
+    return bends
 
 
 def _links(

@@ -19,13 +19,12 @@ from typing import Any
 from bridge.data_files import datasets_folder
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.mcap.part_file import lock_dead
-from bridge.episode.metadata import RETRY, retried_trial
+from bridge.episode.metadata import CONDITION_OF, RETRY, retried_trial
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import verdicts
 from bridge.errors import GstError, UsageError
 from bridge.process_pool import cores
-from bridge.sources.standin.settings import CONDITION_OF
 from bridge.task.find import chosen_task_file
 from bridge.task.model_policy import server_of
 from bridge.task.plan import STUDY_ARMS

@@ -28,7 +28,6 @@ class HeldOutView:
     file: str
     camera_id: str
     stamp_ns: int
-    has_recorded: bool
     psnr_db: float | None
     ssim: float | None
 
@@ -64,7 +63,7 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     paths = run.derived("*.views.*")
     for path in paths:
         try:
-            views += _views(run, path, _scores(judgement, path.stem))
+            views += _views(path, _scores(judgement, path.stem))
         except GstError as error:
             problems.append(str(error))
     views.sort(key=_badness)
@@ -84,18 +83,13 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     )
 
 
-def _views(
-    run: RunFolder, path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]
-) -> list[HeldOutView]:
+def _views(path: Path, scores: dict[tuple[Cell, Cell], dict[str, Cell]]) -> list[HeldOutView]:
     tracks = camera_tracks(path)
-    source = source_of(run, path)
-    recorded = {**(camera_tracks(source) if source else {}), **tracks}
     views = []
     for name, track in tracks.items():
         if not name.startswith(RENDERED):
             continue
         camera_id = name.removeprefix(RENDERED)
-        known = set(recorded[camera_id].stamps_ns) if camera_id in recorded else set()
         for stamp_ns in track.stamps_ns:
             score = scores.get((camera_id, stamp_ns), {})
             views.append(
@@ -103,7 +97,6 @@ def _views(
                     file=path.name,
                     camera_id=camera_id,
                     stamp_ns=stamp_ns,
-                    has_recorded=stamp_ns in known,
                     psnr_db=_number(score.get("PSNR (dB)")),
                     ssim=_number(score.get("SSIM")),
                 )
@@ -111,7 +104,7 @@ def _views(
     return views
 
 
-def source_of(run: RunFolder, path: Path) -> Path | None:
+def _source_of(run: RunFolder, path: Path) -> Path | None:
     """Return the recorded episode a views episode was made from, where it is still there."""
     derived = Episode.open(path).derived
     try:
@@ -159,7 +152,7 @@ def view_image(
         raise NotHereError(message)
     holder: Path | None = path
     if camera_id not in camera_tracks(path):
-        holder = source_of(run, path)
+        holder = _source_of(run, path)
     if holder is None:
         message = f"the recording that {path.name} was made from is not in this run."
         raise NotHereError(message)

@@ -21,6 +21,8 @@ NOTHING_EXECUTED = "nothing executed"
 """How the label of a trial begins in which no plan was sent to the robot."""
 WITHOUT, WITH = "without_replanning", "with_replanning"
 """The two conditions of a trial that evaluation compares."""
+CONDITION_OF = {"without": WITHOUT, "with": WITH, "control": WITHOUT}
+"""Of each study arm."""
 
 
 @dataclass(frozen=True, kw_only=True)

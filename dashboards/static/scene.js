@@ -8,10 +8,9 @@ const HIDDEN = -1;
 const SLOW_MS = 90; // a frame that takes longer is drawn coarser while things move
 const REST_MS = 250;
 const EDGES = [0, 1, 1, 3, 3, 2, 2, 0, 4, 5, 5, 7, 7, 6, 6, 4, 0, 4, 1, 5, 2, 6, 3, 7];
-const COLORS = { // as in the plots beside it, light enough for any ground
-  recorded: [1, 1, 1], planned: [0.72, 0.75, 0.8],
-  "twin-planned": [0.42, 0.64, 1], "twin-executed": [0.96, 0.63, 0.3],
-};
+const STYLE = getComputedStyle(document.documentElement);
+const COLORS = Object.fromEntries(["recorded", "planned", "twin-planned", "twin-executed"].map((name) =>
+  [name, STYLE.getPropertyValue("--in-scene-" + name).match(/[0-9a-f]{2}/g).map((part) => parseInt(part, 16) / 255)]));
 
 function read(buffer) {
   const [magic, version, length] = new Uint32Array(buffer, 0, 3);

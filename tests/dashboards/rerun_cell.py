@@ -54,7 +54,7 @@ def urdf(mesh: Path) -> str:
 
 
 def write_cell_run(folder: Path, synthetic: ModuleType) -> RunFolder:
-    """One trial with camera, robot, truth, replays, a localisation and a scene of three splats."""
+    """One trial with camera, robot, truth and replays."""
     run = RunFolder.create(folder / "cell")
     mesh = folder / "part.stl"
     mesh.write_text(CUBE_STL)
@@ -77,8 +77,6 @@ def write_cell_run(folder: Path, synthetic: ModuleType) -> RunFolder:
             writer.write(topic, data, type_name=type_name, log_time_ns=ns, publish_time_ns=ns)
     synthetic.write_replay(run, trial, "planned", False)
     synthetic.write_replay(run, trial, "executed", False)
-    write_localised(run, trial.id, synthetic.START_NS)
-    write_splats(run.scene_dir / "background.ply", 3)
     return run
 
 
@@ -141,17 +139,3 @@ def write_localised(
             writer.write_json(
                 "/standin/localisation", record, type_name=schema.LOCALISATION, log_time_ns=start
             )
-
-
-def write_splats(path: Path, count: int) -> None:
-    """The n-th splat is at x = n with scale e^-n, half opaque, mid grey."""
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    table = np.zeros((count, len(names)), dtype="<f4")
-    table[:, 0] = np.arange(count)
-    table[:, 10:13] = -np.arange(count)[:, None]
-    table[:, 13] = 1.0
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    head += [f"property float {name}" for name in names] + ["end_header", ""]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes("\n".join(head).encode() + table.tobytes())

@@ -10,23 +10,24 @@ import pytest
 import rerun as rr
 import rerun.chunk as rc
 from rerun.urdf import UrdfTree
-from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run, write_splats
+from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.streams import joint_track
+from bridge.episode.streams import events, joint_track, plans
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
+from bridge.media.palette import rgb
 from bridge.robots.default import ARM_JOINTS
 from bridge.robots.robot import read_robot
 from dashboards.errors import DashboardError
-from dashboards.rerun_entities import drawable
+from dashboards.recording import read_recording
+from dashboards.rerun_entities import drawable, log_robot
 from dashboards.rerun_file import RerunFile
-from dashboards.rerun_objects import read_splats
-from dashboards.rerun_view import Exported, export_rrd, run_of
+from dashboards.rerun_view import Exported, event_text, export_rrd, run_of
 
 
 @pytest.fixture(scope="module")
@@ -72,15 +73,13 @@ def test_every_part_of_the_episode_is_in_the_file(
     replay = "/replayed/planned/dynamic"
     wanted = {
         "/about",
-        "/scene/background",
-        "/localised/cube",
         "/recorded/cameras/hand/color",
         "/recorded/cameras/hand/depth",
         "/recorded/robot/visual_geometries/arm/visual_0",
         f"/recorded/robot_joints/{ARM_JOINTS[0]}",
         *(f"/recorded/joints/{name}" for name in ARM_JOINTS),
         *("/recorded/tcp", "/recorded/tcp_path", "/recorded/gripper_width_m", "/recorded/events"),
-        *("/recorded/verdicts", "/recorded/stage"),
+        *("/recorded/verdicts", "/plans/trial_0001_p1"),
         *(f"{replay}/tcp_path", f"{replay}/clearance_m", f"{replay}/objects/cube"),
         "/replayed/executed/dynamic/tcp_path",
     }
@@ -135,30 +134,43 @@ def test_images_are_byte_for_byte_the_recorded_ones(
     assert [bytes(row[0]) for row in rows if row] == recorded
 
 
-def test_an_object_is_a_box_of_the_task_from_the_first_instant_on(
+def test_a_replayed_object_is_outlined_as_the_task_has_it(
     synthetic: ModuleType, content: dict[str, dict[str, list[object]]]
 ) -> None:
-    cube = content["/localised/cube"]
-    assert [row for row in cube["Transform3D:translation"] if row] == [
-        [pytest.approx([0.4, 0.1, 0.02])]
-    ]
-    assert len([row for row in cube["Boxes3D:half_sizes"] if row]) == 1
-    assert {stamp for stamp in cube["source_time"] if stamp is not None} == {synthetic.START_NS}
-
-
-def test_splats_are_given_as_rerun_wants_them(content: dict[str, dict[str, list[object]]]) -> None:
-    splats = content["/scene/background"]
-    np.testing.assert_allclose(
-        splats["GaussianSplats3D:scales"][0], np.exp(-np.arange(3))[:, None].repeat(3, 1), rtol=1e-6
+    cube = content["/replayed/planned/dynamic/objects/cube"]
+    stamps = [stamp for stamp in cube["source_time"] if stamp is not None]
+    assert min(stamps) == synthetic.EXECUTION_NS
+    assert next(row[0] for row in cube["Transform3D:translation"] if row) == pytest.approx(
+        [0.45, 0, 0.02]
     )
-    np.testing.assert_allclose(splats["GaussianSplats3D:quaternions"][0], [[0, 0, 0, 1]] * 3)
-    assert splats["GaussianSplats3D:colors"][0] == [0x80808080] * 3
+    assert len([row for row in cube["Boxes3D:half_sizes"] if row]) == 1
+    red, green, blue = rgb("twin-planned")
+    (color,) = next(row for row in cube["Boxes3D:colors"] if row)
+    assert color == (red << 24 | green << 16 | blue << 8 | 255)
+
+
+def test_a_plan_is_a_line_from_when_it_was_published_on(
+    cell_run: RunFolder, content: dict[str, dict[str, list[object]]]
+) -> None:
+    ((stamp_ns, plan),) = plans(Episode.open(cell_run.episodes()[0]))
+    way = content[f"/plans/{plan.id}"]
+    assert way["source_time"] == [stamp_ns]
+    np.testing.assert_allclose(way["LineStrips3D:strips"][0][0], plan.positions_m(), atol=1e-6)
+
+
+def test_events_and_verdicts_are_lines_of_text_at_their_instants(
+    cell_run: RunFolder, content: dict[str, dict[str, list[object]]]
+) -> None:
+    recorded = events(Episode.open(cell_run.episodes()[0]))
+    lines = content["/recorded/events"]
+    assert sorted(lines["source_time"]) == sorted(event["stamp_ns"] for event in recorded)
+    assert {row[0] for row in lines["TextLog:text"]} == {event_text(event) for event in recorded}
+    assert content["/recorded/verdicts"]["TextLog:text"]
 
 
 def test_what_is_not_shown_is_said_in_words(
     exported: Exported, content: dict[str, dict[str, list[object]]]
 ) -> None:
-    assert "box was not localised: not drawn" in exported.notes
     assert sum("not in the robot description" in note for note in exported.notes) == 7
     text = content["/about"]["TextDocument:text"][0][0]
     assert "**Stand-in**" in text
@@ -210,22 +222,6 @@ def test_another_ending_than_rrd_is_refused(cell_run: RunFolder, tmp_path: Path)
         export_rrd(cell_run.episodes()[0], tmp_path / "x.mcap")
 
 
-@pytest.mark.parametrize(
-    "damage", [b"ply\nformat ascii 1.0\nend_header\n", b"no ply", b"", "cut", "uchar"]
-)
-def test_a_file_that_is_no_splat_ply_is_refused(tmp_path: Path, damage: bytes | str) -> None:
-    path = tmp_path / "background.ply"
-    write_splats(path, 2)
-    if damage == "cut":
-        path.write_bytes(path.read_bytes()[:-4])
-    elif damage == "uchar":
-        path.write_bytes(path.read_bytes().replace(b"float nx", b"uchar nx"))
-    else:
-        path.write_bytes(bytes(damage))  # type: ignore[arg-type]
-    with pytest.raises(DashboardError, match="robot-gst rebuild"):
-        read_splats(path)
-
-
 def test_the_drawn_robot_stands_on_base_link_whatever_is_above_it(tmp_path: Path) -> None:
     mesh = tmp_path / "part.stl"
     mesh.write_text(CUBE_STL)
@@ -233,10 +229,16 @@ def test_the_drawn_robot_stands_on_base_link_whatever_is_above_it(tmp_path: Path
     assert '"world"' not in text
     assert "collision" not in text
     assert text.count("<joint") == 1
-    with pytest.raises(DashboardError, match="not XML"):
-        drawable("<robot")
-    with pytest.raises(DashboardError, match="root element <xacro>"):
-        drawable("<xacro/>")
+
+
+@pytest.mark.parametrize("urdf_text", ["<robot", "<xacro/>", None])
+def test_a_robot_that_cannot_be_drawn_is_a_note(
+    urdf_text: str | None, cell_run: RunFolder, tmp_path: Path
+) -> None:
+    with RerunFile(tmp_path / "x.rrd", recording_id="x", name="x") as file:
+        log_robot(file, urdf_text, "recorded", read_recording(cell_run.episodes()[0]))
+    (note,) = file.notes
+    assert "the robot is not drawn" in note
 
 
 @pytest.mark.parametrize("name", ["panda", "left_ur5_parallel_gripper", "kinova_j2s6s200"])
@@ -261,3 +263,20 @@ def test_a_full_disk_is_one_clear_sentence_and_leaves_nothing(tmp_path: Path) ->
     ):
         file.always("about", rr.TextDocument("words" * 1000))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_every_view_of_the_layout_has_something_to_show(
+    exported: Exported, content: dict[str, dict[str, list[object]]]
+) -> None:
+    reader = rc.RrdReader(exported.path)
+    queries = [
+        query
+        for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks()
+        if str(chunk.entity_path).endswith("ViewContents")
+        for query in chunk.to_record_batch().column("ViewContents:query").to_pylist()
+    ]
+    series = [query for query in queries if any("recorded" in line for line in query)]
+    assert len(series) == 3
+    for query in series:
+        starts = [line.removeprefix("+ ").removesuffix("**") for line in query]
+        assert any(entity.startswith(start) for entity in content for start in starts), query

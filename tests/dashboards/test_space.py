@@ -35,7 +35,9 @@ from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
 from bridge.robots.default import ROBOT
 from dashboards import scene_file
+from dashboards.recording import read_recording
 from dashboards.scene_file import HEAD, SPLAT
+from dashboards.soft_nodes import read_soft_nodes
 from twin.robot.posture import posture_track
 from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
 from twin.scene.movable_scene import read_movable_scene
@@ -266,6 +268,26 @@ def test_a_soft_object_is_bent_as_the_twin_bends_it(run: RunFolder, synthetic: M
     assert rigid_m.max() > 0.02  # it is bent by centimetres
     assert off_m.max() < 0.004
     assert np.median(off_m) < 0.001
+
+
+def test_nodes_of_a_soft_object_are_read_in_its_own_frame(run: RunFolder) -> None:
+    rest_m = np.random.default_rng(5).uniform(-0.05, 0.05, (30, 3))
+    soften(run, rest_m)
+    (replay,) = run.derived("*.replay.*")
+    nodes = read_soft_nodes(read_recording(replay), "cube")
+    assert nodes is not None
+    np.testing.assert_allclose(nodes.at(float(nodes.stamps_ns[0]) - 1e9), nodes.rest_m)
+    t_s = float(nodes.stamps_ns[10]) * 1e-9
+    expected = bent_nodes(np.eye(4), rest_m, t_s)
+    np.testing.assert_allclose(nodes.at(float(nodes.stamps_ns[10])), expected, atol=1e-6)
+
+
+def test_a_soft_object_without_nodes_is_drawn_unbent_and_that_is_noted(
+    run: RunFolder, synthetic: ModuleType
+) -> None:
+    soften(run, np.zeros((4, 3)))  # too few to bend anything
+    header = unpack(synthetic.browser_of(run).get(f"/episode/{ID}/scene").content).header
+    assert "cube: as replayed (planned) drawn without being bent" in header["notes"]
 
 
 def test_without_a_scene_the_ways_are_shown_and_why_there_is_no_more(

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.metadata import (
+    CONDITION_OF,
     RETRY,
     RETRY_OF_TAG,
     STUDY_ARM_TAG,
@@ -31,7 +32,6 @@ from bridge.sources.standin.planner import perceive
 from bridge.sources.standin.probes import PROBES, NoSpaceForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import (
-    CONDITION_OF,
     CONDITIONS,
     INTERRUPTED,
     SessionConfig,

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 
-from bridge.episode.metadata import WITH, WITHOUT
+from bridge.episode.metadata import CONDITION_OF, WITH, WITHOUT
 from bridge.errors import UsageError, refuse_outside
 from bridge.task.protocol import SEEDS_PER_SESSION
 
 CONDITIONS = (WITHOUT, WITH)
-CONDITION_OF = {"without": WITHOUT, "with": WITH, "control": WITHOUT}
-"""Of each study arm."""
 BUILT_IN, WIRE = "built_in", "wire"
 PLANNERS = (BUILT_IN, WIRE)
 INTERRUPTED = "interrupted"

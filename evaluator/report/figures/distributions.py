@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-COLOURS = ("sim", "rec", "third", "fourth", "ink", "soft")
+COLOURS = ("sim", "executed", "third", "fourth", "rec", "soft")
 LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1)), (0, (3, 1, 1, 1, 1, 1)))
 
 
@@ -354,7 +354,7 @@ def worst_pairs(views: Sequence[ViewQuality]) -> list[ViewPair]:
     return [pair for _, pair in sorted(found, key=lambda item: item[0])]
 
 
-BAND_COLOURS = ("sim", "third", "fourth", "ink", "soft")
+BAND_COLOURS = ("sim", "third", "fourth", "executed", "soft")
 """The recorded colour is the band's."""
 PLACES = range(0, 101, 5)
 """Instants the table beside the figure shows."""

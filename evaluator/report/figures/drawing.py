@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from bridge.media import palette
 from evaluator.result import Table
 
 if TYPE_CHECKING:
@@ -13,27 +14,17 @@ if TYPE_CHECKING:
 COLUMN_IN = 3.5
 """Width of a column of a paper [in]; every figure fits one."""
 
-LIGHT = {
-    "ink": "#1b2130",
-    "soft": "#5a6372",
-    "line": "#d8dce3",
-    "sim": "#0068a8",
-    "rec": "#bf4a00",
-    "third": "#007a5a",
-    "fourth": "#8e4585",
-    "paper": "#ffffff",
+NAMES = {
+    "soft": "quiet",
+    "line": "edge",
+    "sim": "twin-planned",
+    "executed": "twin-executed",
+    "rec": "recorded",
 }
-"""Colours of the files, after Okabe and Ito (2008): told apart by the colour-blind and in print."""
-DARK = {
-    "ink": "#e8ebf1",
-    "soft": "#a6aebc",
-    "line": "#38414e",
-    "sim": "#5cb8ef",
-    "rec": "#f39b55",
-    "third": "#45cfa0",
-    "fourth": "#dd9fd4",
-    "paper": "#14181f",
-}
+"""Short names of figures, and what they mean in the palette."""
+LIGHT = {**palette.LIGHT, **{name: palette.LIGHT[meaning] for name, meaning in NAMES.items()}}
+"""Colours of the files."""
+DARK = {**palette.DARK, **{name: palette.DARK[meaning] for name, meaning in NAMES.items()}}
 """The same names on a dark page."""
 
 ON_PAPER = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.8}

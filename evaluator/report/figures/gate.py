@@ -188,7 +188,7 @@ def costs(tables: Sequence[Table]) -> Drawing | NotDrawn:
         price = [row[0] for row in rows]
         axes.plot(price, [row[1] for row in rows], "o-", color=LIGHT["sim"], label="obey the gate")
         axes.plot(
-            price, [row[2] for row in rows], "s--", color=LIGHT["rec"], label="execute everything"
+            price, [row[2] for row in rows], "s--", color=LIGHT["third"], label="execute everything"
         )
         axes.set_xlabel("price of refusing a good plan (bad executions)")
         axes.set_ylabel("cost per trial (bad executions)")

@@ -108,7 +108,7 @@ def test_a_replay_holds_the_plan_its_verdict_and_the_moving_arm(
     assert not run.derived_dir.exists(), "evaluation reads what is there"
 
 
-def test_the_view_shows_what_was_refused_too(
+def test_the_view_shows_the_replay_of_a_plan(
     steered: tuple[RunFolder, Planned], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     _, done = steered
