@@ -33,6 +33,7 @@ from bridge.robots.default import MAX_WIDTH_M  # noqa: E402
 from bridge.sources.realsense import publish  # noqa: E402
 from bridge.sources.standin.cell import TICK_NS, CellConfig, StandinCell  # noqa: E402
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, load_cell  # noqa: E402
+from bridge.sources.standin.kinematics import arm_kinematics  # noqa: E402
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints  # noqa: E402
 from bridge.task.find import chosen_task_file  # noqa: E402
 from robot_gst import run as type_here  # noqa: E402
@@ -53,7 +54,7 @@ class Tape:
         self.frames: list[tuple[int, str, np.ndarray, np.ndarray]] = []
 
     def joints(self, position: np.ndarray, velocity: np.ndarray, *_: object) -> None:
-        T = self.cell.kinematics.T_base_frame(position, "tool0")
+        T = self.cell.kinematics.T_base_tcp(position)
         pose = [*HALF_TURN @ T[:3, 3], *pinocchio.log3(HALF_TURN @ T[:3, :3])]
         closed = 255 * (1 - self.width_m / MAX_WIDTH_M)
         sample = {"actual_q": list(position), "actual_qd": list(velocity), "robot_mode": 7}
@@ -180,12 +181,15 @@ def main(run: Path) -> int:
     """Play the laboratory and type the recipe."""
     file = load_cell(chosen_task_file(TASK).task().cell)
     tapes, cameras, mounts = perform(file), {}, {}
+    arm, zeros = arm_kinematics(), np.zeros(6)
+    T_tcp_tool0 = se3.invert(arm.T_base_tcp(zeros)) @ arm.T_base_frame(zeros, "tool0")
     for name, mount in file.cameras.items():
         camera, lens = mount.camera.scaled(2.0), rs.intrinsics()
         lens.width, lens.height = camera.width, camera.height
         lens.fx, lens.fy, lens.ppx, lens.ppy = camera.to_ros()
         cameras[name] = SoftwareCamera(serial=SERIALS[name], lens=lens)
-        q, p = se3.split(mount.T_parent_camera)
+        T = mount.T_parent_camera
+        q, p = se3.split(T_tcp_tool0 @ T if mount.moving else T)
         parent = "tool0_controller" if mount.moving else mount.parent
         mounts[name] = {"parent": parent, "p_m": p.tolist(), "q_wxyz": q.tolist()}
     run.mkdir(parents=True)
