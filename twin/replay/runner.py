@@ -201,8 +201,8 @@ def _nothing_to_replay(
     if info.kind == "imported":
         if motion_of(episode) is not None:
             return Prepared(why_not="replayed as an imported motion", was_meant=False)
-        why = "nobody said of which task it is a trial"
-        return Prepared(why_not=f"{why}: {LABEL}" if joints else why, was_meant=bool(joints))
+        said = "nobody said of which task it is a trial"
+        return Prepared(why_not=f"{said}: {LABEL}" if joints else said, was_meant=bool(joints))
     if is_planned:
         return None
     if not info.task:
