@@ -16,6 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from dashboards import wording
 from dashboards.comparison import Judgement
 from dashboards.figures import RateGroup, Scatter, scatter
+from evaluator.report.wording import SIM_SIDE, agreeing_side
 from evaluator.result import Exclusion, Measurement
 from evaluator.review_index import (
     FACETS,
@@ -50,8 +51,6 @@ LONGEST = 60
 
 NO_NAME = "-"
 """Stands in an id for an empty name."""
-SIM_SIDE = "sim_planned"
-"""The headline twin: planned trajectory, dynamic, of the plan actually sent."""
 SIDE_WORDS = {
     "recorded": "recorded",
     "sim_planned": "twin, planned",
@@ -120,7 +119,16 @@ class RateTable:
 
 def headline_cards(judgement: Judgement) -> tuple[Card, ...]:
     """Choose the headline numbers; without results all are marked missing, and say why."""
-    cards = [_card(title, pattern, below, judgement) for title, pattern, below in CARDS]
+    side = agreeing_side({each.id: each for each in judgement.measurements})
+    cards = [
+        _card(
+            title if side == SIM_SIDE else title.replace("predicts", "executed agrees with"),
+            pattern.replace(SIM_SIDE, side),
+            below,
+            judgement,
+        )
+        for title, pattern, below in CARDS
+    ]
     found = tuple(card for card in cards if card.state != "missing")
     return found if judgement.has_results else tuple(cards)
 
@@ -187,12 +195,13 @@ def rate_table(measurements: Sequence[Measurement], selection: Selection) -> Rat
     rates = _rates(measurements)
     if not rates:
         return None
+    by_id = {each.id: each for each in measurements}
     present = list(
         dict.fromkeys(
             side
             for sides in rates.values()
             for side, rate in sides.items()
-            if rate.value is not None or side in ("recorded", SIM_SIDE)
+            if rate.value is not None or side in ("recorded", agreeing_side(by_id))
         )
     )
     known = [side for side in SIDE_WORDS if side in present]
@@ -251,7 +260,10 @@ def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
         if len(parts) == 4 and parts[0] == "gain" and parts[1] in ("pp", "relative"):
             found.setdefault((parts[3], parts[2]), {})[parts[1]] = measurement
     rows = []
+    planned = agreeing_side({each.id: each for each in measurements}) == SIM_SIDE
     for (name, side), kinds in found.items():
+        if side == "sim" and not planned:
+            continue
         task, _, policy = name.partition(".")
         rows.append(
             GainRow(
@@ -312,7 +324,7 @@ class TrialList:
             "distance": any(t.distance_m is not None for t in self.trials),
             "cause": any(t.first_failing for t in self.trials),
         }
-        shown["agreement"] = shown["planned"]
+        shown["agreement"] = any(t.twin is not None for t in self.trials)
         return tuple((name, title) for name, title in COLUMNS if shown.get(name, True))
 
 

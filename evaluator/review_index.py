@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from bridge.episode.catalogue_store import printable
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.provenance import software
 from bridge.episode.run_folder import PART, RunFolder
 from evaluator.cache import FOLDER
 from evaluator.result import Interval, Measurement
 
 FILE_NAME = "review_index.sqlite"
-VERSION = 4
+VERSION = 5
 """Raise it whenever a column, or what one holds, changes."""
 NO_RESULTS = "no results yet"
 """Why there are no numbers of a run that was never evaluated."""
@@ -68,11 +69,26 @@ class IndexedTrial:
     """Where the object of its task started that is placed most differently."""
 
     @property
+    def had_plan(self) -> bool:
+        """Whether what moved the robot had been announced; also where nothing moved it."""
+        return self.plan_id != NO_PLAN
+
+    @property
+    def twin(self) -> bool | None:
+        """What the twin says of the trial: as planned; without a plan, as executed."""
+        return self.sim_planned if self.had_plan else self.sim_executed
+
+    @property
+    def twin_replay(self) -> str | None:
+        """The file that ``twin`` comes from."""
+        return self.planned_replay if self.had_plan else self.executed_replay
+
+    @property
     def agrees(self) -> bool | None:
-        """Whether the planned replay foretold the outcome; None when one of them is unknown."""
-        if self.sim_planned is None or self.recorded is None:
+        """Whether the twin and the outcome agree; None when one of them is unknown."""
+        if self.twin is None or self.recorded is None:
             return None
-        return self.sim_planned == self.recorded
+        return self.twin == self.recorded
 
 
 def severity(trial: IndexedTrial) -> tuple[int, float, str]:
@@ -81,7 +97,7 @@ def severity(trial: IndexedTrial) -> tuple[int, float, str]:
     A wrong yes, success in the twin of a trial that failed, sends a bad plan to a robot.
     """
     agreed = trial.agrees
-    rank = 2 if agreed is None else 3 if agreed else 0 if trial.sim_planned else 1
+    rank = 2 if agreed is None else 3 if agreed else 0 if trial.twin else 1
     return rank, -(trial.distance_m or 0.0), trial.episode
 
 
@@ -108,7 +124,7 @@ SHOW = {
 }
 _SHOW = {
     "disagree": "agrees = 0",
-    "wrong_yes": "sim_planned = 1 AND recorded = 0",
+    "wrong_yes": "twin = 1 AND recorded = 0",
     "failure": "recorded = 0",
     "undecided": "agrees IS NULL",
 }
@@ -118,7 +134,7 @@ SORT = {
     "task": "task, condition, policy, seq",
     "start": "start_id, seq",
     "recorded": "recorded, seq",
-    "planned": "sim_planned, seq",
+    "planned": "twin, seq",
     "cause": "ifnull(failing_cause,'~'), seq",
     "distance": "ifnull(-distance_m,1), seq",
     "date": "began_ns, seq",
@@ -196,7 +212,7 @@ class Selection(_Selected):
         if self.show:
             terms.append(_SHOW.get(self.show, "0"))
         if self.clause or self.cause:
-            terms.append("sim_planned = 0")
+            terms.append("twin = 0")
         for name, column in (
             ("clause", "first_failing"),
             ("cause", "failing_cause"),
@@ -233,9 +249,9 @@ FAILED = {
     "wrong_no": "only the twin fails",
 }
 _FAILED = {
-    "foretold": "sim_planned = 0 AND recorded = 0",
-    "wrong_yes": "recorded = 0 AND ifnull(sim_planned, 1) = 1",
-    "wrong_no": "sim_planned = 0 AND ifnull(recorded, 1) = 1",
+    "foretold": "twin = 0 AND recorded = 0",
+    "wrong_yes": "recorded = 0 AND ifnull(twin, 1) = 1",
+    "wrong_no": "twin = 0 AND ifnull(recorded, 1) = 1",
 }
 NOT_KNOWN = "-"
 """Selects failures of which a part is not known: an empty value selects all."""
@@ -352,7 +368,7 @@ _INTEGERS |= {"num_plans", "num_plans_sent"}
 _BOOLEANS = {"recorded", "sim_planned", "sim_executed", "verdict"}
 _COLUMNS = [item.name for item in fields(IndexedTrial)]
 _BOOLEAN_PLACES = [index for index, name in enumerate(_COLUMNS) if name in _BOOLEANS]
-_FOUND_ONLY = ("agrees", "task_slug", "condition_slug", "policy_slug", "folded")
+_FOUND_ONLY = ("twin", "agrees", "task_slug", "condition_slug", "policy_slug", "folded")
 _SEARCHED = ("episode", "task", "condition", "policy", "start_id", "failing_cause", "failed_stage")
 _FILES = [item.name for item in fields(IndexedFile)]
 
@@ -407,7 +423,7 @@ def _stored(values: Iterable[Any]) -> list[Any]:
 def _found_by(trial: IndexedTrial, slugs: Mapping[str, str]) -> list[Any]:
     words = " ".join(str(getattr(trial, name) or "") for name in _SEARCHED).replace("_", " ")
     folded = f"{words} {trial.episode} {trial.task} {trial.condition}".casefold()
-    return [trial.agrees, *(slugs[name] for name in FACETS), folded]
+    return [trial.twin, trial.agrees, *(slugs[name] for name in FACETS), folded]
 
 
 class UnusableIndexError(Exception):
@@ -486,7 +502,8 @@ class ReviewIndex:
 
     def totals(self) -> tuple[int, int, int]:
         """Return how many trials there are, how many were recorded, how many were replayed."""
-        text = "SELECT count(*), count(nullif(file, '')), count(planned_replay) FROM trials"
+        replayed_in = "coalesce(planned_replay, executed_replay)"
+        text = f"SELECT count(*), count(nullif(file, '')), count({replayed_in}) FROM trials"
         with self._reading() as db:
             trials, recorded, replayed = db.execute(text).fetchone()
         return trials, recorded, replayed
@@ -528,7 +545,7 @@ class ReviewIndex:
         columns = ", ".join(FAILURE_PARTS[name] for name in selection.parts)
         text = (
             f"SELECT {columns}, count(*), sum(ifnull(recorded, 1) = 0), "
-            f"sum(ifnull(sim_planned, 1) = 0), min(seq) FROM trials WHERE {where} "
+            f"sum(ifnull(twin, 1) = 0), min(seq) FROM trials WHERE {where} "
             f"GROUP BY {columns} ORDER BY count(*) DESC, min(seq)"
         )
         with self._reading() as db:

@@ -35,15 +35,15 @@ class FailureKind:
 
 def failure_kind(row: TrialRow) -> FailureKind | None:
     """Sort one trial; None for one that failed on neither side."""
-    if row.sim_planned is False:
+    if row.twin is False:
         cause = row.failing_cause or row.first_failing or UNNAMED
     elif row.recorded is False:
-        cause = TWIN_SUCCEEDS if row.sim_planned else NO_ANSWER
-        if row.sim_planned and row.divergence is not None:
+        cause = TWIN_SUCCEEDS if row.twin else NO_ANSWER
+        if row.twin and row.divergence is not None:
             cause = f"{TWIN_SUCCEEDS}: {row.divergence.attribution}"
     else:
         return None
-    foretold = row.sim_planned is False
+    foretold = row.twin is False
     labelled = first_failed_stage(row) if row.recorded is False else NOT_LABELLED
     stage = row.failing_stage if foretold else ""
     return FailureKind(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from bridge.episode.executions import NO_PLAN
 from evaluator.compare.band_measurements import BandCurve, BandPath
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
@@ -120,6 +121,11 @@ class TrialRow:
     """Reads the files when asked: ten thousand rows hold no series."""
 
     @property
+    def twin(self) -> bool | None:
+        """What the twin says of the trial: as planned; without a plan, as executed."""
+        return self.sim_executed if self.plan_id == NO_PLAN else self.sim_planned
+
+    @property
     def tcp_errors(self) -> tuple[TcpErrorSeries, ...]:
         """Recorded against replayed tool poses over time, read from the files at each access."""
         return () if self.read_tcp_errors is None else self.read_tcp_errors()
@@ -164,6 +170,13 @@ class RateGroup:
 
     trial_table: tuple[int, int, int, int] | None = None
     """Trials in which both succeed, only sim, only recorded, neither; None where not paired."""
+    executed: Measurement | None = None
+    """Rate of what was executed in the twin, of a group in which nobody published a plan."""
+
+    @property
+    def shown_sim(self) -> Measurement:
+        """What tables and figures show as the twin's rate; ``executed`` enters no statistic."""
+        return self.sim if self.executed is None else self.executed
 
     @property
     def pair(self) -> tuple[Measurement, Measurement]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import partial
 
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import CONTROL
 from bridge.episode.metadata import WITH as WITH
 from bridge.episode.metadata import WITHOUT as WITHOUT
@@ -113,12 +114,18 @@ def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Meas
                     of_group(RATES[side], key),
                     members,
                     answer,
-                    reason_if_undefined=f"none of {trials_in(members)} trials has it",
+                    reason_if_undefined="no plan"
+                    if side == "sim_planned" and _without_plans(members)
+                    else f"none of {trials_in(members)} trials has it",
                     method=method,
                 )
             )
         measurements.extend(_counted_rate(key, members, method))
     return measurements
+
+
+def _without_plans(rows: Sequence[TrialRow]) -> bool:
+    return all(row.plan_id == NO_PLAN for row in rows)
 
 
 def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Measurement]:
@@ -198,6 +205,9 @@ def rate_groups(
             unit="trial",
             recorded=recorded,
             sim=sim,
+            executed=by_id[of_group(RATES["sim_executed"], key).id]
+            if _without_plans(members)
+            else None,
         )
         if not both and recorded.n and sim.n:  # each side has trials of its own
             own_rates = fraction_of(recorded), fraction_of(sim)

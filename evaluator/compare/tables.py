@@ -21,6 +21,9 @@ AVERAGES = {kind: f"average, {kind}" for kind in ("macro", "pooled")}
 """What lines of averages say in the column of tasks."""
 
 
+EXECUTED = "executed in twin"
+"""The twin's side of a group in which nobody published a plan."""
+EXECUTED_NOTE = "executed in twin: the recorded joints, replayed dynamically; there was no plan."
 SIM_NOTE = (
     "sim: planned-in-twin, dynamic, of the plan actually sent, replayed from the start localised "
     "again in the recording. With replanning the twin selected the accepted plans, so their sim is "
@@ -63,7 +66,9 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     """
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
-    parts = [source_note or (UNPAIRED_NOTE if one_sided else SIM_NOTE), _brackets(_sides(groups))]
+    without_plans = all(group.executed is not None for group in groups)
+    note = EXECUTED_NOTE if without_plans else SIM_NOTE
+    parts = [source_note or (UNPAIRED_NOTE if one_sided else note), _brackets(_sides(groups))]
     if paired:
         parts.append("The difference is over trials where both sides are known.")
     rows = tuple(
@@ -78,7 +83,10 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
             rate.reason_if_undefined,
         )
         for group in groups
-        for side, rate in (("sim", group.sim), (word, group.recorded))
+        for side, rate in (
+            ("sim" if group.executed is None else EXECUTED, group.shown_sim),
+            (word, group.recorded),
+        )
     )
     return Table(
         id="success",
@@ -93,7 +101,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
 
 
 def _sides(groups: Sequence[RateGroup]) -> list[Measurement]:
-    return [side for group in groups for side in (group.sim, group.recorded)]
+    return [side for group in groups for side in (group.shown_sim, group.recorded)]
 
 
 def _gap(group: RateGroup) -> float | None:
@@ -163,26 +171,26 @@ def layout_table(
     if len(conditions) < 2:
         return ()
     found = {(c.task, c.policy, c.condition): c for c in groups}
+    sides = (word,) if all(group.executed is not None for group in groups) else ("sim", word)
     rows = []
     for task, policy in dict.fromkeys((c.task, c.policy) for c in groups):
         line: list[Cell] = [task, policy]
         for condition in conditions:
             group = found.get((task, policy, condition))
-            line += [group.sim.value, group.recorded.value] if group else [None, None]
+            values = [group.sim.value, group.recorded.value] if group else [None, None]
+            line += values[-len(sides) :]
         rows.append(tuple(line))
     by_id = {measurement.id: measurement for measurement in measurements}
     for kind, average in (("macro", AVERAGE_MACRO), ("pooled", AVERAGE_POOLED)):
         ids = [
             average.of(side=side, condition=condition, over="", unit="").id
             for condition in conditions
-            for side in ("sim_planned", "recorded")
+            for side in ("sim_planned", "recorded")[-len(sides) :]
         ]
         if all(name in by_id for name in ids):
             rows.append((AVERAGES[kind], "", *(by_id[name].value for name in ids)))
     columns = [
-        f"{side}, {condition.replace('_', ' ')}"
-        for condition in conditions
-        for side in ("sim", word)
+        f"{side}, {condition.replace('_', ' ')}" for condition in conditions for side in sides
     ]
     return (
         Table(

@@ -151,7 +151,8 @@ def _row(
 ) -> TrialRow:
     info, outcome, verdict = facts.info, facts.outcome, facts.verdict
     planned = found["planned"]
-    failing = planned.verdict if planned.verdict is not None else verdict
+    answer = found["executed"] if facts.plan_id == NO_PLAN else planned
+    failing = answer.verdict if answer.verdict is not None else verdict
     counted = outcome is not None and outcome.unit != "trial" and not _impossible_count(outcome)
     probabilities = [s.p_success for s in (planned.verdict, verdict) if s is not None]
     places = () if localised is None else localised.facts.places

@@ -110,6 +110,8 @@ def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewP
             shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
+            had_plans=wording.agreeing_side({m.id: m for m in results.measurements})
+            == wording.SIM_SIDE,
             contents=names,
             first=front(results),
             front_figures=shown_first,

@@ -8,6 +8,8 @@ from evaluator.quantity import noun
 from evaluator.report.views import Shown
 from evaluator.result import Measurement, Results
 
+SIM_SIDE = "sim_planned"
+"""The twin's side where there were plans: planned trajectory, dynamic, of the plan sent."""
 HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.sim_planned.rate", "Sim and outcome agree"),
     ("agreement.sim_planned.phi", "phi"),
@@ -169,8 +171,8 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
 
 
 def agreeing_side(by_id: Mapping[str, Measurement]) -> str:
-    """The side whose agreement is shown first: sim_planned, or sim_executed without any plan."""
-    sides = ("sim_planned", "sim_executed")
+    """The side whose agreement is shown first: ``SIM_SIDE``, or sim_executed without any plan."""
+    sides = (SIM_SIDE, "sim_executed")
     rates = {side: by_id.get(f"agreement.{side}.rate") for side in sides}
     return next((side for side, rate in rates.items() if rate is not None and rate.n), sides[0])
 

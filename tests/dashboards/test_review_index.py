@@ -14,6 +14,7 @@ import pytest
 from visible import words
 
 from bridge.episode.catalogue import label_episode
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import Outcome
 from bridge.episode.run_folder import RunFolder
 from dashboards import comparison
@@ -130,6 +131,17 @@ def test_a_wrong_yes_comes_first_and_in_each_kind_the_farthest() -> None:
     ]
     shuffled = random.Random(1).sample(trials, len(trials))
     assert sorted(shuffled, key=severity) == trials
+
+
+def test_what_nobody_planned_is_judged_by_what_was_executed() -> None:
+    fails = {"recorded": False, "sim_executed": True, "plan_id": NO_PLAN}
+    unplanned = replace(PLAIN, episode="unplanned", executed_replay="x.mcap", **fails)
+    planned = replace(unplanned, episode="planned", plan_id="p")
+    assert (unplanned.twin, unplanned.twin_replay, unplanned.agrees) == (True, "x.mcap", False)
+    assert (planned.twin, planned.twin_replay, planned.agrees) == (None, None, None)
+    index = made([unplanned, planned])
+    assert [trial.episode for trial in index.trials(Selection(show="wrong_yes"))] == ["unplanned"]
+    assert index.totals()[2] == 2
 
 
 def test_causes_and_stages_select_the_failures_they_name() -> None:

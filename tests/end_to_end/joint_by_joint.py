@@ -6,6 +6,7 @@ trial grasps beside the cube.
 """
 
 import sys
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from bridge.cli.publish import publish_standin
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.robots.default import MAX_WIDTH_M
 from bridge.sources.standin import session
+from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import (
     LOOK_S,
@@ -30,6 +32,28 @@ OVER_M, GRASP_M, RELEASE_M = 0.15, 0.02, 0.1
 BESIDE_M = 0.06
 
 
+def move_by_hand(cell: StandinCell, poses: Mapping[str, np.ndarray], beside_m: float) -> None:
+    """Carry the cube into the box, posture by posture, as a person at a pendant would.
+
+    Args:
+        cell: At home, its gripper open.
+        poses: Where cube and box stand, ``T_base_object``.
+        beside_m: Grasp so far from the cube.
+    """
+    cube, box = (poses[name] for name in ("cube", "box"))
+    yaw = float(np.arctan2(cube[1, 0], cube[0, 0]))
+    at = cell.home_rad
+    for T, heights in ((cube, (OVER_M, GRASP_M)), (box, (OVER_M, RELEASE_M))):
+        for height_m in (*heights, OVER_M):
+            p = np.array([T[0, 3] + (beside_m if T is cube else 0.0), T[1, 3], height_m])
+            target = cell.kinematics.joints_for(tool_down(p, yaw if T is cube else 0.0), at)
+            cell.follow(*joint_move(at, target, cell.file.max_joint_speed_rad_s / 2))
+            at = target
+            if height_m != OVER_M:
+                cell.grip(0.0 if T is cube else MAX_WIDTH_M)
+                cell.wait(0.8)
+
+
 class Pendant(Operator):
     """Moves the arm from posture to posture."""
 
@@ -41,19 +65,7 @@ class Pendant(Operator):
         cell.cameras_running = True
         rest_s = wait_s(LOOK_S, cell.config.rate_hz)
         cell.wait(rest_s)
-        cube, box = (poses[name] for name in ("cube", "box"))
-        away_m = BESIDE_M * ((info.trial or 0) % 2 == 0)
-        yaw = float(np.arctan2(cube[1, 0], cube[0, 0]))
-        at = cell.home_rad
-        for T, heights in ((cube, (OVER_M, GRASP_M)), (box, (OVER_M, RELEASE_M))):
-            for height_m in (*heights, OVER_M):
-                p = np.array([T[0, 3] + (away_m if T is cube else 0.0), T[1, 3], height_m])
-                target = cell.kinematics.joints_for(tool_down(p, yaw if T is cube else 0.0), at)
-                cell.follow(*joint_move(at, target, cell.file.max_joint_speed_rad_s / 2))
-                at = target
-                if height_m != OVER_M:
-                    cell.grip(0.0 if T is cube else MAX_WIDTH_M)
-                    cell.wait(0.8)
+        move_by_hand(cell, poses, BESIDE_M * ((info.trial or 0) % 2 == 0))
         cell.wait(wait_s(SETTLE_S, cell.config.rate_hz))
         outcome = label_trial(cell.world.task, cell.truth, executed=False)
         cell.cameras_running = False

@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import pytest
 
+from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome, treatment_of
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import pair_starts, paired_progress
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.study import retry_table, study_results, study_starts
+from evaluator.compare.success import rate_groups, side_rates
+from evaluator.compare.tables import success_table
 from evaluator.result import Measurement
 from evaluator.statistics.differences import sign_test, tango_difference
 
@@ -187,3 +190,19 @@ def test_progress_counts_which_trial_of_a_start_came_further_and_not_how_far() -
     further = [replace(each, k=3) if each.k == 2 else each for each in rows]
     assert paired_progress(pair_starts(further)[0])[1].value == test.value
     assert paired_progress(pair_starts(FIRST)[0]) == []
+
+
+def test_without_plans_what_was_executed_is_shown_and_enters_no_statistic() -> None:
+    rows = [
+        row(start, "without", True, plan_id=NO_PLAN, sim_executed=start > 0) for start in range(3)
+    ]
+    (group,) = rate_groups(rows, side_rates(rows))
+    assert (group.shown_sim.k, group.shown_sim.n) == (2, 3)
+    assert (group.sim.value, group.sim.reason_if_undefined, group.sim_rate) == (
+        None,
+        "no plan",
+        None,
+    )
+    assert [line[3] for line in success_table([group], "real").rows] == ["executed in twin", "real"]
+    (planned,) = rate_groups([replace(rows[0], plan_id="p")], side_rates(rows[:1]))
+    assert planned.shown_sim is planned.sim

@@ -296,11 +296,14 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         word: What the recorded side is called: stand-in, real or recorded.
     """
     known = [
-        group for group in groups if group.sim.value is not None or group.recorded.value is not None
+        group
+        for group in groups
+        if group.shown_sim.value is not None or group.recorded.value is not None
     ]
     if not known:
         return NotDrawn(id="success", reason="no group has a rate")
     shown = known[:MAX_ROWS]
+    side = "planned" if any(group.executed is None for group in known) else "executed"
     row = 0.56
 
     def draw(figure: "Figure") -> None:
@@ -313,7 +316,7 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         for index, group in enumerate(shown):
             label = words(group.task, group.condition, group.policy)
             axes.text(-3, index + 0.22, label, va="center", fontsize=8, bbox=ON_PAPER)
-            _rate(axes, group.sim, index + 0.5, "sim", "o")
+            _rate(axes, group.shown_sim, index + 0.5, "sim", "o")
             _rate(axes, group.recorded, index + 0.76, "rec", "s")
         for x, name, marker, text in ((0, "sim", "o", "twin"), (24, "rec", "s", word)):
             axes.plot(
@@ -327,10 +330,12 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
     return Drawing(
         id="success",
         title=f"Success rates in the twin and {word}",
-        caption="Circle: planned-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
+        caption=f"Circle: {side}-in-twin; square: as labelled. Bars are 95 % intervals; the counts "
         f"stand at the right.{rest}",
         alt=f"Rates of {counted_groups(len(known))}: "
-        + listed([f"{c.label}: twin {_text(c.sim)}, {word} {_text(c.recorded)}" for c in known]),
+        + listed(
+            [f"{c.label}: twin {_text(c.shown_sim)}, {word} {_text(c.recorded)}" for c in known]
+        ),
         table=_table("success", known, word, common=False),
         height_in=0.7 + row * len(shown),
         draw=draw,
@@ -360,7 +365,7 @@ def _text(rate: Measurement) -> str:
 def _table(table_id: str, groups: Sequence[RateGroup], word: str, *, common: bool) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for group in groups:
-        sides = group.pair if common else (group.sim, group.recorded)
+        sides = group.pair if common else (group.shown_sim, group.recorded)
         numbers = [value for side in sides for value in _numbers(side)]
         rows.append((group.task, group.condition.replace("_", " "), group.policy, *numbers))
     sides_named = [

@@ -87,6 +87,7 @@ def _group_alone(group: RateGroup) -> RateGroup:
         group,
         recorded=_alone(group.recorded),
         sim=_alone(group.sim),
+        executed=None if group.executed is None else _alone(group.executed),
         episodes=(),
         recorded_common=None if recorded is None else _alone(recorded),
         sim_common=None if sim is None else _alone(sim),

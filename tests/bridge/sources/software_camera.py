@@ -41,6 +41,8 @@ class SoftwareCamera:
     unit_m: float = 0.001
     unit_settable: bool = False
     domain: Any = rs.timestamp_domain.global_time
+    lens: Any = None
+    """``rs.intrinsics`` of both streams, seen from one place; None: as usual, two lenses."""
     device: Any = field(init=False)
 
     def __post_init__(self) -> None:
@@ -53,8 +55,8 @@ class SoftwareCamera:
         self.color_sensor = (
             self.depth_sensor if self.one_sensor else self.device.add_sensor("RGB Camera")
         )
-        depth = intrinsics(width, height, fx=385.0)
-        color = intrinsics(width, height, fx=610.0, coeffs=self.coeffs)
+        depth = self.lens or intrinsics(width, height, fx=385.0)
+        color = self.lens or intrinsics(width, height, fx=610.0, coeffs=self.coeffs)
         self.depth = self.depth_sensor.add_video_stream(
             stream(rs.stream.depth, rs.format.z16, 1, depth)
         )
@@ -69,6 +71,9 @@ class SoftwareCamera:
             self.depth_sensor.add_read_only_option(rs.option.depth_units, self.unit_m)
         between = rs.extrinsics()
         between.rotation, between.translation = list(ROTATION_Z), [0.0148, 0.0002, -0.0001]
+        if self.lens is not None:
+            between.rotation = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+            between.translation = [0.0] * 3
         self.depth.register_extrinsics_to(self.color, between)
         self.between = between
         self.kept: list[np.ndarray] = []
