@@ -194,7 +194,7 @@ def test_policies_are_what_agreement_is_resampled_by(write_table: Callable[[str]
     assert r.value is not None
     assert r.interval is not None
     assert r.interval.method == "hierarchical"
-    assert "policies resampled" in results.get("agreement.mae_pp").definition
+    assert "policies left out" in results.get("agreement.mae_pp").definition
     band = results.get("agreement.pearson_r_remeasured")
     assert band.interval is not None or "remeasurement" in str(band.reason_without_interval)
     assert results.get("decision.regret_pp").n == 1
