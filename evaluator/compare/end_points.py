@@ -4,8 +4,8 @@ A simulated run that was replayed from one recorded run is compared with that ru
 belongs to no single recorded run is compared with each of them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from statistics import median
 
@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry.trajectory import PoseTrajectory
-from evaluator.compare.band_measurements import Side
 from evaluator.compare.measure import Part, ends, interval_or_reason, measured, millimetres
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Defined
@@ -23,6 +22,36 @@ from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
 from evaluator.statistics.intervals import median_interval
 
 TOOL_BODY = "tool"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """One imported run."""
+
+    episode: str
+    task: str
+    engine: str | None
+    """None for a recorded run."""
+    track: PoseTrajectory
+    """Of the tool."""
+    objects: Mapping[str, PoseTrajectory] = field(default_factory=dict)
+    replayed_from: str | None = None
+    """The recorded run that a replay was made from; None where it belongs to no single one."""
+    fitted_to: frozenset[str] = frozenset()
+    """Recorded runs from which something was identified that a replay uses."""
+
+    def body(self, name: str) -> PoseTrajectory | None:
+        """Return the motion of the tool or of an object; None where it was not recorded."""
+        return self.track if name == TOOL_BODY else self.objects.get(name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """Runs of one task that are compared together."""
+
+    name: str
+    """``recorded``, or the engine."""
+    runs: tuple[Run, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +152,8 @@ def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyCompariso
                 simulated=tuple(other.episode for other in others),
                 distance=BodyDistance(
                     **{
-                        field.name: float(np.mean([getattr(item, field.name) for item in each]))
-                        for field in fields(BodyDistance)
+                        part.name: float(np.mean([getattr(item, part.name) for item in each]))
+                        for part in fields(BodyDistance)
                     }
                 ),
                 fitted=any(run.episode in other.fitted_to for other in others),
@@ -212,7 +241,7 @@ def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: s
         ),
         Table.of(
             each,
-            id=table_id.replace("bands_", "runs_of_"),
+            id=f"runs_of_{table_id}",
             title=f"End points of each recorded run: {task}",
             note="Also of runs that something was fitted to; they are marked.",
         ),

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from evaluator.compare.band_measurements import BandCurve, BandPath
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
@@ -195,9 +194,6 @@ class Comparison:
     """How far each motion lies from its replays, with its course."""
     states: tuple[StateSummary, ...] = ()
     """Where objects were predicted, replayed and localised after each stage."""
-    bands: tuple[BandCurve, ...] = ()
-    paths: tuple[BandPath, ...] = ()
-    """Distance and repeatability of imported runs over normalised time."""
     views: tuple[ViewQuality, ...] = ()
     """Every rendered view that was scored, with pictures of the worst."""
     provenance: dict[str, Any] = field(default_factory=dict)

@@ -55,7 +55,7 @@ SECTIONS: tuple[Section, ...] = (
             ("session.drift_p", "Change over the session, p"),
         ),
         tables=("success", "layout", "notes", "session_order"),
-        figures=("success", "order"),
+        figures=("success",),
     ),
     Section(
         id="agreement",
@@ -150,7 +150,7 @@ SECTIONS: tuple[Section, ...] = (
             ("reliability.ece", "Expected calibration error"),
         ),
         tables=("confusion", "gate_*", "reliability"),
-        figures=("confusion", "costs", "reliability"),
+        figures=("costs", "reliability"),
     ),
     Section(
         id="against",
@@ -184,8 +184,8 @@ SECTIONS: tuple[Section, ...] = (
                 ("joint_rms_rad", "Joints, root mean square"),
             )
         ),
-        tables=("motion*", "bands_*"),
-        figures=("motions", "bands"),
+        tables=("motion*", "end_points_*", "runs_of_end_points_*"),
+        figures=("motions",),
     ),
     Section(
         id="states",

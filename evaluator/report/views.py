@@ -47,7 +47,7 @@ class View:
 
 def view(table: Table) -> View:
     """Return what is printed of a table."""
-    build = _VIEWS.get("bands" if table.id.startswith("bands_") else table.id)
+    build = _VIEWS.get(table.id)
     if build is None or not table.rows:
         return View(**vars(table))
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
@@ -285,13 +285,6 @@ def _stopping(rows: Rows) -> Rows:
     ]
 
 
-def _bands(rows: Rows) -> Rows:
-    name = "inside the recorded band"
-    if name not in rows[0]:  # the other tables of bands hold lengths alone
-        return rows
-    return [row | {name: percent(row[name], digits=0)} for row in rows]
-
-
 def _without_task(rows: Rows) -> Rows:
     def r(row: Record) -> Shown:
         known = _known(row["Pearson r"])
@@ -389,7 +382,6 @@ _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "gate_baselines": _baselines,
     "gate_clauses": _clauses,
     "stopping": _stopping,
-    "bands": _bands,
     "leave_one_task_out": _without_task,
     "final_states": _states,
     "published": _published,

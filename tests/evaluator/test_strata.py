@@ -7,8 +7,6 @@ from statsmodels.stats.contingency_tables import StratifiedTable, Table
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.session_order import session_order
 from evaluator.errors import UndefinedStatisticError
-from evaluator.report.figures.drawing import Drawing, NotDrawn
-from evaluator.report.figures.order import session_order as drawing_of_order
 from evaluator.statistics.strata import drift, mantel_haenszel
 
 TABLES = [(3, 10, 6, 10), (8, 12, 11, 14), (1, 9, 4, 8)]
@@ -104,11 +102,3 @@ def test_few_trials_have_no_order_and_equal_ones_no_drift() -> None:
     assert measurements[0].reason_if_undefined
     assert "ended differently" in measurements[0].reason_if_undefined
     assert tables
-
-
-def test_the_figure_shows_every_part_and_says_why_it_is_missing() -> None:
-    _, tables = session_order(session([True, False] * 12))
-    drawn = drawing_of_order(tables)
-    assert isinstance(drawn, Drawing)
-    assert "trials 1 to" in drawn.alt
-    assert isinstance(drawing_of_order(()), NotDrawn)

@@ -77,7 +77,6 @@ def funnel(tables: Sequence[Table]) -> Drawing | NotDrawn:
         + listed(
             [f"{words(*map(str, row[:3]))}: {row[4]} of {row[3]}" for row in table.rows], at_most=12
         ),
-        table=Table(id="figure_funnel", title="", columns=table.columns, rows=table.rows),
         height_in=0.5 + 0.2 * lines,
         draw=draw,
     )
@@ -148,22 +147,6 @@ def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:
         f"has no interval; its measurement says why.{rest}",
         alt="Gains in percentage points: "
         + listed([f"{_label(name)}, {side}: {m.value:+.1f}" for name, side, m in lines]),
-        table=Table(
-            id="figure_gains",
-            title="",
-            columns=("task", "side", "gain (pp)", "low", "high", "why no interval"),
-            rows=tuple(
-                (
-                    _label(name),
-                    word if side == "recorded" else "twin",
-                    round(m.value or 0.0, 2),
-                    None if m.interval is None else round(m.interval.low, 2),
-                    None if m.interval is None else round(m.interval.high, 2),
-                    m.reason_without_interval,
-                )
-                for name, side, m in lines
-            ),
-        ),
         height_in=0.7 + 0.56 * len(shown),
         draw=draw,
     )
@@ -234,7 +217,6 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         "optimistic. Marks that coincide are set apart.",
         alt=f"Scatter of {counted_groups(len(drawn))}: "
         + listed([f"{c.label}: twin {_text(c.pair[0])}, {word} {_text(c.pair[1])}" for c in drawn]),
-        table=_table("scatter", drawn, word, common=True),
         height_in=below + side + 0.12,
         draw=draw,
     )
@@ -331,7 +313,6 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         f"stand at the right.{rest}",
         alt=f"Rates of {counted_groups(len(known))}: "
         + listed([f"{c.label}: twin {_text(c.sim)}, {word} {_text(c.recorded)}" for c in known]),
-        table=_table("success", known, word, common=False),
         height_in=0.7 + row * len(shown),
         draw=draw,
     )
@@ -355,30 +336,3 @@ def _text(rate: Measurement) -> str:
     if rate.k is None or rate.n is None:
         return f"{100 * rate.value:.0f} %"
     return f"{rate.k}/{rate.n}"
-
-
-def _table(table_id: str, groups: Sequence[RateGroup], word: str, *, common: bool) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for group in groups:
-        sides = group.pair if common else (group.sim, group.recorded)
-        numbers = [value for side in sides for value in _numbers(side)]
-        rows.append((group.task, group.condition.replace("_", " "), group.policy, *numbers))
-    sides_named = [
-        f"{side}{what}" for side in ("twin", word) for what in (" (%)", " low", " high", " k", " n")
-    ]
-    return Table(
-        id=f"figure_{table_id}",
-        title="",
-        columns=("task", "condition", "policy", *sides_named),
-        rows=tuple(rows),
-    )
-
-
-def _numbers(rate: Measurement) -> tuple[Cell, ...]:
-    interval = rate.interval
-    ends = (None, None) if interval is None else (_percent(interval.low), _percent(interval.high))
-    return _percent(rate.value), *ends, rate.k, rate.n
-
-
-def _percent(value: float | None) -> float | None:
-    return None if value is None else round(100 * value, 2)
