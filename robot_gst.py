@@ -17,6 +17,7 @@ from rich.console import Console
 
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.gone import refuse_gone
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -224,7 +225,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "Posed images without depth: COLMAP, transforms.json.",
                 "DIR runs/x",
             ),
-            ("kinova", f"{EXCHANGE}:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
             (
                 "rosbag2",
                 f"{EXCHANGE}:import_rosbag2",
@@ -335,6 +335,7 @@ def run(arguments: Sequence[str]) -> int:
         tokens, config = _take_config(list(arguments))
         if config is not None:
             app.config = Toml(config, must_exist=True)
+        refuse_gone(tokens)
         code = app(tokens)
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")

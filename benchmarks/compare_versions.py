@@ -75,7 +75,8 @@ def kitchen_stages(command: str, source: Path, folder: Path) -> None:
 
 def kinova_stages(command: str, source: Path, folder: Path) -> None:
     """Import the runs of a real arm and of its simulators, and compare them."""
-    run(command, "import", "kinova", str(source), str(folder))
+    script = Path(__file__).parents[1] / "datasets" / "kinova" / "make_episodes.py"
+    subprocess.run([sys.executable, script, source, folder], check=True)
     run(command, "evaluate", str(folder))
 
 

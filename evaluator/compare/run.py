@@ -12,12 +12,12 @@ from bridge.task.protocol import VOID_CAUSES, Protocol, read_protocol
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import with_rule
+from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
 from evaluator.compare.images.scores import open_nets
 from evaluator.compare.images.views import ViewReport, compare_views
-from evaluator.compare.imported import compare_imported
 from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results

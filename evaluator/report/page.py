@@ -43,7 +43,6 @@ SOURCES = {
 }
 DRAWN = {
     "gate_costs": "costs",
-    "reliability": "reliability",
     "funnel": "funnel",
 }
 """Tables that say what a figure of the page shows; they are folded beside it."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement
-from evaluator.statistics.agreement import choose, over_tasks, without_each
+from evaluator.statistics.agreement import choose
 from evaluator.statistics.bootstrap import (
     GroupSample,
     remeasure_counts,
@@ -132,11 +132,3 @@ def test_ties_are_sets_and_the_worst_of_them_counts() -> None:
         choose(recorded={"a": 1}, sim={"a": 1})
     with pytest.raises(ValueError, match="different candidates"):
         choose(recorded={"a": 1}, sim={"b": 1})
-
-
-def test_means_over_tasks_use_candidates_that_every_task_has() -> None:
-    rates = {"cube": {"a": 1, "b": 0.5}, "duck": {"a": 0, "b": 0.5, "c": 1}}
-    assert over_tasks(rates) == {"a": Fraction(1, 2), "b": Fraction(1, 2)}
-    assert without_each(["x", "y"]) == {"x": ["y"], "y": ["x"]}
-    with pytest.raises(UndefinedStatisticError, match="1 task; nothing would be left"):
-        without_each(["x"])

@@ -18,6 +18,7 @@ from bridge.errors import PathNotFoundError
 from bridge.media.color import encode_jpeg
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, TrialRow, compare_run
+from evaluator.compare.trial import read_tcp_errors
 from evaluator.errors import EvaluatorError
 
 
@@ -168,7 +169,10 @@ def test_a_label_given_afterwards_overrides_the_recorded_one(maker: Any) -> None
 def test_tool_error_is_measured_at_matching_instants(maker: Any, start_ns: int) -> None:
     maker.trial("t1")
     maker.replay("t1", offset_m=0.01, start_ns=start_ns)
-    series = row_of(compare_run(maker.run), "t1").tcp_errors
+    row = row_of(compare_run(maker.run), "t1")
+    planned = maker.run.derived_dir / str(row.planned_replay)
+    assert row.path is not None
+    series = read_tcp_errors(row.path, row.plan_id, {"planned": planned})
     assert [item.against for item in series] == ["planned"]
     np.testing.assert_allclose(series[0].position_m, 0.01, atol=1e-9)
     np.testing.assert_allclose(series[0].rotation_rad, 0.0, atol=1e-9)

@@ -13,8 +13,14 @@ from evaluator.report.figures.distributions import (
     view_panels,
 )
 from evaluator.report.figures.drawing import Drawing, NotDrawn
-from evaluator.report.figures.gate import costs, reliability
-from evaluator.report.figures.rates import funnel, gains, scatter, success
+from evaluator.report.figures.rates import (
+    costs,
+    funnel,
+    gains,
+    reliability,
+    scatter,
+    success,
+)
 from evaluator.report.figures.tasks import tasks
 
 FIRST = ("recorded to planned", "recorded to executed")
