@@ -25,11 +25,9 @@ INSTEAD = {
     "jeffreys": "wilson or clopper-pearson",
     NEWCOMBE: "clopper-pearson-difference",
     "tango": "McNemar's exact test, which needs no interval",
-    "ppi++": "post-stratified-beta",
 }
 HOLDS_FROM = {
     "tango": (5, "pairs"),
-    "ppi++": (200, "robot trials"),
     "student-t:length": (50, "episodes"),
     "jackknife-points:rmse": (8, "groups"),
     "jackknife-points:intercept": (15, "groups"),
