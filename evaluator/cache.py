@@ -10,6 +10,7 @@ it raises. ``docs/decisions/0008-caches-and-processes.md`` says why.
 
 import hashlib
 import time
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
@@ -64,7 +65,7 @@ def code_version() -> bytes:
 
 
 def _to_plain(value: Any) -> Any:
-    if isinstance(value, Packed):
+    if isinstance(value, array):
         return value.tobytes()
     if isinstance(value, np.generic):
         return value.item()
