@@ -213,7 +213,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "Posed images without depth: COLMAP, transforms.json.",
                 "DIR runs/x",
             ),
-            ("kinova", f"{EXCHANGE}:import_kinova", "The Kinova reality-gap runs.", "DIR runs/x"),
             (
                 "rosbag2",
                 f"{EXCHANGE}:import_rosbag2",

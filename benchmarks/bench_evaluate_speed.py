@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from evaluate_run import Size, paths_of, write_run
 from measure import ROOT, Target, report_targets
 
@@ -137,23 +136,6 @@ def motions(run: RunFolder) -> Spent:
     return spent(lambda: sum_up(trials, cache, QUIET))
 
 
-def intervals() -> Spent:
-    """Every statistic's bootstrap interval over 8 policies: 6,435 resamples, drawn once."""
-    from evaluator.statistics.bootstrap import GroupSample
-    from evaluator.statistics.weighted import STATISTICS
-
-    rng = np.random.default_rng(2)
-    recorded, sim = (rng.integers(0, 11, (2, 24)) / 10).tolist()
-    clusters = [index // 3 for index in range(24)]
-
-    def all_of_them() -> None:
-        sample = GroupSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
-        for statistic in STATISTICS:
-            sample.interval(statistic, "bootstrap")
-
-    return spent(all_of_them)
-
-
 def reference(paths: Iterable[Path]) -> Spent:
     """Read the same metadata and messages with the official reader; nothing is checked."""
     from mcap.reader import make_reader
@@ -189,7 +171,6 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         of_motions = motions(write_run(Path(folder) / "long", LONG))
     long_ms = 1e3 * of_motions.wall_s / LONG.num_trials
-    of_intervals = intervals()
     cold = evaluate(run)
     warm = [evaluate(run) for _ in range(3)]
     write_run(run.path, Size(num_trials=NUM_NEW, seconds=SHORT_S), first=NUM_TRIALS)
@@ -217,13 +198,6 @@ def main() -> None:
                 limit=80.0,
                 unit="ms",
                 reference=f"one process, CPU {1e3 * of_motions.cpu_s / LONG.num_trials:.1f} ms",
-            ),
-            Target(
-                what="bootstrap intervals of every statistic, 6,435 resamples",
-                measured=of_intervals.wall_s,
-                limit=1.0,
-                unit="s",
-                reference=f"CPU {of_intervals.cpu_s:.2f} s",
             ),
             Target(
                 what=f"{NUM_TRIALS} episodes from the cache to the report, whole command",

@@ -38,7 +38,8 @@ def gst(*words: str) -> None:
 def make(run: Path) -> None:
     """Import, replay at nominal friction, identify friction, replay again, evaluate."""
     calibration = run / "scene" / "calibration.json"
-    gst("import", "kinova", str(KINOVA), str(run))
+    script = ROOT / "datasets" / "kinova" / "make_episodes.py"
+    subprocess.run([sys.executable, script, KINOVA, run], check=True)
     if not calibration.is_file():
         gst("replay", str(run), "--workers", "1")
         gst("calibrate", str(run), "--physics")

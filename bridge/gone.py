@@ -31,6 +31,7 @@ GONE: dict[str, str] = {
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
+    "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
 }
 """By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""
 

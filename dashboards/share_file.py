@@ -33,7 +33,7 @@ from dashboards.loading import LOADING
 from dashboards.queue_page import SUBSAMPLING
 from evaluator.compare.rows import Comparison
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
-from evaluator.report.figures.selection import drawable, drawings_of
+from evaluator.report.figures.selection import drawings_of
 from evaluator.report.front import FIGURES, front
 from evaluator.report.page import SHARED, environment, name_shared
 from evaluator.report.wording import stand_in_sentence
@@ -249,7 +249,7 @@ def _figure(comparison: Comparison | None) -> tuple[Drawing | None, str | None]:
     """Draw the report's first figure; none without matplotlib, or without groups."""
     if comparison is None:
         return None, None
-    drawn, _ = drawings_of(drawable(comparison))
+    drawn, _ = drawings_of(comparison)
     first = next((d for name in FIGURES for d in drawn if d.id == name), None)
     if first is None:
         return None, None

@@ -215,7 +215,7 @@ def condition_word(condition: str) -> str:
 def image_title(measurement: Measurement) -> str:
     """Name an image number ``views.<part>.<metric>`` as its metric and part."""
     _, part, metric = [*measurement.id.split(".", 2), "", ""][:3]
-    metric = metric.removesuffix("_db").removesuffix("_m").replace("ms_ssim", "ms-ssim")
+    metric = metric.removesuffix("_db").removesuffix("_m")
     word, _, how = metric.replace("_", " ").partition(" ")
     first = word.capitalize() if word == "depth" else word.upper()
     name = " ".join(filter(None, (first, how))) or measurement.id

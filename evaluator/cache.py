@@ -1,163 +1,55 @@
-"""What was read from files that have not changed since, kept in Parquet beside the results.
+"""What was read from files that have not changed since, kept beside the results.
 
 A summary is a frozen dataclass that follows from the bytes of a few files and from nothing else.
-It is kept under a key that names those bytes by their content hash, together with a digest of the
-code that makes summaries, so that neither a changed file nor changed code is answered from here.
-Files of summaries are each written whole under a name of its own, so any number of evaluations may
-write at once, one may be killed at any instant, and the folder may be deleted at any time. Nothing
-that is wrong with it raises; whoever asks is told once.
-``docs/decisions/0008-caches-and-processes.md`` says why.
+It is kept under a key that names those bytes by their content hash, in a file that names the code
+that made it, so that neither a changed file nor changed code is answered from here. There is one
+file for each kind of summary, written whole: of two evaluations at once the later one's stays, one
+may be killed at any instant, and the folder may be deleted at any time. Nothing that is wrong with
+it raises. ``docs/decisions/0008-caches-and-processes.md`` says why.
 """
 
 import hashlib
-import re
-import secrets
 import time
-from collections.abc import Callable, Mapping
+from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
 
 import bridge
 import evaluator
 from bridge.episode.provenance import software
-
-if TYPE_CHECKING:
-    from types import ModuleType
-
+from bridge.whole_file import write_whole
+from evaluator.memory import Packed, packed, without_collecting
 
 Say = Callable[[str], None]
+Rows = dict[str, tuple[Any, ...]]
+"""Summaries by the key they are kept under; there may be none or several under one."""
+Summary = TypeVar("Summary")
 
-TRIES = 3
-"""Another evaluation may fold files into a new one while they are read: they are looked for again.
-"""
+FOLDER = "cache"
+"""Beside ``results.json``."""
+SAVE_PERIOD_S = 20.0
+"""An evaluation that is killed loses no more work than this."""
+MOST_UNUSED = 0.2
+"""A file of which a larger share is about files that are gone or have changed is written anew."""
 ABANDONED_S = 3600.0
 """A half-written file this old has lost its writer."""
 SUMMING_UP = {
-    evaluator: ("cache_file.py", "compare", "metrics", "run_reader"),
+    evaluator: ("cache.py", "compare", "metrics", "run_reader"),
     bridge: ("clock.py", "episode", "geometry", "media", "task"),
 }
 """The code that reads episodes and sums them up."""
-
-
-@dataclass
-class Found:
-    """What a folder holds of one kind of summary."""
-
-    rows: dict[str, tuple[Any, ...]] = field(default_factory=dict)
-    files: list[Path] = field(default_factory=list)
-    """Where they were read from."""
-    useless: list[Path] = field(default_factory=list)
-    """Damaged, foreign, or of other code."""
-
-
-class CacheFolder:
-    """Files of summaries, by kind."""
-
-    def __init__(self, path: Path, say: Say) -> None:
-        """Use a folder, which need not exist; ``say`` hears what makes the evaluation slower."""
-        self._path = path
-        self._say = say
-        self._can_write = True
-        self._has_complained = False
-        self._parquet = self._import_parquet()
-
-    @property
-    def is_of_use(self) -> bool:
-        """Whether anything can be kept here."""
-        return self._parquet is not None and self._can_write
-
-    def files_of(self, kind: type[Any]) -> list[Path]:
-        """List the files of a kind of summary."""
-        name = re.compile(rf"{kind.__name__}\.[0-9a-f]{{16}}\.parquet")
-        try:
-            return sorted(path for path in self._path.iterdir() if name.fullmatch(path.name))
-        except OSError:  # not there, or not ours to read
-            return []
-
-    def read(self, kind: type[Any]) -> Found:
-        """Read all summaries of a kind."""
-        found, reasons = Found(), list[str]()
-        for _ in range(TRIES):
-            found, reasons, is_whole = self._try_to_read(kind)
-            if is_whole:
-                break
-        if reasons and not self._has_complained:  # the other kinds are alike
-            self._has_complained = True
-            more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
-            self._say(f"In {self._path}, {reasons[0]}{more}. The episodes are read again.")
-        return found
-
-    def _try_to_read(self, kind: type[Any]) -> tuple[Found, list[str], bool]:
-        found, reasons, is_whole = Found(), list[str](), True
-        if self._parquet is None:
-            return found, reasons, is_whole
-        for path in self.files_of(kind):
-            try:
-                found.rows |= self._parquet.read_summaries(path, kind, code_version())
-                found.files.append(path)
-            except FileNotFoundError:
-                is_whole = False
-            except self._parquet.UnusableFileError as error:
-                found.useless.append(path)
-                reasons.append(f"{path.name}: {error}")
-        return found, reasons, is_whole
-
-    def write(self, kind: type[Any], rows: Mapping[str, tuple[Any, ...]]) -> Path | None:
-        """Write summaries into a new file; None where the disk refuses.
-
-        Args:
-            kind: The dataclass of the summaries; its name begins the file's name.
-            rows: Summaries by the key they are kept under.
-        """
-        if self._parquet is None or not self._can_write:
-            return None
-        path = self._path / f"{kind.__name__}.{secrets.token_hex(8)}.parquet"
-        try:
-            self._parquet.write_summaries(path, kind, rows, code_version())
-        except OSError as error:
-            self._can_write = False
-            self._say(
-                f"{self._path} cannot be written ({error.strerror}): the next evaluation reads "
-                "these files again."
-            )
-            return None
-        return path
-
-    def remove(self, path: Path) -> None:
-        """Delete a file, if it is still there and ours."""
-        try:
-            path.unlink(missing_ok=True)
-        except OSError:  # it is only read once more
-            return
-
-    def sweep(self) -> None:
-        """Delete what killed evaluations left half-written."""
-        for path in self._path.glob("*.parquet*.part"):
-            try:
-                if time.time() - path.stat().st_mtime > ABANDONED_S:
-                    path.unlink()
-            except OSError:  # its writer has just finished it
-                continue
-
-    def _import_parquet(self) -> "ModuleType | None":
-        try:
-            from evaluator import cache_file  # noqa: PLC0415  # pyarrow may be missing
-        except ModuleNotFoundError as error:
-            if error.name != "pyarrow":
-                raise
-            self._say(
-                "pyarrow is not installed (pip install 'robot-gst[report]'): nothing is kept for "
-                "the next evaluation, which reads all files again."
-            )
-            return None
-        return cache_file
+DIGEST_BYTES = 32
 
 
 @cache
-def code_version() -> str:
+def code_version() -> bytes:
     """Return a digest of the code that sums episodes up, as it is on the disk."""
     digest = hashlib.sha256(software()["version"].encode())
     for package, places in SUMMING_UP.items():
@@ -169,39 +61,87 @@ def code_version() -> str:
                 if file.suffix in (".py", ".json"):
                     digest.update(f"{file.relative_to(root)}\0".encode())
                     digest.update(file.read_bytes())
-    return digest.hexdigest()
+    return digest.digest()
 
 
-Summary = TypeVar("Summary")
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, array):
+        return value.tobytes()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(type(value).__name__)
 
-FOLDER = "cache"
-"""Beside ``results.json``."""
-SAVE_PERIOD_S = 20.0
-"""An evaluation that is killed loses no more work than this."""
-MOST_FILES = 4
-"""A kind of summary in more files than this is folded into one."""
-MOST_UNUSED = 0.2
-"""So is one of which a larger share is about files that are gone or have changed."""
+
+def _from_plain(kind: type[Any], value: Any) -> Any:
+    return packed(value) if kind is Packed else value
+
+
+_encode = msgspec.msgpack.Encoder(enc_hook=_to_plain).encode
+
+
+def _digest(body: bytes) -> bytes:
+    return hashlib.sha256(code_version() + body).digest()
+
+
+def write_rows(path: Path, rows: Rows) -> None:
+    """Write summaries, whole or not at all; one that cannot be packed costs only its own place.
+
+    Raises:
+        OSError: When the disk refuses.
+    """
+    try:
+        body = _encode(rows)
+    except (TypeError, ValueError, OverflowError):
+        body = _encode({key: found for key, found in rows.items() if _fits(found)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, _digest(body) + body)
+
+
+def _fits(found: tuple[Any, ...]) -> bool:
+    try:
+        _encode(found)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def read_rows(path: Path, kind: type[Any]) -> Rows:
+    """Read the summaries of a file.
+
+    Raises:
+        ValueError: When it is damaged, or other code made it.
+        FileNotFoundError: When it is not there.
+    """
+    data = path.read_bytes()
+    head, body = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
+    if head != _digest(body):
+        message = f"{path.name} is damaged, or another version of this program wrote it"
+        raise ValueError(message)
+    try:
+        with without_collecting():
+            rows: Rows = msgspec.msgpack.decode(
+                body,
+                type=dict[str, tuple[kind, ...]],  # type: ignore[valid-type]
+                dec_hook=_from_plain,
+            )
+    except msgspec.MsgspecError as error:
+        message = f"{path.name} holds something else ({error})"
+        raise ValueError(message) from error
+    return rows
 
 
 @dataclass
 class _Kept:
     """All summaries of one kind."""
 
-    found: Found
-    new: dict[str, tuple[Any, ...]] = field(default_factory=dict)
-    """Those no file holds yet; also among the rows found."""
+    rows: Rows = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
+    is_new: bool = False
+    """Whether something is not on the disk yet."""
 
     @property
     def is_untidy(self) -> bool:
-        rows, files = self.found.rows, self.found.files
-        unused = len(rows) - len(self.used)
-        return (
-            bool(self.found.useless)
-            or len(files) + bool(self.new) > MOST_FILES
-            or unused > MOST_UNUSED * len(rows)
-        )
+        return len(self.rows) - len(self.used) > MOST_UNUSED * len(self.rows)
 
 
 class SummaryCache:
@@ -226,8 +166,9 @@ class SummaryCache:
             say: Called about whatever makes the evaluation take longer.
             monotonic: The clock of periodic saving [s].
         """
-        self._folder = None if folder is None else CacheFolder(folder, say)
+        self._folder = folder
         self._fresh = fresh
+        self._say_once: Say | None = say
         self._monotonic = monotonic
         self._saved_s = monotonic()
         self._kept: dict[type[Any], _Kept] = {}
@@ -249,14 +190,9 @@ class SummaryCache:
         return found
 
     def find(self, kind: type[Summary], key: str) -> tuple[Summary, ...] | None:
-        """Return what is kept under a key, None where nothing is.
-
-        Args:
-            kind: The dataclass of the summaries.
-            key: What they were kept under; it counts as used from now on.
-        """
+        """Return what is kept under a key, None where nothing is; it counts as used from now on."""
         kept = self._of(kind)
-        found = kept.found.rows.get(key)
+        found = kept.rows.get(key)
         if found is not None:
             kept.used.add(key)
         return found
@@ -269,56 +205,75 @@ class SummaryCache:
             key: Names what they were made from, so that a changed file has another key.
             made: The summaries; none is an answer too.
         """
-        if self._folder is None or not self._folder.is_of_use:
+        if self._folder is None:
             return
         kept = self._of(kind)
-        kept.found.rows[key] = kept.new[key] = made
+        kept.rows[key] = made
         kept.used.add(key)
+        kept.is_new = True
         if self._monotonic() - self._saved_s > SAVE_PERIOD_S:
             self.save()
 
     def save(self) -> None:
         """Write what no file holds yet."""
         for kind, kept in self._kept.items():
-            if kept.new:
-                self._write(kind, kept, kept.new)
+            if kept.is_new:
+                self._write(kind, kept)
         self._saved_s = self._monotonic()
 
     def close(self) -> None:
         """Write what is new, and drop what this evaluation had no use for."""
-        for kind, kept in self._kept.items():
+        for kept in self._kept.values():
             if kept.is_untidy:
-                self._fold(kind, kept)
+                kept.rows = {key: found for key, found in kept.rows.items() if key in kept.used}
+                kept.is_new = True
         self.save()
-        if self._folder is not None:
-            self._folder.sweep()
-
-    def _fold(self, kind: type[Any], kept: _Kept) -> None:
-        before = [*kept.found.files, *kept.found.useless]
-        used = {key: kept.found.rows[key] for key in kept.used}
-        if self._folder is None or (used and not self._write(kind, kept, used)):
-            return
-        for path in before:  # only now: what replaces them is on the disk
-            self._folder.remove(path)
-
-    def _write(self, kind: type[Any], kept: _Kept, rows: dict[str, tuple[Any, ...]]) -> bool:
-        path = None if self._folder is None else self._folder.write(kind, rows)
-        if path is None:
-            return False
-        kept.found.files.append(path)
-        kept.new = {}
-        return True
+        self._sweep()
 
     def _of(self, kind: type[Any]) -> _Kept:
         if kind not in self._kept:
-            if self._folder is None:
-                found = Found()
-            elif self._fresh:
-                found = Found(useless=self._folder.files_of(kind))
-            else:
-                found = self._folder.read(kind)
-            self._kept[kind] = _Kept(found)
+            rows: Rows = {}
+            if self._folder is not None and not self._fresh:
+                try:
+                    rows = read_rows(self._path(kind), kind)
+                except OSError:  # not there, or not ours to read
+                    rows = {}
+                except ValueError as error:
+                    self._say(f"In {self._folder}, {error}. The episodes are read again.")
+            self._kept[kind] = _Kept(rows)
         return self._kept[kind]
+
+    def _path(self, kind: type[Any]) -> Path:
+        return (self._folder or Path()) / f"{kind.__name__}.msgpack"
+
+    def _write(self, kind: type[Any], kept: _Kept) -> None:
+        if self._folder is None:
+            return
+        try:
+            write_rows(self._path(kind), kept.rows)
+        except OSError as error:
+            self._say(
+                f"{self._folder} cannot be written ({error.strerror}): the next evaluation reads "
+                "these files again."
+            )
+            self._folder = None
+        kept.is_new = False
+
+    def _say(self, text: str) -> None:
+        if self._say_once is not None:
+            self._say_once(text)
+            self._say_once = None
+
+    def _sweep(self) -> None:
+        """Delete what killed evaluations left half-written, and files of the edition before."""
+        if self._folder is None:
+            return
+        for path in (*self._folder.glob("*.part"), *self._folder.glob("*.parquet")):
+            try:
+                if time.time() - path.stat().st_mtime > ABANDONED_S:
+                    path.unlink()
+            except OSError:  # its writer has just finished it
+                continue
 
     def __enter__(self) -> "SummaryCache":
         """Use as a context manager."""

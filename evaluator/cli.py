@@ -39,6 +39,8 @@ def evaluate(
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
     goal: float | None = None,
     force: bool = False,
+    everything: Annotated[bool, Parameter(name="--all")] = False,
+    latex: bool = False,
     tables: Annotated[TableOptions, Parameter(name="*")] = AS_SAVED,
     images: Annotated[ImageOptions, Parameter(name="*")] = IMAGES,
     live: Annotated[LiveConfig, Parameter(name="*")] = LIVE,
@@ -66,6 +68,8 @@ def evaluate(
         goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
+        everything: Show and write the tables that nobody decides by, and list every number.
+        latex: Write the headline tables as LaTeX, too.
         tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
         live: Follow a session instead of evaluating what is there.
@@ -87,6 +91,8 @@ def evaluate(
         tables=tables,
         images=images,
         force=force,
+        everything=everything,
+        latex=latex,
         check_published=check_published,
         against=against,
         reviews=reviews,
@@ -103,15 +109,15 @@ def _evaluate(
     output: Output,
 ) -> int:
     """Compare, write and say; return the exit code."""
-    from evaluator.report.figures.beside import beside
     from evaluator.report.write import summary_text, write_report
     from evaluator.thresholds import missed
 
     began_ns = time.time_ns()
     published = _recomputed(asked)
-    second = beside(sources[0] if sources else None)
     comparison, folder = _found(sources, asked, published, output)
-    written = write_report(comparison, out or folder, second)
+    written = write_report(
+        comparison, out or folder, everything=asked.everything, latex=asked.latex
+    )
     results = written.content
     if len(sources) == 1 and written.results == sources[0] / RESULTS:
         from bridge.episode.run_folder import RunFolder
@@ -185,6 +191,8 @@ class _Asked:
     tables: TableOptions
     images: ImageOptions
     force: bool
+    everything: bool
+    latex: bool
     check_published: Path | None
     against: Path | None
     reviews: Sequence[Path]

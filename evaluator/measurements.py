@@ -35,7 +35,6 @@ from evaluator.statistics import (
     power,
     prediction_powered,
     sequential,
-    strata,
 )
 
 # ruff: noqa: E501  # one line for each definition
@@ -166,40 +165,12 @@ BOSCHLOO_POOLED = _new(
     differences.boschloo,
     "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
 )
-MANTEL_HAENSZEL = _new(
-    "unpaired.mantel_haenszel_pp.{side}",
-    "pp",
-    "higher",
-    strata.mantel_haenszel,
-    "gain with replanning over {count} tasks, starts not paired, each task compared within itself (Mantel-Haenszel weights; {side})",
-)
-MANTEL_HAENSZEL_P = _new(
-    "unpaired.mantel_haenszel_p.{side}",
-    "1",
-    "none",
-    strata.mantel_haenszel,
-    "two-sided Cochran-Mantel-Haenszel test of that gain, no continuity correction ({side})",
-)
 TRIALS_NEEDED = _new(
     "power.trials_needed.{side}.{task}.{policy}",
     "count",
     "none",
     power.trials_needed,
     "per condition, to show a gain as large as {about} with {power}",
-)
-POWER_UNPAIRED = _new(
-    "power.this_large.{side}.{task}.{policy}",
-    "1",
-    "none",
-    power.power_unpaired,
-    "chance that {arm} per condition show a gain as large as {about}, were it true; two-sided at {alpha:g}, normal approximation",
-)
-DETECTABLE_RATE = _new(
-    "power.detectable_rate.{side}.{task}.{policy}",
-    "1",
-    "none",
-    power.detectable_rate,
-    "smallest better rate that {arm} per condition tell from {percent:.0f} % with {power} ({side})",
 )
 PAIRED_GAIN = _new(
     "paired.gain_pp.{side}",
@@ -221,13 +192,6 @@ PAIRED_PROGRESS_P = _new(
     "none",
     differences.sign_test,
     "two-sided sign test with mid-p of the same: {words}",
-)
-PAIRED_POWER = _new(
-    "power.paired.{side}",
-    "1",
-    "none",
-    power.power_paired,
-    "chance that McNemar's exact test on {count} pairs is significant at 0.05 if these shares are true: {words}",
 )
 MCNEMAR = {
     kind: _new(
@@ -552,27 +516,6 @@ BREAK_EVEN_PRICE = _new(
     gate.break_even,
     "bad executions avoided / good plans refused, by verdicts that were not obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
 )
-FACTOR_NPV = _new(
-    "gate.clause.{clause}.npv",
-    "1",
-    "higher",
-    intervals.wilson,
-    "trials that failed / trials where planned-in-twin failed first in {clause}",
-)
-CLAUSE_REFUSED = _new(
-    "gate.clause.{by}.{clause}.refused",
-    "1",
-    "none",
-    intervals.wilson,
-    "trials in which {name} said no / trials in which it was decided ({side})",
-)
-CLAUSE_RIGHT = _new(
-    "gate.clause.{by}.{clause}.right",
-    "1",
-    "higher",
-    intervals.wilson,
-    "trials that failed / trials in which {name} said no ({side})",
-)
 _WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
 BRIER = _new(
     "reliability.brier",
@@ -637,13 +580,6 @@ PROXY_RATE = _new(
     prediction_powered.post_stratified,
     "recorded success rate with the twin's help: strata of the twin's answer, each with a Beta(1/2, 1/2) prior; {many}",
 )
-PROXY_RATE_PPI = _new(
-    _PROXY.format(name="recorded_rate_ppi"),
-    "1",
-    "higher",
-    prediction_powered.ppi_plus_plus,
-    "the same by PPI++ (normal approximation); {many}",
-)
 TRIALS_SAVED = _new(
     _PROXY.format(name="trials_saved"),
     "count",
@@ -664,13 +600,6 @@ STARTS_ALIKE_P = _new(
     "none",
     prediction_powered.starts_alike,
     "p of the permutation test on the energy distance that the starts with a robot trial and those only the twin has were drawn alike: small forbids the estimates{compared}",
-)
-STARTS_COVERED = _new(
-    _PROXY.format(name="starts_covered"),
-    "1",
-    "higher",
-    prediction_powered.starts_covered,
-    "share of the starts only the twin has that lie no further from a tried start than tried starts lie from their neighbours; alike, n tried ones cover about n / (n + 1){compared}",
 )
 SEQUENCE = _new(
     "sequence.recorded.{task}.{condition}.{policy}",

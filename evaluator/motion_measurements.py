@@ -55,89 +55,8 @@ MOTIONS = {
 }
 """By the field of ``MotionSummary`` they are the mean of."""
 
-_DISTANCES = (
-    (
-        "mean_over_pairs_m",
-        "m",
-        "distance over normalised time, mean over all (recorded, simulated) pairs of runs",
-    ),
-    ("between_mean_curves_m", "m", "distance of the two mean curves, mean over normalised time"),
-    ("max_between_mean_curves_m", "m", "largest distance of the two mean curves"),
-    ("end_point_over_pairs_m", "m", "distance of the end points, mean over all pairs of runs"),
-    ("end_point_between_means_m", "m", "distance of the mean end points"),
-    (
-        "turned_over_pairs_rad",
-        "rad",
-        "angle between what both turned since they began, over normalised time, mean over all (recorded, simulated) pairs of runs",
-    ),
-)
 WHOLE = "whole recordings, waiting at their ends included"
 MOVING = f"the moving part only, from leaving the start to arriving at the end, each within {trajectory.MOVING_THRESHOLD_M * 1000:.0f} mm"
-_PARTS = (("", WHOLE), ("moving_", MOVING))
-_BAND = "bands.{task}.{engine}."
-BAND_DISTANCES = {
-    prefix: {
-        name: _new(
-            f"{_BAND}{prefix}{name}",
-            unit,
-            "lower",
-            trajectory.band_distance,
-            f"{{what}}: {words}; {part}",
-        )
-        for name, unit, words in _DISTANCES
-    }
-    for prefix, part in _PARTS
-}
-"""By ``moving_`` or nothing, then by the field of ``BandDistance``."""
-BAND_MEDIAN = {
-    prefix: _new(
-        f"{_BAND}{prefix}median_over_recorded_m",
-        "m",
-        "lower",
-        trajectory.band_distance,
-        f"{{what}}: median over recorded runs of the mean distance to these simulated runs, so where another recorded run would lie; {part}",
-    )
-    for prefix, part in _PARTS
-}
-BAND_ALONG_PATH = _new(
-    f"{_BAND}moving_along_path_m",
-    "m",
-    "lower",
-    trajectory.path_distance_m,
-    f"{{what}}: distance at equal shares of the way, whatever the speed, mean over all (recorded, simulated) pairs of runs; {MOVING}",
-)
-BAND_WITHOUT_OFFSET = _new(
-    f"{_BAND}moving_without_offset_m",
-    "m",
-    "lower",
-    trajectory.without_rigid_motion,
-    f"{{what}}: distance of the two mean curves after the best rigid motion is taken out, mean over normalised time; {MOVING}",
-)
-BAND_WIDTH = 2.0
-"""The recorded band reaches this many of its root mean square distances from its mean curve."""
-INSIDE_BAND = _new(
-    f"{_BAND}moving_inside_band",
-    "1",
-    "higher",
-    trajectory.band_distance,
-    f"share of normalised time in which the simulated mean curve is nearer to the recorded one than {BAND_WIDTH:g} root mean square distances of the recorded runs from it; {MOVING}",
-)
-REPEATABILITY = {
-    name: _new(
-        f"repeatability.{{task}}.{{side}}.{name}",
-        "m",
-        "lower",
-        trajectory.repeatability,
-        f"end effector, spread of {{count}} {{side}} runs: {words}",
-    )
-    for name, words in (
-        ("mean_m", "root mean square distance from the mean curve, mean over normalised time"),
-        ("worst_m", "root mean square distance from the mean curve at its worst instant"),
-        ("end_point_m", "root mean square distance from the mean end point"),
-    )
-}
-"""By the field of ``Repeatability``."""
-
 _BODY = "body.{task}.{engine}.{body}."
 BODY_DISTANCES = {
     name: _new(

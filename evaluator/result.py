@@ -11,6 +11,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
@@ -282,33 +284,15 @@ def load_results(path: Path) -> Results:
 
 
 def _from_record(record: Mapping[str, Any]) -> Results:
-    lists = [tuple(episodes) for episodes in record.get("episode_lists", ())]
-    return Results(
-        run=record["run"],
-        source=record["source"],
-        stand_in=record["stand_in"],
-        measurements=tuple(_measurement(item, lists) for item in record["measurements"]),
-        tables=tuple(_table(item) for item in record["tables"]),
-        exclusions=tuple(Exclusion(**item) for item in record["exclusions"]),
-        missing=tuple(record["missing"]),
-        provenance=record["provenance"],
-    )
-
-
-def _measurement(record: Mapping[str, Any], lists: list[tuple[str, ...]]) -> Measurement:
-    interval = record.get("interval")
-    values = dict(record)
-    values["interval"] = None if interval is None else Interval(**interval)
-    episodes = record["episodes"]
-    if isinstance(episodes, int) and episodes >= len(lists):
-        message = f"{record['id']} names list {episodes} of {len(lists)} lists of episodes"
-        raise ValueError(message)
-    values["episodes"] = lists[episodes] if isinstance(episodes, int) else tuple(episodes)
-    return Measurement(**values)
-
-
-def _table(record: Mapping[str, Any]) -> Table:
-    values = dict(record)
-    values["columns"] = tuple(record["columns"])
-    values["rows"] = tuple(tuple(row) for row in record["rows"])
-    return Table(**values)
+    lists = record.get("episode_lists", [])
+    for item in record["measurements"]:
+        place = item["episodes"]  # version 1 wrote each list out
+        if isinstance(place, int):
+            if place >= len(lists):
+                message = f"{item['id']} names list {place} of {len(lists)} lists of episodes"
+                raise ValueError(message)
+            item["episodes"] = lists[place]
+    try:
+        return msgspec.convert(record, Results)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from error

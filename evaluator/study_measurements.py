@@ -1,7 +1,7 @@
-"""Measurements of a study: gains of its arms, its drift, and its protocol."""
+"""Measurements of a study: gains of its arms, and its protocol."""
 
 from evaluator.quantity import new_quantity
-from evaluator.statistics import differences, intervals, strata
+from evaluator.statistics import differences, intervals
 
 # ruff: noqa: E501  # one line for each definition
 
@@ -47,20 +47,6 @@ STUDY_NOT_EXECUTED = new_quantity(
     "lower",
     None,
     "share of starts on which the arm {arm} executed nothing: {words}",
-)
-DRIFT = new_quantity(
-    "session.drift_pp",
-    "pp",
-    "none",
-    strata.drift,
-    "change of recorded success from the first to the last trial of the session, slope over the order of trials within task, policy and condition",
-)
-DRIFT_P = new_quantity(
-    "session.drift_p",
-    "1",
-    "none",
-    strata.drift,
-    "two-sided p of that trend (Mantel's extension test)",
 )
 PROTOCOL_DEPARTURES = new_quantity(
     "protocol.departures",

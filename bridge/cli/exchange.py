@@ -382,39 +382,6 @@ def import_images(
     return 0
 
 
-def import_kinova(folder: Path, run: Path, /, *, output: Output = OUTPUT) -> int:
-    """Turn the Kinova reality-gap runs into episodes: real ones recorded, simulated ones derived.
-
-    Example: robot-gst import kinova data/kinova runs/kinova
-
-    Args:
-        folder: Folder with real/Experiment1/*.tsv and sim/Experiment1/*.csv.
-        run: Run folder; made where needed.
-        output: How to talk.
-    """
-    from bridge.episode.run_folder import RunFolder
-    from bridge.exchange.kinova import KinovaFormatError, find_runs, import_runs
-
-    total = sum(map(len, find_runs(folder)))
-    files, real, skipped = [], 0, list[KinovaFormatError]()
-    with output.progress("import", total) as advance:
-        for path, imported in import_runs(folder, RunFolder.create(run), skipped):
-            files.append(str(path))
-            real += imported.engine is None
-            advance(len(files) + len(skipped), path.name)
-    simulated = len(files) - real
-    data = {
-        "real": real,
-        "simulated": simulated,
-        "files": files,
-        "skipped": [str(fault) for fault in skipped],
-    }
-    lines = [f"{real} real and {simulated} simulated runs in {run}"]
-    lines += [f"skipped: {fault}" for fault in skipped]
-    output.result(data, "\n".join(lines))
-    return 0
-
-
 def import_rosbag2(
     bag: Path,
     run: Path,

@@ -1,1 +1,1 @@
-"""Other people's formats in: RGB-D folders, Kinova reality-gap runs, CSV trials."""
+"""Other people's formats in: RGB-D folders, CSV trials."""

@@ -1,11 +1,11 @@
-"""How much an image is like another one: PSNR, SSIM and MS-SSIM of RGB images, in float64.
+"""How much an image is like another one: PSNR and SSIM of RGB images, in float64.
 
 SSIM has three customs at the border of an image; all three are here. Every number is computed on
 8-bit images scaled to 0..1, so that rebuild and evaluation give the same one of the same files.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -161,8 +161,6 @@ class Band:
     channel: int
     rows: slice
     similar: Float64[np.ndarray, "num_rows num_columns"]
-    structure: Float64[np.ndarray, "num_rows num_columns"]
-    """Contrast times structure: SSIM without brightness."""
 
 
 class SlidWindow:
@@ -272,11 +270,11 @@ class SlidWindow:
         mean_u += mean_v
         similar /= mean_u
         similar *= structure
-        similar, structure = similar[:, : self.columns], structure[:, : self.columns]
+        similar = similar[:, : self.columns]
         if self._spoilt is not None:
             spoilt = self._spoilt[rows, :, channel]
-            similar[spoilt] = structure[spoilt] = np.nan
-        return Band(channel=channel, rows=rows, similar=similar, structure=structure)
+            similar[spoilt] = np.nan
+        return Band(channel=channel, rows=rows, similar=similar)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,11 +329,6 @@ PADDINGS: dict[Padding, str] = {
 }
 """In words, for stamps."""
 
-SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-"""Exponents of MS-SSIM from full size to a sixteenth."""
-MS_SSIM_MIN_PX = WINDOW << (len(SCALE_WEIGHTS) - 1)
-"""Shortest side [px] whose smallest scale still holds one window."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SsimMaps:
@@ -343,8 +336,6 @@ class SsimMaps:
 
     zero: Float[np.ndarray, "height width channels"]
     reflect: Float[np.ndarray, "height width channels"]
-    structure: Float[np.ndarray, "inner_height inner_width channels"]
-    """Contrast times structure, of windows inside the image."""
 
     @property
     def valid(self) -> Float[np.ndarray, "inner_height inner_width channels"]:
@@ -393,13 +384,8 @@ def ssim_maps(
         UndefinedStatisticError: When the image is smaller than the window.
     """
     _refuse_small(recorded, replayed)
-    zero, structure = _maps(recorded, replayed, "zero")
-    inner = slice(BORDER, -BORDER)
-    return SsimMaps(
-        zero=zero,
-        reflect=_with_mirrored_border(zero, recorded, replayed),
-        structure=structure[inner, inner],
-    )
+    zero = _maps(recorded, replayed, "zero")
+    return SsimMaps(zero=zero, reflect=_with_mirrored_border(zero, recorded, replayed))
 
 
 def ssim(
@@ -432,56 +418,6 @@ def ssim(
     return math.fsum(float(band.similar.sum()) for band in window.bands()) / window.size
 
 
-def ms_ssim(
-    recorded: Float[np.ndarray, "height width channels"],
-    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
-    *,
-    padding: Literal["valid", "reflect"] = "valid",
-    first: SsimMaps | None = None,
-    weights: Sequence[float] = SCALE_WEIGHTS,
-) -> float:
-    """Return the multi-scale structural similarity (Wang, Simoncelli, Bovik 2003).
-
-    Five scales, each half the last by the mean of 2 x 2 pixels (an odd last row or column is
-    dropped); contrast times structure of each scale, SSIM of the last, averaged over pixels and
-    channels, negative means as 0, raised to ``SCALE_WEIGHTS`` and multiplied.
-
-    Args:
-        recorded: In 0..1.
-        replayed: In 0..1.
-        padding: Of the last scale's SSIM: ``valid`` as the paper has it, ``reflect`` as
-            torchmetrics computes it.
-        first: The maps of the full size, where they are known.
-        weights: Exponents of the scales, full size first.
-
-    Range: 0 to 1, 1 is identical. Undefined when: a side is shorter than ``MS_SSIM_MIN_PX``.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: With the reason.
-    """
-    check_same_shape(recorded, replayed)
-    if min(recorded.shape[:2]) < MS_SSIM_MIN_PX:
-        raise UndefinedStatisticError(
-            statistic="MS-SSIM",
-            reason=f"a side is shorter than {MS_SSIM_MIN_PX} pixels, which five scales need",
-        )
-    product = 1.0
-    for weight in weights[:-1]:
-        structure = _structure(recorded, replayed) if first is None else first.structure.mean()
-        product *= max(float(structure), 0.0) ** weight
-        recorded, replayed, first = _halved(recorded), _halved(replayed), None
-    last = ssim(recorded, replayed, padding=padding)
-    return float(product * max(last, 0.0) ** weights[-1])
-
-
-def _halved(image: np.ndarray) -> np.ndarray:
-    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    even = image[:height, :width]
-    upper = even[0::2, 0::2] + even[0::2, 1::2]
-    return np.asarray((upper + even[1::2, 0::2] + even[1::2, 1::2]) / 4.0)
-
-
 def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
     check_same_shape(recorded, replayed)
     if min(recorded.shape[:2]) < WINDOW:
@@ -491,23 +427,13 @@ def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
-def _structure(recorded: np.ndarray, replayed: np.ndarray) -> float:
-    """Average contrast times structure over the windows inside the image."""
-    window = SlidWindow(recorded, replayed, "valid")
-    return math.fsum(float(band.structure.sum()) for band in window.bands()) / window.size
-
-
-def _maps(
-    recorded: np.ndarray, replayed: np.ndarray, padding: Padding
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return SSIM, and its contrast-structure factor, around every window centre."""
+def _maps(recorded: np.ndarray, replayed: np.ndarray, padding: Padding) -> np.ndarray:
+    """Return SSIM around every window centre."""
     window = SlidWindow(recorded, replayed, padding)
     similar = np.empty((window.channels, window.rows, window.columns))
-    structure = np.empty_like(similar)
     for band in window.bands():
         similar[band.channel, band.rows] = band.similar
-        structure[band.channel, band.rows] = band.structure
-    return np.moveaxis(similar, 0, -1), np.moveaxis(structure, 0, -1)
+    return np.asarray(np.moveaxis(similar, 0, -1))
 
 
 def _with_mirrored_border(
@@ -524,5 +450,5 @@ def _with_mirrored_border(
         ((whole, far), (both, after), whole, slice(-BORDER, None)),
     ):
         a, b = (np.pad(i[seen], (*beyond, (0, 0)), mode="reflect") for i in (recorded, replayed))
-        reflect[rows, columns] = _maps(a, b, "valid")[0]
+        reflect[rows, columns] = _maps(a, b, "valid")
     return reflect

@@ -1,7 +1,7 @@
 """Do the twin's success rates of groups follow the recorded ones, and how far off are they?"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 
@@ -34,12 +34,11 @@ from evaluator.statistics.agreement import Number, counted_groups, fisher_interv
 from evaluator.statistics.bootstrap import (
     GroupSample,
     Remeasured,
-    refuse_no_width,
     remeasure_counts,
     remeasure_paired,
     student_interval,
 )
-from evaluator.statistics.coverage import Choice, choose_method, vouch
+from evaluator.statistics.coverage import vouch
 
 SEED = 0
 """Resampling is seeded: the same groups give the same interval."""
@@ -59,29 +58,25 @@ def sides(groups: Sequence[RateGroup]) -> tuple[list[Fraction], list[Fraction]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """An interval, or the reason why there is none, with where its coverage is stored."""
+    """An interval, or the reason why there is none."""
 
     interval: Interval | None
     reason: str
-    choice: Choice
+    key: str
+    """Its name in ``coverage.HOLDS_FROM``."""
     num_units: int
     """Groups or clusters of groups: what coverage depends on."""
 
 
 class GroupIntervals:
-    """The intervals of some groups: what belongs together is found once, resamples drawn once."""
+    """The intervals of some groups: what belongs together is found once."""
 
     def __init__(self, groups: Sequence[RateGroup]) -> None:
-        """Prepare; nothing is drawn before the first interval.
-
-        Args:
-            groups: With both rates.
-        """
+        """Prepare; both rates of each group are known."""
         self._groups = list(groups)
         self.num_groups = len(self._groups)
         self._recorded, self._sim = sides(groups)
         self._clusters, self.num_units, self.unit = clusters_of(groups)
-        self._sample: GroupSample | None = None
 
     @property
     def kind(self) -> str:
@@ -97,37 +92,29 @@ class GroupIntervals:
         return headline_interval(statistic, self._groups)
 
     def of(self, statistic: str) -> Found:
-        """Return the interval by the method whose stored coverage is best.
+        """Return Fisher's interval of r, Student's of the bias, and the jackknife's of others.
 
         Args:
             statistic: A name in ``weighted.STATISTICS``.
         """
-        choice = choose_method(statistic, self.kind, self.num_units)
-        if choice.method == "student-t" and not self._means():
-            key = f"jackknife-{self.kind}:{statistic}"
-            choice = replace(choice, method="jackknife", key=key)
-        interval, reason = None, ""
+        interval, reason, key = None, "", f"jackknife-{self.kind}:{statistic}"
+        is_fisher = (statistic, self.kind) == ("pearson", "points")
         try:
-            interval = self._make(statistic, choice)
+            if is_fisher:
+                key = "fisher-z"
+                interval = fisher_interval(pearson(self._recorded, self._sim), self.num_groups)
+            elif statistic == "bias" and (means := self._means()):
+                key = "student-t:bias"
+                interval = student_interval(means)
+            else:
+                clusters = None if self.kind == "points" else self._clusters
+                sample = GroupSample(recorded=self._recorded, sim=self._sim, clusters=clusters)
+                interval = sample.interval(statistic)
         except UndefinedStatisticError as error:
             reason = f"{self.num_units} {self.unit}: {error.reason}"
             if self.num_units < MIN_CLUSTERS:
-                reason = self._too_few(choice.method)
-        return Found(interval=interval, reason=reason, choice=choice, num_units=self.num_units)
-
-    def _make(self, statistic: str, choice: Choice) -> Interval:
-        if choice.method == "fisher-z":
-            return fisher_interval(pearson(self._recorded, self._sim), len(self._groups))
-        if choice.method == "student-t":
-            return student_interval(self._means())
-        if self._sample is None:
-            self._sample = GroupSample(
-                recorded=self._recorded,
-                sim=self._sim,
-                rng=np.random.default_rng(SEED),
-                clusters=None if self.kind == "points" else self._clusters,
-            )
-        return refuse_no_width(self._sample.interval(statistic, choice.method))
+                reason = self._too_few(is_fisher=is_fisher)
+        return Found(interval=interval, reason=reason, key=key, num_units=self.num_units)
 
     def _means(self) -> list[Fraction]:
         """Mean gap of each unit; none where the units differ in size, for then means do too."""
@@ -138,9 +125,9 @@ class GroupIntervals:
             return []
         return [sum(gaps, Fraction(0)) / len(gaps) for gaps in members.values()]
 
-    def _too_few(self, method: str) -> str:
+    def _too_few(self, *, is_fisher: bool) -> str:
         if self.unit == "groups":
-            name = "Fisher's interval" if method == "fisher-z" else "an interval over groups"
+            name = "Fisher's interval" if is_fisher else "an interval over groups"
             return f"{counted_groups(self.num_units)}; {name} needs {MIN_CLUSTERS}"
         why = "groups share tasks across conditions" if _is_shared(self._groups) else ""
         why = why or "groups share policies or tasks"
@@ -219,13 +206,12 @@ def interval_table(
         Table(
             id="agreement_intervals",
             title="How certain is the agreement?",
-            columns=("statistic", "over", "low", "high", "method", "least coverage", "reason"),
+            columns=("statistic", "over", "low", "high", "method", "reason"),
             rows=tuple(rows),
             note="95 %. Two questions: where the number would be for other groups of the same "
             "kind, and where it would fall if these were measured again with as many trials. "
             "Hierarchical: the model of all counts, which takes out the noise of counting; it is "
-            "the interval of the number itself. Beside it the classic method with the best "
-            "coverage in the stored map; least coverage is the least in it.",
+            "the interval of the number itself. Beside it the classic method.",
         ),
     )
 
@@ -233,9 +219,7 @@ def interval_table(
 def _vouched(found: Found) -> tuple[Interval | None, str]:
     if found.interval is None:
         return None, ""
-    return vouch(
-        found.interval, found.num_units, key=found.choice.key, instead=found.choice.instead
-    )
+    return vouch(found.interval, found.num_units, key=found.key)
 
 
 def _band(
@@ -251,16 +235,15 @@ def _band(
         band = again.band(statistic)
     except UndefinedStatisticError as error:
         return _shown(None, error.reason, factor)
-    key = f"remeasurement:{statistic}".removesuffix(":pearson")
-    kept, refusal = vouch(band, intervals.num_groups, key=key)
+    kept, refusal = vouch(band, intervals.num_groups, key=f"remeasurement:{statistic}")
     return _shown(kept, refusal, factor)
 
 
 def _shown(interval: Interval | None, reason: str, factor: float) -> tuple[Cell, ...]:
     if interval is None:
-        return None, None, None, None, reason
+        return None, None, None, reason
     ends = (round(factor * interval.low, 4), round(factor * interval.high, 4))
-    return *ends, interval.method, interval.worst_coverage, None
+    return *ends, interval.method, None
 
 
 Statistic = Callable[[], float]
@@ -327,11 +310,11 @@ def measure_over(
     value: Statistic,
     **parts: str,
 ) -> Measurement:
-    """Measure one statistic with the interval that the coverage map chooses for it.
+    """Measure one statistic with its interval.
 
     Args:
         groups: With both rates.
-        intervals: Of the groups; the model's goes before the map's.
+        intervals: Of the groups; the model's goes first.
         what: Says over which groups.
         quantity: Percentage points or 1.
         statistic: A name in ``weighted.STATISTICS``.
@@ -353,7 +336,11 @@ def measure_over(
             )
         return factor * value(), interval
 
-    resampled = f"; interval: {intervals.unit} resampled" if intervals.kind == "clusters" else ""
+    resampled = (
+        f"; interval: one of {intervals.num_units} {intervals.unit} left out at a time"
+        if intervals.kind == "clusters"
+        else ""
+    )
     if model is not None:
         resampled = (
             "; interval: of true rates over other groups like these, all counts in one model"
@@ -366,8 +353,7 @@ def measure_over(
         reason_without_interval=found.reason,
         episodes=_episodes(groups),
         interval_n=found.num_units,
-        coverage_key=found.choice.key if model is None else "",
-        instead=found.choice.instead,
+        coverage_key=found.key if model is None else "",
     )
 
 
@@ -439,5 +425,4 @@ def _remeasured(groups: Sequence[RateGroup], intervals: GroupIntervals, what: st
         counted="group",
         reason_without_interval="r is exactly 1 or -1, or no other outcome changes it",
         episodes=_episodes(groups),
-        coverage_key="remeasurement",
     )

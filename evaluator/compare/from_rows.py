@@ -24,8 +24,6 @@ from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
-from evaluator.compare.sensitivity import sensitivity_table
-from evaluator.compare.session_order import session_order
 from evaluator.compare.stages import divergence_table, failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -57,12 +55,10 @@ class _Found:
     measurements: tuple[Measurement, ...]
     exclusions: tuple[Exclusion, ...]
     gains: list[Measurement]
-    again_tables: tuple[Table, ...]
     study_tables: tuple[Table, ...]
     gate_tables: tuple[Table, ...]
-    """What the gate is scorecard, and whether its success probability can be relied on."""
+    """The gate's scorecard."""
     stage_tables: tuple[Table, ...]
-    decision_tables: tuple[Table, ...]
 
 
 def compare_rows(
@@ -113,12 +109,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     pairs, unpaired = pair_starts(rows)
     scorecard, scorecard_tables = gate_scorecard(rows)
     beside, beside_tables = baseline_results(rows)
-    kept, kept_tables = reliability(rows)
-    again, again_tables = varied_sim(rows)
     stages, stage_tables, other_stages = stage_results(rows)
-    drifted, order_tables = session_order(rows)
-    chosen, decision_tables = decisions(groups)
-    modelled, model_tables = model_results(usable_groups(groups))
     study, study_tables, void = study_results(rows, void_causes, method=method)
     measurements = (
         *rates,
@@ -128,20 +119,19 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *group_agreement(groups),
         *gains,
         *gain_tests(groups),
-        *again,
+        *varied_sim(rows),
         *varied_agreement(rows, groups),
         *study,
         *paired_gain(pairs),
         *paired_progress(pairs),
         *start_distances(pairs),
         *never_sent(rows),
-        *drifted,
         *beside,
         *scorecard,
-        *kept,
+        *reliability(rows),
         *stages,
-        *chosen,
-        *modelled,
+        *decisions(groups),
+        *model_results(usable_groups(groups)),
         *assisted_rates(rows),
         *sequences(rows, pairs),
     )
@@ -150,11 +140,9 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         measurements=measurements,
         exclusions=(*unpaired, *void, *other_stages),
         gains=gains,
-        again_tables=again_tables,
         study_tables=study_tables,
-        gate_tables=(*beside_tables, *scorecard_tables, *kept_tables),
+        gate_tables=(*beside_tables, *scorecard_tables),
         stage_tables=stage_tables,
-        decision_tables=(*model_tables, *decision_tables, *order_tables),
     )
 
 
@@ -169,7 +157,6 @@ def _tables(
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
         *found.study_tables,
-        *found.again_tables,
         *notes_table(notes(groups, measurements)),
         *agreement_intervals(groups),
         confusion_table(rows, word),
@@ -177,10 +164,8 @@ def _tables(
         *found.stage_tables,
         *failures_table(rows, word),
         *divergence_table(rows),
-        *found.decision_tables,
         *axis_tables(rows, word),
         *progress_table(rows, word),
-        *sensitivity_table(rows),
         *stopping_table(rows, goal),
         *(() if is_streamed(rows) else (trials_table(rows, word),)),
     )

@@ -15,19 +15,14 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     BOSCHLOO,
     BOSCHLOO_POOLED,
-    DETECTABLE_RATE,
     GAIN_POINTS,
     GAIN_POINTS_AVERAGE,
     GAIN_RELATIVE,
     GAIN_RELATIVE_AVERAGE,
-    MANTEL_HAENSZEL,
-    MANTEL_HAENSZEL_P,
     MCNEMAR,
     PAIRED_GAIN,
-    PAIRED_POWER,
     PAIRED_PROGRESS,
     PAIRED_PROGRESS_P,
-    POWER_UNPAIRED,
     START_DISTANCE,
     TRIALS_NEEDED,
 )
@@ -45,12 +40,8 @@ from evaluator.statistics.intervals import relative_gain
 from evaluator.statistics.power import (
     ALPHA,
     POWER,
-    detectable_rate,
-    power_paired,
-    power_unpaired,
     trials_needed,
 )
-from evaluator.statistics.strata import mantel_haenszel
 
 START_LIMIT_M = 0.03
 """Paired trials whose objects started further apart than this are not the same start."""
@@ -168,7 +159,6 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
         worsened = sum(before and not after for before, after in answers)
         words = f"{improved} improved, {worsened} worsened of {len(known)} paired starts ({side})"
         measurements.append(_paired_points(side, known, improved, worsened, words))
-        measurements.append(_paired_power(side, known, improved, worsened, words))
         for kind, quantity in MCNEMAR.items():
             measurements.append(
                 measured(
@@ -241,23 +231,6 @@ def _paired_points(
         n=len(known),
         counted="pair",
         episodes=[r.episode for pair in known for r in (pair.before, pair.after)],
-    )
-
-
-def _paired_power(
-    side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
-) -> Measurement:
-    def power() -> float:
-        if not known:
-            raise UndefinedStatisticError(statistic="paired power", reason="there are no pairs")
-        return power_paired(improved / len(known), worsened / len(known), len(known))
-
-    return measured(
-        PAIRED_POWER.of(side=side, count=len(known), words=words),
-        power,
-        n=len(known),
-        counted="pair",
-        reason_without_interval="a plan, not an estimate",
     )
 
 
@@ -336,7 +309,6 @@ def gain_tests(groups: Sequence[RateGroup]) -> list[Measurement]:
             measurements += _tests(change)
         if len(mine) > 1:
             measurements.append(_pooled_test(mine, side))
-            measurements += _over_strata(mine, side)
     return measurements
 
 
@@ -439,16 +411,6 @@ def _tests(change: Change) -> list[Measurement]:
             lambda: float(trials_needed(p_first, p_second)),
             reason_without_interval="a plan, not an estimate",
         ),
-        make(
-            POWER_UNPAIRED.of(**parts, about=about, arm=arm, alpha=ALPHA),
-            lambda: power_unpaired(p_first, p_second, arm),
-            reason_without_interval="a plan, not an estimate",
-        ),
-        make(
-            DETECTABLE_RATE.of(**parts, arm=arm, percent=100 * p_first, power=power),
-            lambda: detectable_rate(p_first, arm),
-            reason_without_interval="a plan, not an estimate",
-        ),
     ]
 
 
@@ -471,35 +433,6 @@ def _pooled_test(mine: Sequence[Change], side: str) -> Measurement:
         counted="task",
         reason_without_interval="a p-value",
     )
-
-
-def _over_strata(mine: Sequence[Change], side: str) -> list[Measurement]:
-    tables = [change.counts for change in mine if change.counts is not None]
-    make = partial(
-        measured,
-        n=len(mine),
-        counted="task",
-        episodes=[name for c in mine for name in (*c.before.episodes, *c.after.episodes)],
-    )
-
-    def compute(name: str) -> float:
-        if len(tables) < len(mine):
-            reason = "the number of trials of a task is not known"
-            raise UndefinedStatisticError(statistic="Mantel-Haenszel test", reason=reason)
-        return float(getattr(mantel_haenszel(tables), name))
-
-    return [
-        make(
-            MANTEL_HAENSZEL.of(side=side, count=len(mine)),
-            lambda: 100 * compute("difference"),
-            reason_without_interval="its p-value is beside it; the model's mean gain has one",
-        ),
-        make(
-            MANTEL_HAENSZEL_P.of(side=side),
-            lambda: compute("p"),
-            reason_without_interval="a p-value",
-        ),
-    ]
 
 
 def _mean(measurements: Sequence[Measurement]) -> float:

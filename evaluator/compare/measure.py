@@ -141,7 +141,7 @@ def measured(
         reason_without_interval: Said where there is no interval.
         episodes: Ids of the episodes that the number rests on.
         interval_n: What the coverage of the interval depends on, where it is not ``n``.
-        coverage_key: Name in the coverage map, where one method serves several statistics.
+        coverage_key: Name in ``coverage.HOLDS_FROM``, where one method serves several statistics.
         instead: What to use where the interval is refused; what its method says without.
     """
     value: float | None = None

@@ -26,14 +26,13 @@ from evaluator.measurements import (
     MODEL_WITHIN,
     Defined,
 )
-from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.result import Interval, Measurement
 from evaluator.statistics.group_likelihood import GroupCounts
 from evaluator.statistics.hierarchical import (
     AgreementModel,
     Estimate,
     chosen_is_best,
     estimate,
-    ranking,
 )
 
 HEADLINE_FROM = 4
@@ -108,18 +107,18 @@ def headline_interval(statistic: str, groups: Sequence[RateGroup]) -> Interval |
 
 def model_results(
     groups: Sequence[RateGroup],
-) -> tuple[list[Measurement], tuple[Table, ...]]:
-    """Measure everything that the model says beyond the headline, and lay out groups and ranking.
+) -> list[Measurement]:
+    """Measure everything that the model says beyond the headline.
 
     Args:
         groups: With both rates.
     """
     if len(groups) < 2:
-        return [], ()
+        return []
     try:
         model = model_of(groups)
     except UndefinedStatisticError as error:
-        return [_refused(error, len(groups))], ()
+        return [_refused(error, len(groups))]
     draws = model.draws
     measurements = [
         _of(MODEL_R.of(), estimate(draws.pearson), len(groups)),
@@ -139,9 +138,7 @@ def model_results(
         measurements.append(
             _of(MODEL_BIAS_OF_GROUP.of(**parts), gap, _trials(group), 100.0, counted="trial")
         )
-    gains = _gains(groups, model)
-    ranked, table = _ranking(groups, model)
-    return [*measurements, *gains, *ranked], (_group_table(groups, model, gaps), *table)
+    return [*measurements, *_gains(groups, model), *_ranking(groups, model)]
 
 
 def _of(
@@ -192,64 +189,21 @@ def _gains(groups: Sequence[RateGroup], model: AgreementModel) -> list[Measureme
     return found
 
 
-def _group_table(
-    groups: Sequence[RateGroup], model: AgreementModel, gaps: Sequence[Estimate]
-) -> Table:
-    rows: list[dict[str, Cell]] = []
-    for place, (group, gap) in enumerate(zip(groups, gaps, strict=True)):
-        above = float((model.draws.gap[:, place] > 0).mean())
-        rows.append(
-            {
-                "group": group.label,
-                "recorded k": group.recorded.k,
-                "recorded n": group.recorded.n,
-                "recorded rate": round(float(model.draws.recorded[:, place].mean()), 3),
-                "sim k": group.sim.k,
-                "sim n": group.sim.n,
-                "sim rate": round(float(model.draws.sim[:, place].mean()), 3),
-                "bias (pp)": round(100 * gap.mean, 1),
-                "low": round(100 * gap.low, 1),
-                "high": round(100 * gap.high, 1),
-                "twin is": _direction(above),
-            }
-        )
-    return Table.of(
-        rows,
-        id="model_groups",
-        title="Rates and bias of each group, all groups in one model",
-        note="Rates are posterior means: few trials are drawn towards the other groups. 95 %. "
-        f"Optimistic or pessimistic from a probability of {CERTAIN:g} on. "
-        + (
-            "Paired trials count as pairs. "
-            if any(sum(counts.pairs) for counts in model.groups)
-            else ""
-        ),
-    )
-
-
-def _direction(above: float) -> str:
-    if above >= CERTAIN:
-        return "optimistic"
-    return "pessimistic" if above <= 1 - CERTAIN else "not known"
-
-
-def _ranking(
-    groups: Sequence[RateGroup], model: AgreementModel
-) -> tuple[list[Measurement], tuple[Table, ...]]:
-    """Rank policies, else conditions, by their mean over the tasks that all of them have."""
+def _ranking(groups: Sequence[RateGroup], model: AgreementModel) -> list[Measurement]:
+    """Ask whether the twin's best is the recorded best, over the tasks that all candidates have."""
     for kind in ("policy", "condition"):
         names = list(dict.fromkeys(getattr(group, kind) for group in groups))
         if len(names) > 1:
             break
     else:
-        return [], ()
+        return []
     others = "condition" if kind == "policy" else "policy"
     cells: dict[tuple[str, str], dict[str, int]] = {}
     for place, group in enumerate(groups):
         cells.setdefault((group.task, getattr(group, others)), {})[getattr(group, kind)] = place
     shared = [cell for cell in cells.values() if len(cell) == len(names)]
     if not shared:
-        return [], ()
+        return []
     columns = [[cell[name] for cell in shared] for name in names]
 
     def over(rates: np.ndarray) -> np.ndarray:
@@ -258,27 +212,5 @@ def _ranking(
     sim = [sum(groups[p].sim_rate or 0 for p in column) / len(column) for column in columns]
     picked = [place for place, rate in enumerate(sim) if rate == max(sim)]
     best = chosen_is_best(model.draws, picked, over)
-    ranked = ranking(names, over(model.draws.recorded))
-    twin = {item.name: item for item in ranking(names, over(model.draws.sim))}
-    rows: list[dict[str, Cell]] = [
-        {
-            kind: item.name.replace("_", " "),
-            "recorded rate": round(item.mean, 3),
-            "place": item.tie,
-            "best recorded with probability": round(item.best, 3),
-            "sim rate": round(twin[item.name].mean, 3),
-            "place in the twin": twin[item.name].tie,
-        }
-        for item in ranked
-    ]
-    table = Table.of(
-        rows,
-        id="model_ranking",
-        title=f"Ranking of {len(names)} {'policies' if kind == 'policy' else 'conditions'}",
-        note=f"Mean over the {len(shared)} tasks that all have. One place: the order to the first "
-        f"of them has a probability below {CERTAIN:g}. The twin's best, "
-        f"{' or '.join(names[p].replace('_', ' ') for p in picked)}, is the recorded best with "
-        f"probability {best:.2f}.",
-    )
     words = " or ".join(names[place] for place in picked)
-    return [_share(MODEL_BEST.of(words=words), best, len(names), kind)], (table,)
+    return [_share(MODEL_BEST.of(words=words), best, len(names), kind)]

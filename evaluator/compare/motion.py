@@ -263,9 +263,6 @@ def _or_none(compute: Callable[[], float]) -> float | None:
 
 Groups = Mapping[str, Sequence[MotionSummary]]
 """By what the motions are held against: planned, executed, or twin."""
-OVER_TIME = range(0, 101, 10)
-"""Places on the curves that the table shows, in percent of the duration."""
-NUM_WORST = 3
 
 
 def group_table(groups: Groups) -> Table:
@@ -308,65 +305,6 @@ def group_table(groups: Groups) -> Table:
     )
 
 
-def over_time_table(groups: Groups) -> Table:
-    """Errors at eleven places of the execution."""
-    rows: list[dict[str, Cell]] = []
-    for name, motions in groups.items():
-        if not motions:
-            continue
-        tool = _stacked([motion.curve_m for motion in motions])
-        joints = _stacked([m.joint_curve_rad for m in motions if m.joint_curve_rad])
-        for place in OVER_TIME:
-            arm = degrees(float(joints[:, place].mean())) if len(joints) else None
-            rows.append(
-                {
-                    "against": name,
-                    "time (% of the execution)": place,
-                    "trials": len(tool),
-                    "mean distance (mm)": millimetres(float(tool[:, place].mean())),
-                    "largest (mm)": millimetres(float(tool[:, place].max())),
-                    "joints, mean of RMS (deg)": arm,
-                }
-            )
-    return Table.of(
-        rows,
-        id="motion_over_time",
-        title="Motion errors over time",
-        note="From the first to the last instant that both sides of a trial know.",
-    )
-
-
-def _stacked(curves: Sequence[Packed]) -> Float[np.ndarray, "num_curves num_places"]:
-    """Stack curves of one length."""
-    flat = np.frombuffer(b"".join(curves), dtype=np.float64)
-    return flat.reshape(len(curves), -1) if curves else flat.reshape(0, 0)
-
-
-def worst_table(groups: Groups) -> Table:
-    """The trials with the largest distances."""
-    rows: list[dict[str, Cell]] = []
-    for name, motions in groups.items():
-        far = sorted(motions, key=lambda motion: -motion.position_max_m)[:NUM_WORST]
-        rows += [
-            {
-                "against": name,
-                "episode": motion.episode,
-                "aligned by": motion.aligned_by,
-                "largest distance (mm)": millimetres(motion.position_max_m),
-                "mean distance (mm)": millimetres(motion.position_mean_m),
-                "worst joint": motion.joint_worst,
-                "its error (deg)": degrees(motion.joint_max_rad),
-            }
-            for motion in far
-        ]
-    return Table.of(
-        rows,
-        id="motion_worst",
-        title="The largest motion errors",
-        note="The three trials with the largest distance.",
-    )
-
-
 TWIN = "twin"
 MEANING = {
     PLANNED: "recorded against the planned replay (what was commanded; the controller's tracking "
@@ -389,7 +327,7 @@ def motion_results(motions: Sequence[MotionSummary]) -> Part:
     found = [m for name, members in groups.items() for m in _measure(name, members)]
     return Part(
         measurements=tuple(found),
-        tables=(group_table(groups), over_time_table(groups), worst_table(groups)),
+        tables=(group_table(groups),),
     )
 
 

@@ -17,13 +17,11 @@ from evaluator.compare.success import Key, group_rows, names_of, of_group, trial
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     PROXY_RATE,
-    PROXY_RATE_PPI,
     RANDOM_STARTS_P,
     REPLANNING_EVIDENCE,
     SEQUENCE,
     SEQUENCE_GAIN,
     STARTS_ALIKE_P,
-    STARTS_COVERED,
     TRIALS_SAVED,
 )
 from evaluator.result import Cell, Interval, Measurement, Table
@@ -31,9 +29,7 @@ from evaluator.statistics.gate import Confusion
 from evaluator.statistics.prediction_powered import (
     applicability,
     post_stratified,
-    ppi_plus_plus,
     starts_alike,
-    starts_covered,
     trials_saved,
 )
 from evaluator.statistics.sequential import (
@@ -124,10 +120,6 @@ class StartOverlap:
         """
         return self._p_alike
 
-    def _covered(self) -> float:
-        covered, total = starts_covered(self._places.tried, self._places.others)
-        return covered / total
-
     def measurements(self, key: Key) -> list[Measurement]:
         """Measure the overlap, or say why it is not computed."""
         try:
@@ -143,10 +135,7 @@ class StartOverlap:
                 reason_without_interval=why,
                 episodes=names_of([*self._tried, *self._others]),
             )
-            for quantity, compute, why in (
-                (STARTS_ALIKE_P, self.p_alike, "a p-value"),
-                (STARTS_COVERED, self._covered, "it describes these starts"),
-            )
+            for quantity, compute, why in ((STARTS_ALIKE_P, self.p_alike, "a p-value"),)
         ]
 
 
@@ -194,16 +183,6 @@ class _Assisted:
         estimate = post_stratified(self.counts, self.alone_k, self.alone_n)
         return estimate.value, estimate.interval
 
-    def rate_ppi(self) -> tuple[float, Interval | None]:
-        self._check()
-        counts = self.counts
-        real = [True] * counts.true_positive + [False] * counts.false_positive
-        real += [True] * counts.false_negative + [False] * counts.true_negative
-        predicted = [1.0] * counts.predicted_success + [0.0] * counts.predicted_failure
-        further = [1.0] * self.alone_k + [0.0] * (self.alone_n - self.alone_k)
-        estimate = ppi_plus_plus(real, predicted, further)
-        return estimate.value, estimate.interval
-
     def saved(self) -> float:
         self._check()
         return float(trials_saved(self.counts, self.alone_k, self.alone_n))
@@ -249,7 +228,6 @@ def _assisted_rate(
         )
         for quantity, compute in (
             (PROXY_RATE, assisted.rate),
-            (PROXY_RATE_PPI, assisted.rate_ppi),
             (TRIALS_SAVED, assisted.saved),
             (RANDOM_STARTS_P, assisted.p_random),
         )

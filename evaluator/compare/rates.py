@@ -5,7 +5,7 @@ from fractions import Fraction
 from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
-from bridge.exchange.trials_rates import RateRecord, read_rates
+from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.decisions import decisions
@@ -18,19 +18,6 @@ from evaluator.compare.success import WITH, averages
 from evaluator.compare.tables import gains_table, layout_table, success_table
 from evaluator.measurements import RATE_AS_GIVEN
 from evaluator.result import Exclusion, Measurement
-
-
-def compare_rates(path: Path, *, method: str = "wilson") -> Comparison:
-    """Compare printed rates: r over groups, gains, intervals where n is known.
-
-    Args:
-        path: The rates CSV.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-
-    Raises:
-        TableError: Naming the row that contradicts itself.
-    """
-    return compare_records(read_rates(path), path, method=method)
 
 
 def compare_records(

@@ -1,6 +1,6 @@
 """What a comparison is made of: one row per recorded trial, with what the twin said of it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.executions import NO_PLAN
-from evaluator.compare.band_measurements import BandCurve, BandPath
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.motion import MotionSummary
 from evaluator.compare.states import StateSummary
@@ -97,10 +96,6 @@ class TrialRow:
     """What was said of an outcome that is not known."""
     stages: tuple[tuple[str, bool | None], ...] = ()
     """How each stage ended as labelled, in order; empty where nobody said."""
-    clauses: tuple[tuple[str, bool], ...] = ()
-    """What each clause of the planned replay's verdict said, predicates included."""
-    gate_clauses: tuple[tuple[str, bool], ...] = ()
-    """The same of the verdict before motion."""
     baselines: tuple[tuple[str, bool], ...] = ()
     """What forecasts without a twin say of the plan sent, by name; unknown ones are left out."""
     progress: float | None = None
@@ -115,20 +110,11 @@ class TrialRow:
     path: Path | None = None
     start_positions_m: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Where the objects were localised at the start, to judge pairs of starts."""
-    read_tcp_errors: Callable[[], tuple[TcpErrorSeries, ...]] | None = field(
-        default=None, repr=False, compare=False
-    )
-    """Reads the files when asked: ten thousand rows hold no series."""
 
     @property
     def twin(self) -> bool | None:
         """What the twin says of the trial: as planned; without a plan, as executed."""
         return self.sim_executed if self.plan_id == NO_PLAN else self.sim_planned
-
-    @property
-    def tcp_errors(self) -> tuple[TcpErrorSeries, ...]:
-        """Recorded against replayed tool poses over time, read from the files at each access."""
-        return () if self.read_tcp_errors is None else self.read_tcp_errors()
 
     @property
     def recorded_word(self) -> str:
@@ -208,9 +194,6 @@ class Comparison:
     """How far each motion lies from its replays, with its course."""
     states: tuple[StateSummary, ...] = ()
     """Where objects were predicted, replayed and localised after each stage."""
-    bands: tuple[BandCurve, ...] = ()
-    paths: tuple[BandPath, ...] = ()
-    """Distance and repeatability of imported runs over normalised time."""
     views: tuple[ViewQuality, ...] = ()
     """Every rendered view that was scored, with pictures of the worst."""
     provenance: dict[str, Any] = field(default_factory=dict)

@@ -11,8 +11,8 @@ from bridge.exchange.trials_csv import trials_path
 from bridge.task.protocol import VOID_CAUSES, Protocol, read_protocol
 from bridge.terminal import Output
 from evaluator.cache import SummaryCache
-from evaluator.compare.bands import BandReport, compare_bands
 from evaluator.compare.baselines import with_rule
+from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
@@ -35,7 +35,7 @@ from evaluator.run_reader.contents import ODD, RunContents, broken, read_content
 from evaluator.run_reader.episodes import DerivedIndex
 
 Item = TypeVar("Item")
-AnyPart = Part | ViewReport | BandReport
+AnyPart = Part | ViewReport
 
 QUIET = Output(quiet=True)
 
@@ -70,13 +70,11 @@ def compare_run(
     nets = open_nets(images.backbones)
     views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
-    bands = _bands(contents)
+    motions = _imported_motions(contents)
     base = compare_read([read], name=read.name, method=method, goal=goal)
-    # Words of what is missing come first, then those of images and bands.
+    # Words of what is missing come first, then those of images and imported motions.
     return replace(
-        _with_parts(base, (views, methods, bands)),
-        bands=bands.curves,
-        paths=bands.paths,
+        _with_parts(base, (views, methods, motions)),
         views=(*views.views, *methods.views),
         provenance={**base.provenance, **images.origin()},
     )
@@ -291,7 +289,7 @@ def _task_hashes(contents: RunContents) -> dict[str, frozenset[str]]:
     return {task: frozenset(hashes) for task, hashes in found.items()}
 
 
-def _bands(contents: RunContents) -> BandReport:
+def _imported_motions(contents: RunContents) -> Part:
     imported, left_out = [], []
     for each in contents.recorded:
         if each.facts.info.kind != "imported":
@@ -299,9 +297,9 @@ def _bands(contents: RunContents) -> BandReport:
         try:
             imported.append(Episode.open(each.file.path))
         except ODD as error:  # it was there a moment ago
-            left_out.append(broken(each.file.path.name, error, scope="bands"))
-    report = compare_bands(imported, [f for f in contents.derived if f.info.kind == "imported"])
-    return replace(report, exclusions=(*left_out, *report.exclusions))
+            left_out.append(broken(each.file.path.name, error, scope="motions"))
+    found = compare_imported(imported, [f for f in contents.derived if f.info.kind == "imported"])
+    return replace(found, exclusions=(*left_out, *found.exclusions))
 
 
 def _marks(read: ReadRun) -> Iterator[bool | None]:

@@ -244,7 +244,9 @@ def _trials(
     rows = settled[len(inside) :]
     if reads:
         base = compare_read(reads, name=_named(sources), more_rows=rows, method=method, goal=goal)
-        base = replace(base, missing=(*base.missing, f"images: {ALONE}", f"bands: {ALONE}"))
+        base = replace(
+            base, missing=(*base.missing, f"images: {ALONE}", f"imported motions: {ALONE}")
+        )
     else:
         base = compare_rows(
             rows,

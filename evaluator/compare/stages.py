@@ -1,22 +1,17 @@
-"""Where trials are lost: the stage funnel, success over control steps, kinds of failure."""
+"""Where trials are lost: the stage funnel, kinds of failure."""
 
 from collections import Counter
 from collections.abc import Sequence
 
-from bridge.episode.reader import Episode
-from evaluator.compare.known_task import known_task, recorded_task
-from evaluator.compare.measure import RATE_COLUMNS, proportion
+from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
 from evaluator.measurements import STAGE
-from evaluator.result import Cell, Exclusion, Measurement, Table
+from evaluator.result import Exclusion, Measurement, Table
 from evaluator.statistics.funnel import (
-    CurvePoint,
     StageCount,
     failure_taxonomy,
     funnel,
-    success_curve,
 )
-from evaluator.statistics.intervals import wilson
 
 NOT_LABELLED, NO_STAGE = "stage not labelled", "no stage, but the task"
 """Stand for the stage of a failure of which nobody named one."""
@@ -40,7 +35,7 @@ def stages_of(row: TrialRow) -> tuple[tuple[str, bool | None], ...]:
 def stage_results(
     rows: Sequence[TrialRow],
 ) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
-    """Measure each stage of each task and condition, and success up to each control step."""
+    """Measure each stage of each task and condition."""
     groups: dict[tuple[str, str], list[Trial]] = {}
     for row in rows:
         stages = stages_of(row)
@@ -49,7 +44,6 @@ def stage_results(
     measurements: list[Measurement] = []
     left_out: list[Exclusion] = []
     funnel_rows: list[tuple[str | int | None, ...]] = []
-    curve_rows: list[tuple[Cell, ...]] = []
     for (task, condition), trials in groups.items():
         names = [name for name, _ in trials[0][1]]
         alike = [trial for trial in trials if [name for name, _ in trial[1]] == names]
@@ -70,11 +64,7 @@ def stage_results(
         funnel_rows += [
             (task, words, s.name, s.reached, s.passed, s.unknown or None) for s in found
         ]
-        curves = (("trials so far", _survival(found)), *_objects(alike[0][0], names, ended))
-        curve_rows += [
-            (task, words, counted, p.step, *_band(p)) for counted, points in curves for p in points
-        ]
-    return measurements, _tables(funnel_rows, curve_rows), left_out
+    return measurements, _tables(funnel_rows), left_out
 
 
 def _measure(task: str, condition: str, stage: StageCount, episodes: list[str]) -> Measurement:
@@ -88,56 +78,8 @@ def _measure(task: str, condition: str, stage: StageCount, episodes: list[str]) 
     )
 
 
-def _survival(stages: Sequence[StageCount]) -> list[CurvePoint]:
-    """Trials in which every control step up to this one succeeded; a stage is a control step.
-
-    Trials whose ending is unknown somewhere on the way cannot be counted as either.
-    """
-    trials, points = stages[0].reached, []
-    for step, stage in enumerate(stages, start=1):
-        trials -= stage.unknown
-        points.append(CurvePoint(step=step, done=stage.passed, n=trials))
-    return points
-
-
-def _objects(
-    row: TrialRow, names: Sequence[str], ended: Sequence[Sequence[bool | None]]
-) -> tuple[tuple[str, list[CurvePoint]], ...]:
-    """Objects that were released where they belong, by control step, for tasks with several.
-
-    The task file says which stages release something; of a task without one nothing is known. An
-    object whose stage came and has no known ending is neither; one whose stage was not reached,
-    because an earlier one failed, is not where it belongs.
-    """
-    known = known_task(row.task) if row.path is None else recorded_task(Episode.open(row.path))
-    releasing = (
-        {str(stage["id"]) for stage in known.stages if stage.get("release") or stage.get("push")}
-        if known
-        else ()
-    )
-    places = [place for place, name in enumerate(names, start=1) if name in releasing]
-    if len(places) < 2:
-        return ()
-    done_at = [
-        place if trial[place - 1] else None
-        for trial in ended
-        for place in places
-        if trial[place - 1] is not None or False in trial[: place - 1]
-    ]
-    return (("objects", success_curve(done_at, len(names))),) if done_at else ()
-
-
-def _band(point: CurvePoint) -> tuple[Cell, ...]:
-    if not point.n:
-        return (point.done, 0, None, None, None, None)
-    interval = wilson(point.done, point.n)
-    rate = point.done / point.n
-    return (point.done, point.n, rate, interval.low, interval.high, interval.method)
-
-
 def _tables(
     funnel_rows: Sequence[tuple[str | int | None, ...]],
-    curve_rows: Sequence[tuple[Cell, ...]],
 ) -> tuple[Table, ...]:
     if not funnel_rows:
         return ()
@@ -149,16 +91,6 @@ def _tables(
             rows=tuple(funnel_rows),
             note="Reached: every earlier stage succeeded. A stage after a failed one is not "
             "reached, even where it is labelled a success.",
-        ),
-        Table(
-            id="success_curve",
-            title="Success over control steps",
-            columns=("task", "condition", "counted", "control step", *RATE_COLUMNS),
-            rows=tuple(curve_rows),
-            note="Trials so far: every control step up to this one succeeded. Objects: released "
-            "where they belong up to this step, whatever happened to the others; those of which "
-            "nobody said it are left out. Brackets: 95 % "
-            "Wilson intervals in percent; neighbouring steps share their trials.",
         ),
     )
 

@@ -22,7 +22,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Defined
 from evaluator.metrics.state import extents_difference_m, turn_between_rad, turns_alike
 from evaluator.motion_measurements import STATES
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
+from evaluator.result import Exclusion, Interval, Measurement, Table
 from evaluator.run_reader.object_states import (
     ObjectState,
     predicted_states,
@@ -220,38 +220,6 @@ def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
     )
 
 
-def stage_table(states: Sequence[StateSummary]) -> Table:
-    """Distances after each stage of each task and condition."""
-    groups: dict[tuple[str, str, str, str, str], list[StateSummary]] = {}
-    for state in states:
-        key = (state.task, state.condition, state.stage, state.predicted_by, state.against)
-        groups.setdefault(key, []).append(state)
-    rows: list[dict[str, Cell]] = []
-    for (task, condition, stage, predicted_by, against), members in groups.items():
-        positions = [s.position_m for s in members if s.position_m is not None]
-        turns = [s.rotation_rad for s in members if s.rotation_rad is not None]
-        rows.append(
-            {
-                "task": task,
-                "condition": condition.replace("_", " "),
-                "stage": stage,
-                "predicted by": predicted_by,
-                "against": against,
-                "objects": len(positions),
-                "median distance (mm)": millimetres(median(positions) if positions else None),
-                "largest (mm)": millimetres(max(positions, default=None)),
-                "median rotation (deg)": degrees(median(turns) if turns else None),
-            }
-        )
-    return Table.of(
-        rows,
-        id="stage_states",
-        title="Object states after each stage",
-        note="Objects are localised only while nothing moves, so the recording is asked about the "
-        "last stage of each object alone.",
-    )
-
-
 WHO = {
     PLAN: "the plan's predicted pose",
     PLANNED: "the planned replay's",
@@ -293,7 +261,7 @@ def state_results(states: Sequence[StateSummary]) -> Part:
     by_id = {measurement.id: measurement for measurement in measurements}
     return Part(
         measurements=tuple(measurements),
-        tables=(final_table(ordered, by_id), stage_table(states)),
+        tables=(final_table(ordered, by_id),),
         exclusions=_left_out(states),
     )
 

@@ -23,7 +23,7 @@ from evaluator.measurements import (
     Defined,
     Quantity,
 )
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement
 from evaluator.statistics.agreement import counted_groups, mean_rate
 
 CONDITION_OF_ARM = {"without": WITHOUT, "with": WITH, "control": CONTROL}
@@ -332,23 +332,20 @@ def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
 NO_INTERVAL = "means of shares are no counts, and no interval of them was checked for its coverage"
 
 
-def varied_sim(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table, ...]]:
+def varied_sim(rows: Sequence[TrialRow]) -> list[Measurement]:
     """Estimate the twin's rates again from varied replays, beside the nominal ones.
 
     Returns:
         Per task, condition and policy with varied replays: ``rate.sim_varied.*``, and
-        ``bias.selection.*``, how far the nominal replays of the same trials lie above them [pp];
-        and the table of both. Nothing where no trial has varied replays.
+        ``bias.selection.*``, how far the nominal replays of the same trials lie above them [pp].
+        Nothing where no trial has varied replays.
     """
     found: list[Measurement] = []
-    lines: list[tuple[Cell, ...]] = []
     for key, members in group_rows(rows).items():
         there = [row for row in members if row.sim_varied is not None]
         if there:
-            again, gap = _again(key, there), _gap(key, there)
-            found += [again, gap]
-            lines.append(_line(key, there, again, gap))
-    return found, (_table(lines),) if lines else ()
+            found += [_again(key, there), _gap(key, there)]
+    return found
 
 
 def _again(key: Key, rows: Sequence[TrialRow]) -> Measurement:
@@ -387,37 +384,3 @@ def _mean(rows: Sequence[TrialRow]) -> float:
 
 def _nominal(rows: Sequence[TrialRow]) -> int:
     return sum(row.sim_planned is True for row in rows)
-
-
-def _line(
-    key: Key, rows: Sequence[TrialRow], again: Measurement, gap: Measurement
-) -> tuple[Cell, ...]:
-    decided = sum(row.sim_planned is not None for row in rows)
-    task, condition, policy = key
-    return (
-        task,
-        condition,
-        policy,
-        _nominal(rows),
-        decided,
-        again.value,
-        len(rows),
-        None if gap.value is None else round(gap.value, 1),
-    )
-
-
-def _table(lines: Sequence[tuple[Cell, ...]]) -> Table:
-    return Table(
-        id="sim_varied",
-        title="Sim estimated again with fresh seeds",
-        columns=(
-            *("task", "condition", "policy", "sim k", "sim n"),
-            *("rate with fresh seeds", "trials with fresh seeds", "difference (pp)"),
-        ),
-        rows=tuple(lines),
-        note="sim: nominal planned replays of the plans sent, in trials that have varied replays. "
-        "Fresh seeds: the share of each plan's varied replays that succeed, averaged over trials; "
-        "what is not known exactly is drawn anew, with no draw the gate used. Where the twin "
-        "selected the plans, the difference shows how much of sim is that selection. There are no "
-        f"intervals: {NO_INTERVAL}.",
-    )

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 from bridge.clock import NS_PER_S
@@ -184,8 +183,6 @@ def _row(
         failing_cause=None if failing is None else failing.failing_cause,
         failing_bodies=() if failing is None else failing.failing_bodies,
         failing_stage=_stage_at(facts, None if failing is None else failing.failing_t_ns),
-        clauses=() if planned.verdict is None else planned.verdict.clauses,
-        gate_clauses=() if verdict is None else verdict.clauses,
         stages=_stages(outcome),
         planned_replay=replays["planned"].file.file_name if "planned" in replays else None,
         divergence=replays["executed"].facts.divergence if "executed" in replays else None,
@@ -193,12 +190,6 @@ def _row(
         began_ns=facts.began_ns,
         path=file.path,
         start_positions_m=facts.start_positions_m | positions_at_start(places, facts.started_ns),
-        read_tcp_errors=partial(
-            _tcp_errors,
-            file,
-            facts.plan_id,
-            {name: replay.file for name, replay in replays.items()},
-        ),
     )
 
 
@@ -229,14 +220,6 @@ def tcp_track(episode: Episode) -> PoseTrajectory | None:
         return pose_track(episode, topics[0]) if topics else None
     except BridgeError:
         return None
-
-
-def _tcp_errors(
-    recorded: RunFile, plan_id: str | None, replays: Mapping[str, RunFile]
-) -> tuple[TcpErrorSeries, ...]:
-    """Read them; paths are made only now, for most rows are never asked."""
-    paths = {name: file.path for name, file in replays.items()}
-    return read_tcp_errors(recorded.path, plan_id, paths)
 
 
 def read_tcp_errors(

@@ -3,9 +3,8 @@
 All of a stamp must be equal before two numbers may be compared.
 """
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,11 +91,6 @@ class Stamp:
     def text(self) -> str:
         """Write everything in one line."""
         return "; ".join(_written(name, value) for name, value in self._items())
-
-    @property
-    def key(self) -> str:
-        """Eight hexadecimal digits that change when anything but the number of images does."""
-        return hashlib.sha256(replace(self, n=0).text().encode()).hexdigest()[:8]
 
     def _items(self) -> list[tuple[str, str]]:
         return [(f.name, str(getattr(self, f.name))) for f in fields(self)]

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bridge.media.image_quality import (
-    MS_SSIM_MIN_PX,
     PADDINGS,
     SIGMA,
     WINDOW,
@@ -17,12 +16,10 @@ from bridge.media.image_quality import (
     SsimMaps,
     aligned,
     as_float,
-    ms_ssim,
     psnr_db,
     ssim_maps,
 )
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image import gmsd
 from evaluator.metrics.image_protocol import ImageMetric, MaskMode
 from evaluator.metrics.lpips import LPIPS_METRICS, PerceptualNet
 
@@ -58,25 +55,6 @@ PLAIN_METRICS: tuple[ImageMetric, ...] = (
             padding=words,
         )
         for padding, words in PADDINGS.items()
-    ),
-    ImageMetric(
-        id="ms_ssim",
-        column="MS-SSIM",
-        definition=f"MS-SSIM (Wang 2003), five scales from {MS_SSIM_MIN_PX} px on, {GAUSSIAN}",
-        implementation="bridge.media.image_quality 1",
-        window=GAUSSIAN,
-        padding=PADDINGS["valid"],
-        by_pixel=False,
-    ),
-    ImageMetric(
-        id="gmsd",
-        column="GMSD",
-        definition="GMSD (Xue 2014), luma 0..255 at half size, Prewitt gradients, constant 170",
-        implementation="evaluator.metrics.image 1",
-        values="luma of sRGB, data range 0..255",
-        window="Prewitt 3 x 3",
-        padding="zeros beyond the border",
-        higher_is_better=False,
     ),
 )
 """What needs no learned weights, in the order of a table's columns."""
@@ -145,12 +123,9 @@ def score_image(
         reasons |= dict.fromkeys(_IDS.values(), error.reason)
     attempts = {
         "psnr_db": partial(psnr_db, recorded, replayed, mask=mask),
-        "gmsd": partial(gmsd, recorded, replayed, mask=mask),
     }
     if maps is not None:
         attempts |= {_IDS[p]: partial(maps.mean, p, mask=mask) for p in PADDINGS}
-    if mask is None:
-        attempts["ms_ssim"] = partial(ms_ssim, recorded, replayed, first=maps)
     for name, compute in attempts.items():
         try:
             values[name] = compute()

@@ -19,6 +19,8 @@ from evaluator.report import wording
 from evaluator.report.figures.drawing import DARK, LIGHT, Drawing
 from evaluator.report.front import FIGURES, front, front_tables
 from evaluator.report.pairs import Picture, ViewPair, pictures_of
+from evaluator.report.ranked import FIGURES as DECIDED
+from evaluator.report.ranked import decides, shown_tables
 from evaluator.report.sections import OTHER, SECTIONS, TRIALS, Section, numbers_of, section_of
 from evaluator.report.views import Figures, Shown, is_number, used_columns, view
 from evaluator.result import Measurement, Results, Table
@@ -40,9 +42,7 @@ SOURCES = {
     "images": "folders of images",
 }
 DRAWN = {
-    "confusion": "confusion",
     "gate_costs": "costs",
-    "reliability": "reliability",
     "funnel": "funnel",
 }
 """Tables that say what a figure of the page shows; they are folded beside it."""
@@ -78,22 +78,37 @@ class Part:
     """Each with whether a click shows it."""
 
 
-def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewPair] = ()) -> str:
-    """Build the page of the results, the figures made of them, and pictures of the worst views."""
+def page(
+    results: Results,
+    figures: Sequence[Inline] = (),
+    pairs: Sequence[ViewPair] = (),
+    *,
+    everything: bool = False,
+) -> str:
+    """Build the page of the results.
+
+    Args:
+        results: What was found.
+        figures: Drawn from it.
+        pairs: Pictures of the worst views.
+        everything: Show the tables that nobody decides by and the list of all numbers, too.
+    """
+    shown = shown_tables(results, everything=everything)
     shown_first = [pair for name in FIGURES for pair in figures if pair[0].id == name][:1]
     tables_first = front_tables(results)
-    later = replace(results, tables=tuple(t for t in results.tables if t not in tables_first))
+    later = replace(results, tables=tuple(t for t in shown if t not in tables_first))
     rest = [pair for pair in figures if pair not in shown_first]
     parts = [
         part
         for section in (*SECTIONS, OTHER)
         if (part := _part(section, later, rest, pairs)) is not None
     ]
-    trials = next((table for table in results.tables if table.id == TRIALS), None)
+    trials = next((table for table in shown if table.id == TRIALS), None)
     names = [("meaning", "What it means")]
     names += [(part.section.id, part.section.title) for part in parts]
     names += [("trials-part", "Every trial")] if trials else []
-    names += [("left-out", "Left out, and missing"), ("numbers", "Every number")]
+    names += [("left-out", "Left out, and missing")]
+    names += [("numbers", "Every number")] if everything else []
     names += [("provenance", "Where it came from")]
     excluded = Table(
         id="exclusions",
@@ -121,6 +136,7 @@ def page(results: Results, figures: Sequence[Inline] = (), pairs: Sequence[ViewP
             excluded=excluded,
             software=_software(results.provenance.get("software")),
             provenance=json.dumps(dict(_short(results.provenance)), indent=1),
+            everything=everything,
             next_table=count(1).__next__,
             next_figure=count(1).__next__,
         )
@@ -202,7 +218,7 @@ def environment() -> Environment:
     environment.filters |= {
         function.__name__: function
         for function in (
-            *(breakable, minus, thousands, grid, footnotes, reason, is_long),
+            *(breakable, minus, thousands, grid, footnotes, reason, is_long, decides),
             *(wording.cell_text, wording.value_text, wording.ends_text, wording.count_text),
             *(wording.method_text, wording.measurement_text),
         )
@@ -212,6 +228,7 @@ def environment() -> Environment:
         "policy": POLICY,
         "light": LIGHT,
         "dark": DARK,
+        "decided": DECIDED,
         "shown_rows": SHOWN_ROWS,
         "shown_numbers": SHOWN_NUMBERS,
         "shown_measurements": SHOWN_MEASUREMENTS,

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,6 @@ from evaluator.compare.failures import failure_kind, start_regions
 from evaluator.compare.rows import Comparison, TrialRow
 from evaluator.compare.run import compare_run
 from evaluator.compare.stages import first_failed_stage
-from evaluator.motion_measurements import BAND_WIDTH
 from evaluator.quantity import slug
 from evaluator.report.front import CLOSE_PP, answer, conclusions, front, next_trials, sentence
 from evaluator.report.page import grid
@@ -39,8 +38,6 @@ FROM_TRIALS = ("agreement.", "gain.", "rate.")
 """Numbers that follow from trials, labels and replays, whatever else was asked of an evaluation."""
 DIGITS = 9
 """Two versions of the program may sum up in another order."""
-RECORDED = "recorded"
-"""The side of a band that is no engine."""
 SHOWN_EXCLUSIONS = 200
 """Of those left out; ``results.json`` has all."""
 SHOWN_ROWS = 24
@@ -117,7 +114,6 @@ def _write(
         "changed_meanwhile": state.newest_ns >= began_ns,
         "comparison_reason": reason,
         "outdated": _outdated(stored.results, comparison),
-        **({} if comparison is None else _bands(comparison)),
         **_about(comparison, stored, has_trials=bool(rows)),
     }
     slug_of = cache(slug)
@@ -204,34 +200,6 @@ def _about(comparison: Comparison | None, stored: _Stored, *, has_trials: bool) 
         "failures": [] if failures is None else [list(row) for row in failures.rows],
         "tables": [] if has_trials else [_shown(t) for t in results.tables if t.rows],
     }
-
-
-def _bands(comparison: Comparison) -> dict[str, Any]:
-    """What is drawn of imported motions, in millimetres."""
-
-    def rounded(points: Sequence[Sequence[float]]) -> list[list[float]]:
-        return [[round(1000 * value, 1) for value in point] for point in points]
-
-    paths = [
-        {
-            **{name: getattr(path, name) for name in ("task", "body", "side", "num_runs")},
-            "mean_mm": rounded(path.mean_m),
-            "low_mm": rounded(path.low_m) if path.side == RECORDED else [],
-            "high_mm": rounded(path.high_m) if path.side == RECORDED else [],
-        }
-        for path in comparison.paths
-    ]
-    distances = [
-        {
-            "task": curve.task,
-            "side": curve.engine,
-            "distance_mm": rounded([curve.distance_m])[0],
-            "band_mm": rounded([[BAND_WIDTH * each for each in curve.recorded_spread_m]])[0],
-        }
-        for curve in comparison.bands
-        if curve.part == "moving"
-    ]
-    return {"paths": paths, "distances": distances} if paths else {}
 
 
 def _shown(table: Table) -> dict[str, Any]:

@@ -50,12 +50,9 @@ SECTIONS: tuple[Section, ...] = (
         title="Success rates",
         lead="How often a task succeeded in the twin and as labelled. Sim is planned-in-twin: the "
         "plan actually sent, replayed with physics.",
-        numbers=(
-            ("session.drift_pp", "Change of success over the session"),
-            ("session.drift_p", "Change over the session, p"),
-        ),
-        tables=("success", "layout", "notes", "session_order"),
-        figures=("success", "order"),
+        numbers=(),
+        tables=("success", "layout", "notes"),
+        figures=("success",),
     ),
     Section(
         id="agreement",
@@ -87,11 +84,7 @@ SECTIONS: tuple[Section, ...] = (
             ("decision.*", ""),
         ),
         tables=(
-            "model_groups",
-            "model_ranking",
             "agreement_intervals",
-            "decisions",
-            "leave_one_task_out",
             "axes",
             "progress",
         ),
@@ -149,8 +142,8 @@ SECTIONS: tuple[Section, ...] = (
             ("reliability.brier_of_base_rate", "Brier score of the base rate"),
             ("reliability.ece", "Expected calibration error"),
         ),
-        tables=("confusion", "gate_*", "reliability"),
-        figures=("confusion", "costs", "reliability"),
+        tables=("confusion", "gate_*"),
+        figures=("costs", "reliability"),
     ),
     Section(
         id="against",
@@ -164,7 +157,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
         numbers=(),
-        tables=("funnel", "success_curve", "failures", "divergences", "sensitivity"),
+        tables=("funnel", "failures", "divergences"),
         figures=("funnel",),
     ),
     Section(
@@ -184,8 +177,8 @@ SECTIONS: tuple[Section, ...] = (
                 ("joint_rms_rad", "Joints, root mean square"),
             )
         ),
-        tables=("motion*", "bands_*"),
-        figures=("motions", "bands"),
+        tables=("motion*", "end_points_*", "runs_of_end_points_*"),
+        figures=("motions",),
     ),
     Section(
         id="states",
@@ -193,7 +186,7 @@ SECTIONS: tuple[Section, ...] = (
         lead="Where the twin expected objects to end up, where they were localised, and where the "
         "replay left them; and whether labels and localised goals agree.",
         numbers=(("label.*", ""),),
-        tables=("final_states", "stage_states", "state*", "label*"),
+        tables=("final_states", "label*"),
         figures=("states",),
     ),
     Section(
@@ -207,8 +200,6 @@ SECTIONS: tuple[Section, ...] = (
             ("views.all.psnr_pose_gain_db", "PSNR, after pose and gain"),
             ("views.all.ssim", "SSIM, raw"),
             ("views.all.ssim_gain", "SSIM, after a gain per image"),
-            ("views.all.ms_ssim", "MS-SSIM, raw"),
-            ("views.all.gmsd", "GMSD, raw"),
             ("views.all.lpips*", ""),
             ("views.all.depth_median_abs_m", "Depth, median absolute error"),
             ("views.all.depth_mean_abs_m", "Depth, mean absolute error"),

@@ -1,19 +1,17 @@
-"""One table as CSV, Markdown and terminal text; ``latex`` writes the same for a paper."""
+"""One table as CSV, as text for a terminal, and as LaTeX for a paper."""
 
 import csv
 import io
 import re
 import shutil
 import textwrap
-from functools import lru_cache
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from evaluator.compare.tables import AVERAGES, MEAN_OF_TASKS, METHOD_NAMES
-from evaluator.report.views import Shown, View, is_number, used_columns, view
+from evaluator.report.views import is_number, used_columns, view
 from evaluator.report.wording import cell_text
 from evaluator.result import Table
 
@@ -25,24 +23,6 @@ def as_csv(table: Table) -> str:
     writer.writerow(table.columns)
     writer.writerows(["" if cell is None else cell for cell in row] for row in table.rows)
     return stream.getvalue()
-
-
-def as_markdown(table: Table) -> str:
-    """Write a Markdown table with its title and note."""
-    written = lru_cache(maxsize=None, typed=True)(_markdown_cell)
-    shown = view(table)
-    heads = [written(name) for name in shown.columns]
-    lines = [f"**{table.title}**", "", _bar(heads), _bar(["---"] * len(heads))]
-    lines += [_bar([written(cell) for cell in row]) for row in shown.rows]
-    return "\n".join(lines) + (f"\n\n{table.note}\n" if table.note else "\n")
-
-
-def _markdown_cell(cell: Shown) -> str:
-    return " ".join(cell_text(cell).split()).replace("|", r"\|")  # a row is one line
-
-
-def _bar(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def as_text(table: Table, *, width: int | None = None) -> str:
@@ -140,203 +120,22 @@ def _filled(text: str, width: int, indent: str = "") -> list[str]:
     )
 
 
-_COMMANDS = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"{''}",
-    "`": r"{`}",
-    # A bracket or star after the end of a line would be read as that line's argument.
-    "[": "{[}",
-    "]": "{]}",
-    "*": "{*}",
-    "–": "--",
-    "—": "---",
-    "−": "$-$",
-    "±": r"$\pm$",
-    "×": r"$\times$",
-    "≤": r"$\leq$",
-    "≥": r"$\geq$",
-    "≠": r"$\neq$",
-    "→": r"$\rightarrow$",
-    "°": r"$^\circ$",
-    "…": r"\ldots{}",
-    "’": "'",
-    "‘": "`",
-    "«": r"$\ll$",
-    "»": r"$\gg$",
-    "“": "``",
-    "”": "''",
-    "τ": r"$\tau$",
-    "ρ": r"$\rho$",
-    "φ": r"$\phi$",
-    "λ": r"$\lambda$",
-    "µ": r"$\mu$",
-    "✓": "yes",
-    "✗": "no",
-    "\u2060": "{}",
-}
-_TRANSLATION = str.maketrans(_COMMANDS)
-_NOT_SET = re.compile("[^\x20-\x7e\xa1-\u017f]|[ÐÞðþĄąĘęĮįŲųĐđĦħĸĿŀŉŊŋŦŧſ]")
-"""What LaTeX since 2020 does not set in its default font encoding is written as U+XXXX; of the
-letters up to U+017F that are those named here."""
-_NAME = re.compile(r"[^A-Za-z0-9:.-]+")
-_MINUS = re.compile(r"(?<![\w.-])-(?=\.?\d)")
-_HYPHENS = re.compile("-(?=-)")
-"""Two would become a dash: ``--goal``."""
+_SPECIAL = re.compile(r"([&%$#_{}])")
 
 
 def as_latex(table: Table) -> str:
-    r"""Write a booktabs table: numbers to the right, no empty columns, the note below.
+    r"""Write a table for a paper; the document needs ``\usepackage{booktabs}``."""
+    import pandas as pd  # noqa: PLC0415  # takes a moment, and only this needs it
 
-    The document needs ``\usepackage{booktabs,threeparttable}``; a table wider than the page also
-    ``graphicx``, which shrinks it to the width of the text, and one longer than a page
-    ``longtable``, which is set in a smaller size where it is wide. One wider than a column of a
-    two-column article spans both (``table*``). Sentences are broken over lines; the caption is
-    made from the content.
-    """
     shown = view(table)
     used = used_columns(shown)
-    align, characters = _columns(shown, used)
-    head = " & ".join(latex(shown.columns[index]) for index in used)
-    written = lru_cache(maxsize=None, typed=True)(_cell)  # tables say the same again and again
-    body = [" & ".join([written(row[i]) for i in used]) + r" \\" for row in shown.rows]
-    columns = f"@{{}}{align}@{{}}"
-    caption = rf"\caption{{{latex(caption_of(table))}}}"
-    label = rf"\label{{tab:{_NAME.sub('-', table.id)}}}"
-    note = [rf"\par\smallskip\footnotesize {latex(table.note)}"] if table.note else []
-    if len(body) > LONG_ROWS:
-        lines = [
-            rf"{{{_fitting(characters)}",
-            rf"\begin{{longtable}}{{{columns}}}",
-            rf"{caption}{label} \\",
-            *(r"\toprule", rf"{head} \\", r"\midrule", r"\endhead", r"\bottomrule", r"\endfoot"),
-            *body,
-            r"\end{longtable}",
-            *note,
-            "}",
-        ]
-        return "\n".join(lines) + "\n"
-    tabular = [
-        rf"\begin{{tabular}}{{{columns}}}",
-        *(r"\toprule", rf"{head} \\", r"\midrule"),
-        *body,
-        *(r"\bottomrule", r"\end{tabular}"),
-    ]
-    if characters > WIDE_CHARACTERS:
-        tabular = [r"\resizebox{\textwidth}{!}{%", *tabular, "}", *note]
-    elif table.note:
-        notes = [r"\begin{tablenotes}", rf"\footnotesize\item {latex(table.note)}"]
-        tabular = [*tabular, *notes, r"\end{tablenotes}"]
-        tabular = [r"\begin{threeparttable}", caption, label, *tabular, r"\end{threeparttable}"]
-        caption = label = ""
-    kind = "table*" if characters > COLUMN_CHARACTERS else "table"
-    lines = [
-        *(rf"\begin{{{kind}}}[t]", r"\centering", caption, label, r"\small"),
-        *tabular,
-        rf"\end{{{kind}}}",
-    ]
-    return "\n".join(filter(None, lines)) + "\n"
-
-
-NO_NAMES = {"", None, MEAN_OF_TASKS, *AVERAGES.values()}
-"""What stands in a column of names and names nothing."""
-
-
-def caption_of(table: Table) -> str:
-    """Return a caption that can stand alone: the title, over what, and which intervals.
-
-    Args:
-        table: Any table of the evaluation.
-    """
-    counts = []
-    for name, many in (("task", "tasks"), ("policy", "policies"), ("condition", "conditions")):
-        if name in table.columns:
-            values = {row[table.columns.index(name)] for row in table.rows} - NO_NAMES
-            count = f"{len(values)} {many}"
-            if len(values) > 1 and count not in table.title:
-                counts.append(count)
-    over = f" over {' and '.join(counts)}" if counts else ""
-    methods = [
-        str(row[place])
-        for place, name in enumerate(table.columns)
-        if name in ("interval", "method", "agree interval")
-        for row in table.rows
-        if row[place]
-    ]
-    named = [METHOD_NAMES.get(name, name) for name in dict.fromkeys(methods)]
-    brackets = f" Brackets: 95 % intervals ({', '.join(named)})." if named else ""
-    title = table.title.rstrip(".")
-    ending = "" if title.endswith("?") and not over else "."
-    return f"{title}{over}{ending}{brackets}"
-
-
-COLUMN_CHARACTERS = 44
-"""A line of text in a column of a two-column article, in the small size of tables."""
-LONG_ROWS = 45
-"""A table with more rows does not fit one page and is set over several (``longtable``)."""
-
-
-WIDE_CHARACTERS = 84
-"""A line of text in a usual article, in the small size of tables."""
-
-
-SENTENCE = 45
-"""Text longer than this is broken over lines, where it can be."""
-SENTENCES = 0.6
-"""Share of the width of the text that such columns have together."""
-LONGEST_WORD = 20
-
-
-def _columns(table: View, used: list[int]) -> tuple[str, float]:
-    """Return how columns are set, and how many characters lie beside each other."""
-    lines = [table.columns, *([cell_text(cell) for cell in row] for row in table.rows)]
-    longest = {index: max(len(line[index]) for line in lines) for index in used}
-    sentences = {
-        index
-        for index in used
-        if longest[index] > SENTENCE
-        and all(len(word) <= LONGEST_WORD for line in lines for word in line[index].split())
-    }
-    share = SENTENCES / max(1, len(sentences))
-    align, characters = "", 0.0
-    for index in used:
-        if index in sentences:
-            align += rf"p{{{share:.2f}\textwidth}}"
-            characters += share * WIDE_CHARACTERS + 2
-        else:
-            align += "r" if is_number(table, index) else "l"
-            characters += longest[index] + 2
-    return align, characters
-
-
-def _fitting(characters: float) -> str:
-    """Return the size in which a table of several pages, which cannot be shrunk, is as wide."""
-    if characters <= WIDE_CHARACTERS:
-        return r"\small"
-    size = "scriptsize" if characters <= 1.2 * WIDE_CHARACTERS else "tiny"
-    return rf"\{size}\setlength{{\tabcolsep}}{{2pt}}"
-
-
-def _cell(cell: Shown) -> str:
-    return latex(cell_text(cell))
-
-
-def latex(text: str) -> str:
-    """Escape what LaTeX would read as a command, and write what it cannot set as U+XXXX.
-
-    A minus before a number is set as one; hyphens in a row stay hyphens, where LaTeX makes dashes.
-    """
-    plain = _MINUS.sub("−", " ".join(text.split()))
-    plain = _HYPHENS.sub("-\u2060", plain).translate(_TRANSLATION)
-    return _NOT_SET.sub(lambda found: f"U+{ord(found[0]):04X}", plain)
+    rows = [[cell_text(row[index]) for index in used] for row in shown.rows]
+    text: str = pd.DataFrame(rows, columns=[shown.columns[index] for index in used]).to_latex(
+        index=False,
+        escape=True,
+        column_format="".join("r" if is_number(shown, index) else "l" for index in used),
+        caption=_SPECIAL.sub(r"\\\1", table.title),
+        label=f"tab:{table.id}",
+        position="t",
+    )
+    return text

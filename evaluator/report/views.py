@@ -47,7 +47,7 @@ class View:
 
 def view(table: Table) -> View:
     """Return what is printed of a table."""
-    build = _VIEWS.get("bands" if table.id.startswith("bands_") else table.id)
+    build = _VIEWS.get(table.id)
     if build is None or not table.rows:
         return View(**vars(table))
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
@@ -167,51 +167,6 @@ def _layout(rows: Rows) -> Rows:
     return [row | {name: percent(row[name]) or "undefined" for name in rates} for row in rows]
 
 
-def _curve(rows: Rows) -> Rows:
-    renamed = {"k": "succeeded", "n": "of"}
-    left_out = ("rate", "low", "high", "interval")
-    return [
-        {renamed.get(name, name): cell for name, cell in row.items() if name not in left_out}
-        | {"rate": percent(row["rate"], row["low"], row["high"])}
-        for row in rows
-    ]
-
-
-def _varied(rows: Rows) -> Rows:
-    def fresh(row: Record) -> str:
-        return f"{100 * row['rate with fresh seeds']:.1f} % (n = {row['trials with fresh seeds']})"
-
-    return [
-        _picked(row, "task", "condition", "policy")
-        | {
-            "condition": _words(row["condition"]),
-            "sim": f"{row['sim k']}/{row['sim n']}",
-            "sim, fresh seeds": fresh(row),
-            "difference (pp)": row["difference (pp)"],
-        }
-        for row in rows
-    ]
-
-
-def _clauses(rows: Rows) -> Rows:
-    """Write both shares of a clause, and ``any`` for the price of one that refused no good plan."""
-
-    def price(row: Record) -> Shown:
-        found: float | None = row["pays up to a price of"]
-        return "any" if not _known(found) and row["refused and failed"] else found
-
-    return [
-        _picked(row, "verdict of", "clause", "trials", "refused", "refused and failed")
-        | {
-            "right to refuse": _share(row, "right", "refused and failed", "refused"),
-            "good plans refused": row["good plans refused"],
-            "failures it found": _share(row, "found", "refused and failed", "failed"),
-            "pays up to a price of": price(row),
-        }
-        for row in rows
-    ]
-
-
 def _share(row: Record, name: str, k: str, n: str) -> Shown:
     """Write a share with its interval, and with its count: ``4/5 = 80 % [38, 96]``."""
     shown = percent(row[name], row[f"{name} low"], row[f"{name} high"], digits=0)
@@ -281,25 +236,6 @@ def _stopping(rows: Rows) -> Rows:
             "advice": advice(row),
             "more trials at this rate": row["more trials at this rate"],
         }
-        for row in rows
-    ]
-
-
-def _bands(rows: Rows) -> Rows:
-    name = "inside the recorded band"
-    if name not in rows[0]:  # the other tables of bands hold lengths alone
-        return rows
-    return [row | {name: percent(row[name], digits=0)} for row in rows]
-
-
-def _without_task(rows: Rows) -> Rows:
-    def r(row: Record) -> Shown:
-        known = _known(row["Pearson r"])
-        return row["Pearson r"] if known else f"undefined: {row['why undefined']}"
-
-    return [
-        {name: cell for name, cell in row.items() if name != "why undefined"}
-        | {"Pearson r": r(row)}
         for row in rows
     ]
 
@@ -384,13 +320,8 @@ _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "progress": _progress,
     "gains": _gains,
     "layout": _layout,
-    "success_curve": _curve,
-    "sim_varied": _varied,
     "gate_baselines": _baselines,
-    "gate_clauses": _clauses,
     "stopping": _stopping,
-    "bands": _bands,
-    "leave_one_task_out": _without_task,
     "final_states": _states,
     "published": _published,
 }

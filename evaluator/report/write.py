@@ -9,14 +9,12 @@ from bridge.exchange.trials_csv import TrialRecord, write_trials
 from evaluator.compare.rows import Comparison
 from evaluator.compare.spreadsheet import record_from_row
 from evaluator.errors import EvaluatorError
-from evaluator.report.figures.beside import Beside
 from evaluator.report.figures.distributions import worst_pairs
-from evaluator.report.figures.drawing import Drawing, NotDrawn, Rendered
-from evaluator.report.figures.selection import drawable, drawings_of
-from evaluator.report.methods import methods
+from evaluator.report.figures.drawing import Drawing, Rendered
+from evaluator.report.figures.selection import drawings_of
 from evaluator.report.page import name_shared, page
-from evaluator.report.sections import TRIALS
-from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text, latex
+from evaluator.report.ranked import FIGURES, shown_tables
+from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.wording import headlines, stand_in_sentence
 from evaluator.result import Results, write_results
 
@@ -38,8 +36,14 @@ SHOWN = (
 GROUPS = "success"
 """The table of success rates; ``groups.parquet`` holds it too."""
 
+HEADLINE_TABLES = ("conclusions", "success", "layout", "study_gains", "gains", "confusion")
+"""Those that ``--latex`` writes for a paper."""
+OLD_FIGURES = ("confusion", "order", "bands")
+"""Drawn by the edition before."""
+
 PARQUET_PACKAGES = ("pyarrow",)
 FIGURE_PACKAGES = ("matplotlib",)
+LATEX_PACKAGES = ("pandas", "jinja2")
 INSTALL = "pip install 'robot-gst[report]'"
 
 
@@ -56,46 +60,46 @@ class Written:
     """Which packages are not installed and what is missing for it, or None."""
 
 
-def write_report(comparison: Comparison, folder: Path, beside: Beside | None = None) -> Written:
+def write_report(
+    comparison: Comparison, folder: Path, *, everything: bool = False, latex: bool = False
+) -> Written:
     """Write every file of one evaluation into ``folder``, replacing an earlier one.
 
     Args:
         comparison: What to report.
         folder: Where to.
-        beside: Draws the figures meanwhile; they are the same without it.
+        everything: Show and write the tables that nobody decides by, too.
+        latex: Write the headline tables for a paper as well.
 
     Raises:
         EvaluatorError: When the folder cannot be written.
     """
-    shown = drawable(comparison)
-    if beside is not None:
-        beside.send(shown)
-    drawn, not_drawn = drawings_of(shown)
+    drawn, not_drawn = drawings_of(comparison)
     results = comparison.results()
     if not_drawn:
         words = "; ".join(f"{item.id} ({item.reason})" for item in not_drawn)
         missing = f"figures without data, not drawn: {words}"
         results = replace(results, missing=(*results.missing, missing))
-    old = _old_files(folder, results)
+    old = _old_files(folder)
     path = write_results(results, folder / "results.json")
     try:
-        paper = dict(zip(("methods.tex", "references.bib"), methods(results), strict=True))
-        texts = {folder / "tables" / name: text.encode() for name, text in paper.items()}
-        tables = _write(_table_files(folder / "tables", results) | texts)
-        _remove_old(folder, not_drawn, old)
+        tables, no_latex = _table_files(folder, results, everything=everything, latex=latex)
         trials = [record_from_row(row) for row in comparison.rows]
         extra = [write_trials(folder / "trials.csv", trials)] if trials else []
         parquet, no_parquet = _write_parquet(folder, trials, results)
-        rendered, no_figures = _render(drawn, beside)
+        rendered, no_figures = _render(drawn)
         inline = {item.drawing.id: item.inline for item in rendered}
         text = page(
             results,
             [(drawing, inline.get(drawing.id)) for drawing in drawn],
             worst_pairs(comparison.views),
+            everything=everything,
         )
-        report = {folder / "report.html": text.encode()}
-        shown_files = _write(report | _figure_files(folder / "figures", drawn, rendered))
+        figures = {folder / "figures" / f"{item.drawing.id}.svg": item.svg for item in rendered}
+        files = [*_write({folder / "report.html": text.encode()} | figures | tables)]
         name_shared(folder / "report.html")
+        for one in set(old) - {*files, *extra, *parquet}:
+            one.unlink(missing_ok=True)
     except OSError as error:
         message = f"cannot write into {folder}: {error.strerror}. Choose another with --out."
         raise EvaluatorError(message) from error
@@ -103,20 +107,15 @@ def write_report(comparison: Comparison, folder: Path, beside: Beside | None = N
         content=results,
         results=path,
         report=folder / "report.html",
-        files=(*shown_files, *tables, *extra, *parquet),
-        not_written="; ".join(filter(None, (no_figures, no_parquet))) or None,
+        files=(*files, *extra, *parquet),
+        not_written="; ".join(filter(None, (no_figures, no_parquet, no_latex))) or None,
     )
 
 
-def _render(
-    drawn: Sequence[Drawing], beside: Beside | None
-) -> tuple[Sequence[Rendered], str | None]:
+def _render(drawn: Sequence[Drawing]) -> tuple[Sequence[Rendered], str | None]:
     """Draw the figures, or say why not; matplotlib is heavy and may be missing."""
     if not drawn:
         return [], None
-    found = None if beside is None else beside.take(drawn)
-    if found is not None:
-        return found, None
     try:
         from evaluator.report.figures import render  # noqa: PLC0415  # loads matplotlib
     except ModuleNotFoundError as error:
@@ -133,72 +132,39 @@ def _write(contents: Mapping[Path, bytes]) -> list[Path]:
     return list(contents)
 
 
-def _table_files(folder: Path, results: Results) -> dict[Path, bytes]:
-    return {
-        folder / f"{table.id}.{suffix}": write(table).encode()
-        for table in results.tables
-        for suffix, write in (("csv", as_csv), ("md", as_markdown), ("tex", as_latex))
-    }
+def _table_files(
+    folder: Path, results: Results, *, everything: bool, latex: bool
+) -> tuple[dict[Path, bytes], str | None]:
+    """Return the tables as CSV, the headline tables as LaTeX, and why the latter are missing."""
+    shown = shown_tables(results, everything=everything)
+    files = {folder / "tables" / f"{table.id}.csv": as_csv(table).encode() for table in shown}
+    try:
+        for table in results.tables if latex else ():
+            if table.id in HEADLINE_TABLES:
+                files[folder / "tables" / f"{table.id}.tex"] = as_latex(table).encode()
+    except ModuleNotFoundError as error:
+        if error.name not in LATEX_PACKAGES:
+            raise
+        return files, f"LaTeX not written: {error.name} is not installed ({INSTALL})"
+    return files, None
 
 
-def _figure_files(
-    folder: Path, drawn: Sequence[Drawing], rendered: Sequence[Rendered]
-) -> dict[Path, bytes]:
-    files = {folder / f"{drawing.id}.csv": as_csv(drawing.table).encode() for drawing in drawn}
-    for item in rendered:
-        files[folder / f"{item.drawing.id}.svg"] = item.svg
-        files[folder / f"{item.drawing.id}.pdf"] = item.pdf
-        files[folder / f"{item.drawing.id}.tex"] = figure_latex(item.drawing).encode()
-    return files
-
-
-def figure_latex(drawing: Drawing) -> str:
-    r"""Write a figure for a paper: as wide as it was drawn, or as the column where that is less.
-
-    The document needs ``\usepackage{graphicx}`` and the folder ``figures`` beside it.
-    """
-    width = f"{drawing.width_in:g}in"
-    lines = (
-        r"\begin{figure}[t]",
-        r"\centering",
-        rf"\includegraphics[width=\ifdim\linewidth<{width}\linewidth\else{width}\fi]"
-        rf"{{figures/{drawing.id}.pdf}}",
-        rf"\caption{{{latex(f'{drawing.title}. {drawing.caption}')}}}",
-        rf"\label{{fig:{drawing.id}}}",
-        r"\end{figure}",
-    )
-    return "\n".join(lines) + "\n"
-
-
-def _old_files(folder: Path, results: Results) -> list[Path]:
-    """List what the earlier evaluation wrote and this one will not; only what it says is its own.
+def _old_files(folder: Path) -> list[Path]:
+    """List what an earlier evaluation may have written; only what it says is its own.
 
     A paper that includes a table would else go on to print the numbers of another evaluation.
     """
-    now = {table.id for table in results.tables} | {"methods", "references"}
     try:
-        named = {path.stem for path in (folder / "tables").iterdir()} - now
-        if not named:
-            return []
         tables = json.loads((folder / "results.json").read_bytes())["tables"]
-        gone = sorted(named & {str(table["id"]) for table in tables})
+        named = [*(str(table["id"]) for table in tables), "methods", "references"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []  # nothing of ours
-    files = [folder / "tables" / f"{name}.{end}" for name in gone for end in ("csv", "md", "tex")]
-    if TRIALS in gone:
-        files += [folder / "trials.csv", folder / "trials.parquet"]
-    if GROUPS in gone:
-        files.append(folder / "groups.parquet")
-    return files
-
-
-def _remove_old(folder: Path, not_drawn: Sequence[NotDrawn], old: Sequence[Path]) -> None:
-    """Remove what an earlier evaluation wrote and this one has no data for."""
-    for path in old:
-        path.unlink(missing_ok=True)
-    for item in not_drawn:
-        for ending in ("csv", "svg", "pdf", "tex"):
-            (folder / "figures" / f"{item.id}.{ending}").unlink(missing_ok=True)
+    endings = ("csv", "md", "tex", "bib", "svg", "pdf")
+    files = [folder / "tables" / f"{name}.{end}" for name in named for end in endings]
+    drawn = (*FIGURES, *OLD_FIGURES)
+    files += [folder / "figures" / f"{name}.{end}" for name in drawn for end in endings]
+    ours = ("trials.csv", "trials.parquet", "groups.parquet", "measurements.parquet")
+    return [*files, *(folder / name for name in ours)]
 
 
 def _write_parquet(
@@ -233,7 +199,7 @@ def summary_text(results: Results, written: Written) -> str:
     understood = results.provenance.get("read_as")
     if isinstance(understood, list) and understood:
         parts.append("Read:\n" + "\n".join(f"  {line}" for line in understood))
-    shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("bands_")]
+    shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("end_points_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
     if lines or not results.measurements:

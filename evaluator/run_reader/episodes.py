@@ -32,35 +32,6 @@ from bridge.task.verdict import STAND_IN_ENGINE, Verdict
 from evaluator.errors import EvaluatorError
 from evaluator.run_reader.inventory import RunFile
 
-FACTORS = ("ik", "clearance", "terminal")
-Clauses = tuple[tuple[str, bool], ...]
-"""Name and answer: the three factors, and each success predicate by its kind (``terminal.inside``).
-
-One of several objects says no as soon as one object fails it; undecided clauses are left out.
-"""
-
-
-def clauses_of(verdict: Verdict | None) -> Clauses:
-    """List the decided clauses of a verdict; predicates only of the replayed side."""
-    if verdict is None:
-        return ()
-    found: dict[str, bool | None] = {name: getattr(verdict, name).value for name in FACTORS}
-    for finding in verdict.findings:
-        if finding.get("side", "replayed") != "replayed":
-            continue
-        name = f"terminal.{finding.get('kind', 'unnamed')}"
-        found[name] = (
-            _both(found[name], finding.get("value")) if name in found else (finding.get("value"))
-        )
-    return tuple((name, value) for name, value in found.items() if isinstance(value, bool))
-
-
-def _both(first: bool | None, second: bool | None) -> bool | None:
-    """And, in three-valued logic."""
-    if first is False or second is False:
-        return False
-    return None if first is None or second is None else True
-
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictSummary:
@@ -77,7 +48,6 @@ class VerdictSummary:
     """The cause alone, to be counted: ``collision``, ``unreachable`` ..."""
     failing_detail: str | None
     """Cause, bodies and time, to be read."""
-    clauses: Clauses = ()
     engine: str = ""
     failing_bodies: tuple[str, ...] = ()
     """What touched, came too close or was lost, in the verdict's order."""
@@ -99,7 +69,6 @@ def summarise_verdict(verdict: Verdict) -> VerdictSummary:
         first_failing=name,
         failing_cause=None if factor is None else factor.cause,
         failing_detail=_detail(verdict),
-        clauses=clauses_of(verdict),
         engine=verdict.engine,
         failing_bodies=() if factor is None else factor.bodies,
         failing_t_ns=None if factor is None else factor.first_t_ns,

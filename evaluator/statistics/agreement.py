@@ -451,35 +451,3 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
         regret=max(losses),
         regret_if_lucky=min(losses),
     )
-
-
-def over_tasks(rates: Mapping[str, Mapping[str, Number]]) -> dict[str, Fraction]:
-    """Return each candidate's mean rate over tasks, from task -> candidate -> rate.
-
-    Only candidates that every task has: others would be judged by easier or harder tasks.
-
-    Raises:
-        UndefinedStatisticError: Without tasks.
-    """
-    if not rates:
-        raise UndefinedStatisticError(statistic="decision", reason="there are no tasks")
-    shared = set.intersection(*(set(by_candidate) for by_candidate in rates.values()))
-    return {
-        name: sum((Fraction(by_candidate[name]) for by_candidate in rates.values()), Fraction(0))
-        / len(rates)
-        for name in sorted(shared)
-    }
-
-
-def without_each(names: list[str]) -> dict[str, list[str]]:
-    """Return for each name the others: what is left when one task is left out.
-
-    Raises:
-        UndefinedStatisticError: Below two names: nothing would be left.
-    """
-    if len(names) < 2:
-        raise UndefinedStatisticError(
-            statistic="leave one task out",
-            reason=f"{len(names)} task{'s' if len(names) != 1 else ''}; nothing would be left",
-        )
-    return {name: [other for other in names if other != name] for name in names}

@@ -1,4 +1,4 @@
-"""Uncertainty of agreement over groups: resampled groups, resampled policies, one left out.
+"""Uncertainty of agreement over groups: one group or one policy left out, or measured again.
 
 Points: other tasks of the same kind. Clusters: other policies, whose groups come together. What the
 same groups would give when measured again is another question: a ``Remeasured`` band of measurement
@@ -13,17 +13,16 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain, combinations
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from scipy.special import gammaln, ndtr, stdtrit
+from jaxtyping import Bool, Float64
+from scipy.special import stdtrit
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.agreement import Number, counted_groups, exact, floats
 from evaluator.statistics.intervals import LEVEL
-from evaluator.statistics.weighted import EPSILON, Values, values_of
+from evaluator.statistics.weighted import EPSILON, values_of
 
 NEAR = 1e-9
 """A value this close to its limit is at it; Fisher's z is endless there."""
@@ -127,170 +126,64 @@ SCALES: dict[str, Scale] = {
 """By the names of ``weighted.STATISTICS``."""
 
 
-MAX_EXACT = 30_000
-"""Up to so many different resamples are all visited: 9 units."""
-NUM_RESAMPLES = 9_999
 MIN_UNITS = 4
-"""Of three units, one resample in nine holds only one of them."""
+"""Below this, leaving one out says too little about the spread."""
 MAX_UNDEFINED = 0.05
-"""The part of the resamples that may leave the statistic undefined, as all the same group does."""
-METHODS = ("bootstrap", "bootstrap-expanded", "jackknife")
-"""What ``GroupSample.interval`` knows, from the narrowest to the widest."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resamples:
-    """How often each unit is in each resample, and how likely that resample is."""
-
-    counts: Int64[np.ndarray, "resamples units"]
-    weights: Float64[np.ndarray, " resamples"]
-    is_exact: bool
-
-
-def resamples(
-    num_units: int,
-    rng: np.random.Generator,
-    *,
-    max_exact: int = MAX_EXACT,
-    num_resamples: int = NUM_RESAMPLES,
-) -> Resamples:
-    """Return every resample with its probability when there are few, else random ones.
-
-    The K^K ordered draws of K units are C(2K - 1, K) different resamples, each as likely as its
-    multinomial coefficient says (Hall 1992, appendix I).
-
-    Args:
-        num_units: Groups, or clusters of them, that are drawn with replacement.
-        rng: Draws the resamples where they are too many to visit.
-        max_exact: All resamples are visited up to this many different ones.
-        num_resamples: Random resamples beyond that.
-    """
-    if math.comb(2 * num_units - 1, num_units) <= max_exact:
-        counts = _all_counts(num_units)
-        logs = gammaln(num_units + 1) - gammaln(counts + 1).sum(axis=1)
-        weights = np.exp(logs - num_units * math.log(num_units))
-        return Resamples(counts=counts, weights=weights, is_exact=True)
-    counts = rng.multinomial(num_units, np.full(num_units, 1 / num_units), size=num_resamples)
-    weights = np.full(num_resamples, 1 / num_resamples)
-    return Resamples(counts=counts.astype(np.int64), weights=weights, is_exact=False)
-
-
-def _all_counts(num_units: int) -> Int64[np.ndarray, "resamples units"]:
-    """Every way to share K draws among K units: bars between stars."""
-    if num_units == 1:
-        return np.ones((1, 1), dtype=np.int64)
-    slots = 2 * num_units - 1
-    flat = chain.from_iterable(combinations(range(slots), num_units - 1))
-    bars = np.fromiter(flat, dtype=np.int64).reshape(-1, num_units - 1)
-    ends = np.full((len(bars), 1), slots, dtype=np.int64)
-    edges = np.concatenate([np.full_like(ends, -1), bars, ends], axis=1)
-    return np.asarray(np.diff(edges, axis=1) - 1)
+"""The part of the draws that may leave the statistic undefined."""
 
 
 class GroupSample:
-    """Groups, what they belong to, and the interval of each statistic over them.
-
-    Resamples are drawn once, when the first method asks for them, and shared by all statistics.
-    """
+    """Groups, what they belong to, and the interval of each statistic over them."""
 
     def __init__(
         self,
         *,
         recorded: Sequence[Number],
         sim: Sequence[Number],
-        rng: np.random.Generator,
         clusters: Sequence[Hashable] | None = None,
-        max_exact: int = MAX_EXACT,
-        num_resamples: int = NUM_RESAMPLES,
     ) -> None:
         """Prepare.
 
         Args:
             recorded: Recorded rate of each group.
             sim: The twin's.
-            rng: Draws the resamples where they are too many to visit.
             clusters: What each group belongs to, for example its policy; groups alone without.
-            max_exact: All resamples are visited up to this many.
-            num_resamples: Random resamples beyond that.
         """
         self._recorded, self._sim = (floats(side) for side in exact("interval", recorded, sim))
         names = list(range(len(self._recorded))) if clusters is None else list(clusters)
         units = {name: place for place, name in enumerate(dict.fromkeys(names))}
         self._members = np.array([units[name] for name in names])
-        self._rng, self._limits = rng, (max_exact, num_resamples)
-        self._values: dict[str, Values] = {}
         self.num_units = len(units)
-        self.kind = "points" if clusters is None else "clusters"
+        self.method = "jackknife-points" if clusters is None else "jackknife-clusters"
 
-    @cached_property
-    def _drawn(self) -> Resamples:
-        max_exact, num = self._limits
-        return resamples(self.num_units, self._rng, max_exact=max_exact, num_resamples=num)
+    def interval(self, statistic: str, *, level: float = LEVEL) -> Interval:
+        """Return Student's t with the standard error of leaving one unit out (Tukey 1958).
 
-    @cached_property
-    def _counts(self) -> Float64[np.ndarray, "resamples groups"]:
-        return self._drawn.counts[:, self._members].astype(np.float64)
-
-    def _resampled(self, statistic: str) -> Values:
-        if statistic not in self._values:
-            found = values_of(statistic, self._counts, self._recorded, self._sim)
-            self._values[statistic] = found
-        return self._values[statistic]
-
-    def interval(self, statistic: str, method: str, *, level: float = LEVEL) -> Interval:
-        """Return the interval of a statistic by one of ``METHODS``.
-
-        bootstrap: percentiles of the resampled values. bootstrap-expanded: percentiles further
-        out, as Student's t is further out than the normal (Hesterberg 2015).
-        jackknife: Student's t with the standard error of leaving one unit out (Tukey 1958), on
-        Fisher's z or the logarithm where ``scales`` says so.
+        On Fisher's z or the logarithm where ``SCALES`` says so.
 
         Args:
             statistic: Its name in ``weighted.STATISTICS``.
-            method: One of ``METHODS``.
             level: Confidence level, 0 to 1.
 
         Raises:
-            UndefinedStatisticError: Below 4 units, when the statistic is undefined in more than
-                5 % of the resamples, at the end of its range, or when nothing varies.
+            UndefinedStatisticError: Below 4 units, when the statistic is undefined, at the end of
+                its range, or when nothing varies.
         """
-        what = f"{method} of {self.kind}"
-        if self.num_units < MIN_UNITS:
-            reason = f"{self.num_units} units; it needs at least {MIN_UNITS}"
-            raise UndefinedStatisticError(statistic=what, reason=reason)
-        if method == "jackknife":
-            low, high = self._jackknife(statistic, what, level)
-        else:
-            tail = (1 - level) / 2
-            if method == "bootstrap-expanded":
-                tail = expanded_tail(tail, self.num_units)
-            values, defined = self._resampled(statistic)
-            low, high = weighted_ends(values, defined, self._drawn.weights, tail, what)
-        return Interval(low=low, high=high, level=level, method=f"{method}-{self.kind}")
-
-    def _jackknife(self, statistic: str, what: str, level: float) -> tuple[float, float]:
         units = self.num_units
+        if units < MIN_UNITS:
+            reason = f"{units} units; it needs at least {MIN_UNITS}"
+            raise UndefinedStatisticError(statistic=self.method, reason=reason)
         left = (np.arange(units)[:, None] != self._members[None, :]).astype(np.float64)
         every = np.ones((1, len(self._members)))
         (value,), (known,) = values_of(statistic, every, self._recorded, self._sim)
         without, defined = values_of(statistic, left, self._recorded, self._sim)
         if not known or not defined.all():
             reason = "the statistic is undefined when one unit is left out"
-            raise UndefinedStatisticError(statistic=what, reason=reason)
+            raise UndefinedStatisticError(statistic=self.method, reason=reason)
         error = math.sqrt((units - 1) / units * float(((without - without.mean()) ** 2).sum()))
         reach = float(stdtrit(units - 1, 0.5 + level / 2)) * error
-        return SCALES[statistic].around(what, float(value), reach)
-
-
-def expanded_tail(tail: float, num_units: int) -> float:
-    """Return the tail at which a percentile is as far out as Student's t would have it.
-
-    Args:
-        tail: Probability that the interval leaves on each side.
-        num_units: Units that are resampled, 2 or more.
-    """
-    quantile = float(stdtrit(num_units - 1, tail))
-    return float(ndtr(quantile * math.sqrt(num_units / (num_units - 1))))
+        low, high = SCALES[statistic].around(self.method, float(value), reach)
+        return refuse_no_width(Interval(low=low, high=high, level=level, method=self.method))
 
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
@@ -342,7 +235,7 @@ def weighted_ends(
     if undefined > MAX_UNDEFINED:
         raise UndefinedStatisticError(
             statistic=statistic,
-            reason=f"the statistic is undefined in {100 * undefined:.0f} % of the resamples",
+            reason=f"the statistic is undefined in {100 * undefined:.0f} % of the draws",
         )
     order = np.argsort(values[defined], kind="stable")
     ordered, mass = values[defined][order], np.cumsum(weights[defined][order])
@@ -360,7 +253,7 @@ def refuse_no_width(interval: Interval) -> Interval:
     if interval.high - interval.low < NEAR:
         raise UndefinedStatisticError(
             statistic=interval.method,
-            reason="nothing varies between resamples: the interval would have no width",
+            reason="nothing varies: the interval would have no width",
         )
     return interval
 

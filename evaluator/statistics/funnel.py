@@ -1,4 +1,4 @@
-"""Where in a task the trials are lost: stage by stage, and over control steps."""
+"""Where in a task the trials are lost: stage by stage."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -50,44 +50,6 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
         )
         going = [trial for trial in going if trial[place]]
     return stages
-
-
-@dataclass(frozen=True, kw_only=True)
-class CurvePoint:
-    """How many units had succeeded up to a control step."""
-
-    step: int
-    done: int
-    n: int
-
-
-def success_curve(done_at: Sequence[int | None], num_steps: int) -> list[CurvePoint]:
-    """Count successes up to each control step, 1 .. num_steps.
-
-    Args:
-        done_at: The control step at which each unit (trial or object) had succeeded for good, None
-            where it never did.
-        num_steps: Control steps of the task.
-
-    Raises:
-        UndefinedStatisticError: Without units or steps.
-        ValueError: For a step outside 1 .. num_steps.
-    """
-    if not done_at or num_steps < 1:
-        raise UndefinedStatisticError(
-            statistic="success curve", reason="there are no units with known control steps"
-        )
-    if any(step is not None and not 1 <= step <= num_steps for step in done_at):
-        message = f"a control step lies outside 1 .. {num_steps}"
-        raise ValueError(message)
-    return [
-        CurvePoint(
-            step=step,
-            done=sum(at is not None and at <= step for at in done_at),
-            n=len(done_at),
-        )
-        for step in range(1, num_steps + 1)
-    ]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -454,43 +454,6 @@ def _population(
     return np.clip(r, -1.0, 1.0), mean_s - mean_r
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ranked:
-    """One candidate's place in a ranking."""
-
-    name: str
-    mean: float
-    """Posterior mean of its recorded rate."""
-    best: float
-    """Probability that its recorded rate is the highest."""
-    tie: int
-    """From 1; candidates of one number cannot be told apart."""
-
-
-def ranking(
-    names: Sequence[str], draws: Float64[np.ndarray, "draws candidates"], *, level: float = LEVEL
-) -> list[Ranked]:
-    """Rank candidates; one whose order to the first of a tie is not certain belongs to that tie.
-
-    Args:
-        names: The candidates.
-        draws: Their true rates.
-        level: Probability of an order from which on two candidates differ.
-    """
-    means = draws.mean(axis=0)
-    top = (draws == draws.max(axis=1, keepdims=True)).astype(np.float64)
-    best = (top / top.sum(axis=1, keepdims=True)).mean(axis=0)
-    found: list[Ranked] = []
-    leader, tie = -1, 0
-    for place in np.argsort(-means, kind="stable"):
-        if leader < 0 or (draws[:, leader] > draws[:, place]).mean() >= level:
-            leader, tie = int(place), tie + 1
-        found.append(
-            Ranked(name=names[place], mean=float(means[place]), best=float(best[place]), tie=tie)
-        )
-    return found
-
-
 def chosen_is_best(
     draws: Draws, picked: Sequence[int], over: Callable[[np.ndarray], np.ndarray]
 ) -> float:

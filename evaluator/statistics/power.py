@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Int64
-from scipy.special import ndtr
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.intervals import normal_quantile
@@ -15,36 +14,6 @@ ALPHA = 0.05
 POWER = 0.8
 MAX_PAIRS = 4_000
 """The exact paired power counts every outcome out; beyond this a normal formula is as good."""
-
-
-def power_unpaired(
-    p_first: float, p_second: float, n_per_arm: int, *, alpha: float = ALPHA, sides: int = 2
-) -> float:
-    """Return the chance that n trials per arm show the difference of two rates.
-
-    Normal approximation with the pooled variance under no difference and the separate variances
-    under the difference (Fleiss, Levin and Paik 2003, section 4.3, no continuity correction).
-
-    Args:
-        p_first: True rate of the first arm, 0 to 1.
-        p_second: True rate of the second arm.
-        n_per_arm: Trials in each arm.
-        alpha: Chance of a false alarm that the test allows.
-        sides: 2 for a difference in either direction, 1 where only one direction counts.
-
-    Raises:
-        UndefinedStatisticError: Without trials, or for equal rates.
-    """
-    _check_rates(p_first, p_second)
-    if n_per_arm < 1:
-        raise UndefinedStatisticError(statistic="power", reason="there are no trials")
-    z = normal_quantile(1 - alpha / sides)
-    pooled, separate = _spreads(p_first, p_second)
-    distance = abs(p_second - p_first) * math.sqrt(n_per_arm)
-    if separate == 0:
-        return 1.0 if distance > z * pooled else 0.0
-    power = float(ndtr((distance - z * pooled) / separate))
-    return power + (float(ndtr((-distance - z * pooled) / separate)) if sides == 2 else 0.0)
 
 
 def trials_needed(

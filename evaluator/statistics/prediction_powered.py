@@ -6,7 +6,7 @@ further out than the tried ones reach?
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -19,7 +19,7 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
 from evaluator.statistics.differences import boschloo
 from evaluator.statistics.gate import Confusion
-from evaluator.statistics.intervals import LEVEL, check_count, normal_quantile
+from evaluator.statistics.intervals import LEVEL, check_count
 
 MIN_STARTS = 2
 """On each side; a single start has no neighbour of its own kind."""
@@ -62,32 +62,6 @@ def starts_alike(tried: Starts, others: Float64[np.ndarray, "num_others num_coor
         as_large += int((_energy(splits, distances_m) >= largest).sum())
         num_splits += len(splits)
     return as_large / num_splits if exact else (1 + as_large) / (1 + num_splits)
-
-
-def starts_covered(
-    tried: Starts, others: Float64[np.ndarray, "num_others num_coordinates"]
-) -> tuple[int, int]:
-    """Count the other starts that lie no further from a tried one than tried ones lie apart.
-
-    Further means: beyond the largest distance of a tried start from its nearest tried neighbour.
-    Were both drawn alike, about n / (n + 1) of the others would be covered by n tried ones.
-
-    Args:
-        tried: Coordinates of all objects [m], one row for each start with a robot trial.
-        others: The same of the starts that only the twin has.
-
-    Returns:
-        Covered starts, and all others that were looked at.
-
-    Raises:
-        UndefinedStatisticError: With fewer than two starts on a side.
-    """
-    _refuse_few(tried, others)
-    between_m = _distances(tried, tried)
-    np.fill_diagonal(between_m, np.inf)
-    reach_m = float(between_m.min(axis=1).max())
-    nearest_m = np.array([_distances(row[None], tried).min() for row in others])
-    return int((nearest_m <= reach_m * (1 + ROUNDING)).sum()), len(others)
 
 
 def _refuse_few(tried: np.ndarray, others: np.ndarray) -> None:
@@ -141,9 +115,6 @@ GRID = 40
 """Equally likely values of each of three rates; the interval's ends are then right to 0.002."""
 PRIOR = 0.5
 """Jeffreys' prior, chosen by coverage."""
-MIN_PAIRS_CLT = 100
-"""Below this the central limit theorem promises too much: with 10 pairs 84 to 88 % are covered
-where 95 % are claimed (design page, finding 6)."""
 MAX_SAVED = 10_000
 SHOWN_FROM = 0.025
 """One-sided p from which on a twin's answers are worth something."""
@@ -204,67 +175,6 @@ def post_stratified(pairs: Confusion, sim_k: int, sim_n: int, *, level: float = 
 def _values(k: int, n: int) -> Float64[np.ndarray, " values"]:
     """Equally likely values of a rate with posterior Beta(k + 1/2, n - k + 1/2)."""
     return np.asarray(betaincinv(k + PRIOR, n - k + PRIOR, (np.arange(GRID) + 0.5) / GRID))
-
-
-def ppi_plus_plus(
-    real: Sequence[bool],
-    sim_paired: Sequence[float],
-    sim_alone: Sequence[float],
-    *,
-    level: float = LEVEL,
-) -> Estimate:
-    """Estimate the real rate by prediction-powered inference (Angelopoulos et al. 2023, PPI++).
-
-    theta = lambda mean(sim_alone) + mean(real - lambda sim_paired), with
-    lambda = cov(real, sim_paired) / ((1 + n/N) var(sim)) cut to 0..1, and a normal interval.
-
-    Args:
-        real: Outcomes of the n robot trials.
-        sim_paired: What the twin said of them: answers, or success probabilities.
-        sim_alone: What it said of N further starts.
-        level: Confidence level.
-
-    Raises:
-        UndefinedStatisticError: Below 100 robot trials, without further starts, or when a side
-            does not vary: the formula would give an interval of no width.
-        ValueError: When real and sim_paired differ in length.
-    """
-    y, f, more = (np.array(side, dtype=np.float64) for side in (real, sim_paired, sim_alone))
-    if len(y) != len(f):
-        message = f"{len(y)} robot trials but {len(f)} answers of the twin"
-        raise ValueError(message)
-    why = _not_for_ppi(y, f, more)
-    if why is not None:
-        raise UndefinedStatisticError(statistic="PPI++", reason=why)
-    n, num_more = len(y), len(more)
-    covariance = float(np.mean((y - y.mean()) * (f - f.mean())))
-    variance = float(np.concatenate([f, more]).var(ddof=1))
-    power = min(1.0, max(0.0, covariance / ((1 + n / num_more) * variance)))
-    value = power * float(more.mean()) + float((y - power * f).mean())
-    error = math.sqrt(float((power * more).var()) / num_more + float((y - power * f).var()) / n)
-    if error == 0:
-        reason = "the estimate has no spread; use post-stratified Beta"
-        raise UndefinedStatisticError(statistic="PPI++", reason=reason)
-    half = normal_quantile(0.5 + level / 2) * error
-    interval = Interval(
-        low=max(0.0, value - half), high=min(1.0, value + half), level=level, method="ppi++"
-    )
-    return Estimate(value=min(1.0, max(0.0, value)), interval=interval)
-
-
-def _not_for_ppi(y: np.ndarray, f: np.ndarray, more: np.ndarray) -> str | None:
-    if len(y) < MIN_PAIRS_CLT:
-        return (
-            f"{len(y)} robot trials; the normal approximation needs {MIN_PAIRS_CLT}. "
-            "Use post-stratified Beta"
-        )
-    if not len(more):
-        return "there are no further starts in the twin"
-    if y.min() == y.max():
-        return "every robot trial ended the same; use Wilson"
-    if f.min() == f.max():
-        return "the twin said the same of every robot trial; use Wilson"
-    return None
 
 
 def applicability(paired_k: int, paired_n: int, alone_k: int, alone_n: int) -> float:

@@ -13,8 +13,6 @@ from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from evaluator.compare import compare_run
-from evaluator.compare.band_measurements import PATH_SAMPLES
 
 SIDES = {"": 3, "engine:good": 2, "engine:flat": 1}
 """Tag and number of runs."""
@@ -54,24 +52,6 @@ def imported(tmp_path: Path) -> RunFolder:
             name = f"{tag.removeprefix('engine:') or 'real'}_{number}"
             _write(run, name, "push", tag, 0.01 * number)
     return run
-
-
-def test_paths_are_means_of_the_runs_and_the_reach_holds_each(imported: RunFolder) -> None:
-    paths = {(path.body, path.side): path for path in compare_run(imported).paths}
-    assert set(paths) == {(b, s) for b in ("tool", "cup") for s in ("recorded", "good", "flat")}
-    tool = paths["tool", "recorded"]
-    assert tool.num_runs == 3
-    mean, low, high = (np.array(part) for part in (tool.mean_m, tool.low_m, tool.high_m))
-    assert mean.shape == (PATH_SAMPLES, 3)
-    assert mean[:, 1] == pytest.approx(0.01)
-    assert low[:, 1] == pytest.approx(0.0)
-    assert high[:, 1] == pytest.approx(0.02)
-    assert (low <= mean + 1e-12).all()
-    assert (mean <= high + 1e-12).all()
-    assert mean[0, 0] == pytest.approx(0.3, abs=0.011)  # the first 10 mm count as waiting
-    assert mean[-1, 0] == pytest.approx(0.7, abs=0.011)
-    flat = np.array(paths["cup", "flat"].mean_m)
-    assert np.ptp(flat[:, 0]) == pytest.approx(0.0)
 
 
 def test_hostile_tasks_and_engines_are_text(synthetic: ModuleType, tmp_path: Path) -> None:

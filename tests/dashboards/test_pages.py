@@ -357,7 +357,7 @@ def test_the_views_follow_the_few_numbers_to_read_first(browser: Any) -> None:
     assert first < views < all_numbers
     assert page[first:views].count("<article") <= 4
     assert "held out: " not in words(page[first:views])
-    assert "MS-SSIM" in words(page[all_numbers:])
+    assert "SSIM" in words(page[all_numbers:])
 
 
 def test_a_run_that_is_named_by_a_relative_path_is_shown(

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
+from kinova_data import episodes
 
 pytestmark = pytest.mark.slow
 Gst = Callable[..., subprocess.CompletedProcess[str]]
@@ -55,8 +56,7 @@ def test_real_robot_runs_are_compared_with_their_simulators(
     tmp_path: Path, gst: Gst, shared_data: Shared
 ) -> None:
     kinova, run = shared_data("robot_realitygap_kinova_real_vs_sim"), tmp_path / "kinova"
-    imported = gst("import", "kinova", str(kinova), str(run), "--json")
-    assert imported.returncode == 0, imported.stderr
+    assert episodes.main([str(kinova), str(run)]) == 0
     evaluated = gst("evaluate", str(run), "--json")
     assert evaluated.returncode == 0, evaluated.stderr[-3000:]
     results = json.loads((run / "results" / "results.json").read_text())

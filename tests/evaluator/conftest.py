@@ -109,7 +109,7 @@ class RunMaker:
             tags=tags,
         )
         if outcome is None and recorded is not None:
-            outcome = Outcome(result=recorded, k=recorded == "success")
+            outcome = Outcome(result=recorded, k=int(recorded == "success"))
         plan_id = f"plan_{name}"
         with EpisodeWriter(self.run.episodes_dir / f"{name}.mcap") as writer:
             writer.describe(info, outcome=outcome)

@@ -1,6 +1,5 @@
 """Rank agreement, error, calibration, resampling and decisions over groups."""
 
-import itertools
 import math
 from fractions import Fraction
 
@@ -11,12 +10,11 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement
-from evaluator.statistics.agreement import choose, over_tasks, without_each
+from evaluator.statistics.agreement import choose
 from evaluator.statistics.bootstrap import (
     GroupSample,
     remeasure_counts,
     remeasure_paired,
-    resamples,
     student_interval,
 )
 
@@ -71,69 +69,25 @@ def test_exact_counts_see_ties_that_floats_would_miss() -> None:
     assert agreement.mmrv(recorded=recorded, sim=sim) == 0
 
 
-@pytest.mark.parametrize("num_units", [1, 2, 4, 5])
-def test_few_units_are_resampled_exactly(num_units: int) -> None:
-    drawn = resamples(num_units, rng())
-    assert drawn.is_exact
-    assert drawn.weights.sum() == pytest.approx(1)
-    assert (drawn.counts.sum(axis=1) == num_units).all()
-    assert len(drawn.counts) == math.comb(2 * num_units - 1, num_units)
-    ordered = itertools.product(range(num_units), repeat=num_units)
-    shares: dict[tuple[int, ...], float] = {}
-    for draw in ordered:
-        key = tuple(draw.count(unit) for unit in range(num_units))
-        shares[key] = shares.get(key, 0) + num_units**-num_units
-    for counts, weight in zip(drawn.counts.tolist(), drawn.weights, strict=True):
-        assert weight == pytest.approx(shares[tuple(counts)])
-
-
-def test_many_units_are_drawn() -> None:
-    drawn = resamples(30, rng())
-    assert not drawn.is_exact
-    assert len(drawn.weights) == 9999
-
-
-@pytest.mark.parametrize("statistic", ["pearson", "bias", "mae"])
-def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str) -> None:
-    recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
-    plain = {
-        "pearson": agreement.pearson,
-        "bias": lambda x, y: agreement.bias(recorded=x, sim=y),
-        "mae": lambda x, y: agreement.mean_absolute_error(recorded=x, sim=y),
-    }[statistic]
-    values = []
-    for draw in itertools.product(range(5), repeat=5):
-        try:
-            values.append(plain([recorded[i] for i in draw], [sim[i] for i in draw]))
-        except UndefinedStatisticError:
-            continue
-    sample = GroupSample(recorded=recorded, sim=sim, rng=rng())
-    interval = sample.interval(statistic, "bootstrap")
-    low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
-    assert interval.low == pytest.approx(low, abs=1e-9)
-    assert interval.high == pytest.approx(high, abs=1e-9)
-    assert interval.method == "bootstrap-points"
-
-
-def test_clusters_are_resampled_together() -> None:
+def test_clusters_are_left_out_together() -> None:
     recorded = [0.1, 0.2, 0.5, 0.6, 0.8, 0.9, 0.3, 0.4]
-    sim = [0.2, 0.1, 0.6, 0.5, 0.9, 0.8, 0.4, 0.3]
-    clusters = list("aabbccdd")
-    sample = GroupSample(recorded=recorded, sim=sim, rng=rng(), clusters=clusters)
-    interval = sample.interval("bias", "bootstrap")
-    # Within every cluster the gaps cancel, so no resample of clusters has a bias.
-    assert interval.low == pytest.approx(0, abs=1e-12)
-    assert interval.high == pytest.approx(0, abs=1e-12)
-    assert interval.method == "bootstrap-clusters"
+    sim = [0.3, 0.1, 0.6, 0.7, 1.0, 0.8, 0.4, 0.6]
+    sample = GroupSample(recorded=recorded, sim=sim, clusters=list("aabbccdd"))
+    gaps = np.subtract(sim, recorded)
+    without = [gaps[np.arange(8) // 2 != left].mean() for left in range(4)]
+    error = math.sqrt(3 / 4 * float(((without - np.mean(without)) ** 2).sum()))
+    found = sample.interval("bias")
+    assert (found.high - found.low) / 2 == pytest.approx(3.182446 * error, abs=1e-6)
+    assert found.method == "jackknife-clusters"
 
 
-def test_too_few_units_and_too_many_constant_resamples_are_refused() -> None:
-    few = GroupSample(recorded=[0, 1, 1], sim=[0, 1, 0], rng=rng())
+def test_too_few_units_and_one_that_all_depends_on_are_refused() -> None:
+    few = GroupSample(recorded=[0, 1, 1], sim=[0, 1, 0])
     with pytest.raises(UndefinedStatisticError, match="3 units; it needs at least 4"):
-        few.interval("bias", "bootstrap")
-    constant = GroupSample(recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3], rng=rng())
-    with pytest.raises(UndefinedStatisticError, match="undefined in 32 % of the resamples"):
-        constant.interval("pearson", "bootstrap")
+        few.interval("bias")
+    constant = GroupSample(recorded=[0, 1, 1, 1], sim=[0.1, 0.5, 0.2, 0.3])
+    with pytest.raises(UndefinedStatisticError, match="undefined when one unit is left out"):
+        constant.interval("pearson")
 
 
 def test_student_gives_no_interval_of_no_width() -> None:
@@ -178,11 +132,3 @@ def test_ties_are_sets_and_the_worst_of_them_counts() -> None:
         choose(recorded={"a": 1}, sim={"a": 1})
     with pytest.raises(ValueError, match="different candidates"):
         choose(recorded={"a": 1}, sim={"b": 1})
-
-
-def test_means_over_tasks_use_candidates_that_every_task_has() -> None:
-    rates = {"cube": {"a": 1, "b": 0.5}, "duck": {"a": 0, "b": 0.5, "c": 1}}
-    assert over_tasks(rates) == {"a": Fraction(1, 2), "b": Fraction(1, 2)}
-    assert without_each(["x", "y"]) == {"x": ["y"], "y": ["x"]}
-    with pytest.raises(UndefinedStatisticError, match="1 task; nothing would be left"):
-        without_each(["x"])

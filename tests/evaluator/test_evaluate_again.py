@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -286,17 +285,6 @@ def test_the_command_keeps_and_forgets(
     assert opened != []
     assert (six_trials.run.results_dir / "results.json").read_bytes() == first
     assert "results/cache" not in capsys.readouterr().err
-
-
-def test_the_command_works_without_pyarrow_and_says_so(
-    six_trials: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "evaluator.cache_file", raising=False)
-    monkeypatch.delattr("evaluator.cache_file", raising=False)
-    assert evaluate(six_trials.run.path) == 0
-    assert "nothing is kept for the next evaluation" in capsys.readouterr().err
-    assert not list((six_trials.run.results_dir / FOLDER).glob("*.parquet"))
 
 
 derived_files = st.lists(

@@ -14,7 +14,7 @@ from evaluator.statistics.calibration import (
     calibration_error_interval,
     perfect_forecaster,
 )
-from evaluator.statistics.funnel import failure_taxonomy, funnel, success_curve
+from evaluator.statistics.funnel import failure_taxonomy, funnel
 from evaluator.statistics.gate import (
     Confusion,
     break_even,
@@ -29,7 +29,6 @@ from evaluator.statistics.intervals import wilson
 from evaluator.statistics.prediction_powered import (
     applicability,
     post_stratified,
-    ppi_plus_plus,
     trials_saved,
 )
 from evaluator.statistics.sequential import (
@@ -96,15 +95,6 @@ def test_a_stage_after_a_failed_one_is_not_reached() -> None:
         funnel([[True]], ["pick", "carry", "release"])
     with pytest.raises(UndefinedStatisticError, match="no trials with labelled stages"):
         funnel([], ["pick"])
-
-
-def test_a_success_curve_never_falls() -> None:
-    curve = success_curve([3, None, 1, 3], 4)
-    assert [(p.step, p.done, p.n) for p in curve] == [(1, 1, 4), (2, 1, 4), (3, 3, 4), (4, 3, 4)]
-    with pytest.raises(ValueError, match="outside 1"):
-        success_curve([5], 4)
-    with pytest.raises(UndefinedStatisticError, match="no units"):
-        success_curve([], 4)
 
 
 def test_failures_are_counted_most_frequent_first() -> None:
@@ -281,20 +271,6 @@ def test_the_stratified_interval_agrees_with_drawing_from_the_posterior() -> Non
     low, high = np.quantile(rates, [0.025, 0.975])
     assert found.interval.low == pytest.approx(low, abs=4e-3)
     assert found.interval.high == pytest.approx(high, abs=4e-3)
-
-
-def test_ppi_is_refused_where_its_interval_would_lie() -> None:
-    real, said = [True] * 60 + [False] * 40, [1.0] * 70 + [0.0] * 30
-    with pytest.raises(UndefinedStatisticError, match=r"10 robot trials; .* needs 100"):
-        ppi_plus_plus(real[:10], said[:10], said)
-    with pytest.raises(UndefinedStatisticError, match="no further starts"):
-        ppi_plus_plus(real, said, [])
-    with pytest.raises(UndefinedStatisticError, match="ended the same"):
-        ppi_plus_plus([True] * 100, said, said)
-    with pytest.raises(UndefinedStatisticError, match="said the same"):
-        ppi_plus_plus(real, [1.0] * 100, said)
-    found = ppi_plus_plus(real, said, said * 10)
-    assert found.interval.low < found.value < found.interval.high
 
 
 def test_starts_that_were_picked_forbid_the_estimate() -> None:

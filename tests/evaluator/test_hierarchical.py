@@ -18,7 +18,6 @@ from evaluator.statistics.hierarchical import (
     estimate,
     from_normal,
     population,
-    ranking,
     to_normal,
 )
 
@@ -225,15 +224,6 @@ def test_the_population_has_the_correlation_that_draws_have() -> None:
 def test_too_little_is_refused(counts: Counts) -> None:
     with pytest.raises(UndefinedStatisticError):
         AgreementModel(groups_of(counts))
-
-
-def test_candidates_that_cannot_be_told_apart_share_a_place() -> None:
-    rng = np.random.default_rng(1)
-    draws = np.stack([rng.normal(m, 0.05, 4000) for m in (0.2, 0.8, 0.78)], axis=1)
-    found = {item.name: item for item in ranking(["bad", "good", "also good"], draws)}
-    assert found["good"].tie == found["also good"].tie == 1
-    assert found["bad"].tie == 2
-    assert found["good"].best + found["also good"].best == pytest.approx(1, abs=1e-3)
 
 
 def test_the_interval_of_a_mean_gain_covers() -> None:

@@ -9,7 +9,7 @@ from evaluator.compare.prediction_powered import assisted_rates
 from evaluator.compare.rows import TrialRow
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement
-from evaluator.statistics.prediction_powered import starts_alike, starts_covered
+from evaluator.statistics.prediction_powered import starts_alike
 
 
 def energy(x: np.ndarray, y: np.ndarray) -> float:
@@ -50,29 +50,13 @@ def test_the_same_starts_give_the_same_answer_and_it_is_never_zero() -> None:
 
 def test_starts_that_are_all_the_same_tell_nothing() -> None:
     assert starts_alike(np.ones((4, 3)), np.ones((6, 3))) == 1.0
-    assert starts_covered(np.ones((4, 3)), np.ones((6, 3))) == (6, 6)
-
-
-def test_a_start_further_out_than_tried_ones_lie_apart_is_not_covered() -> None:
-    tried = np.array([[0.0], [0.1], [0.3]])  # 0.2 from its nearest neighbour at most
-    others = np.array([[0.05], [0.45], [0.5], [0.51], [-0.2], [-0.21]])
-    assert starts_covered(tried, others) == (4, 6)
-
-
-def test_drawn_alike_about_n_of_n_plus_one_are_covered() -> None:
-    rng = np.random.default_rng(4)
-    shares = []
-    for _ in range(200):
-        covered, total = starts_covered(rng.random((10, 2)), rng.random((10, 2)))
-        shares.append(covered / total)
-    assert np.mean(shares) == pytest.approx(10 / 11, abs=0.03)
 
 
 def test_one_start_is_too_few() -> None:
     with pytest.raises(UndefinedStatisticError, match="1 localised starts with a robot trial"):
         starts_alike(np.zeros((1, 2)), np.zeros((3, 2)))
     with pytest.raises(UndefinedStatisticError, match="0 localised starts only the twin has"):
-        starts_covered(np.zeros((3, 2)), np.zeros((0, 2)))
+        starts_alike(np.zeros((3, 2)), np.zeros((0, 2)))
 
 
 def row(number: int, recorded: bool | None, place: tuple[float, float, float] | None) -> TrialRow:
@@ -109,24 +93,21 @@ def test_starts_spread_alike_are_estimated_and_the_overlap_stands_beside_it() ->
     numbers = found(rows_at(0.4))
     assert numbers["recorded_rate"].value is not None
     assert numbers["starts_alike_p"].value > 0.05  # type: ignore[operator]
-    assert numbers["starts_covered"].value > 0.8  # type: ignore[operator]
-    assert numbers["starts_covered"].n == 48
-    assert "positions of box, cube" in numbers["starts_covered"].definition
+    assert numbers["starts_alike_p"].n == 48
+    assert "positions of box, cube" in numbers["starts_alike_p"].definition
 
 
 def test_starts_tried_in_one_corner_give_no_estimate() -> None:
     numbers = found(rows_at(0.08))
-    for name in ("recorded_rate", "recorded_rate_ppi", "trials_saved"):
+    for name in ("recorded_rate", "trials_saved"):
         assert "lie elsewhere" in str(numbers[name].reason_if_undefined)
     assert numbers["starts_alike_p"].value < 0.01  # type: ignore[operator]
-    assert numbers["starts_covered"].value < 0.3  # type: ignore[operator]
 
 
 def test_without_localised_objects_the_overlap_says_why_and_forbids_nothing() -> None:
     numbers = found(rows_at(0.08, localised=False))
     assert numbers["recorded_rate"].value is not None
-    for name in ("starts_alike_p", "starts_covered"):
-        assert "no object was localised" in str(numbers[name].reason_if_undefined)
+    assert "no object was localised" in str(numbers["starts_alike_p"].reason_if_undefined)
 
 
 def test_starts_without_one_of_the_objects_are_left_out_and_counted() -> None:

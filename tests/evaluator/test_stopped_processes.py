@@ -7,8 +7,7 @@ from multiprocessing.connection import wait
 import pytest
 
 from bridge import process_pool
-from bridge.process_pool import ProcessPool
-from evaluator.report.figures.beside import Beside
+from bridge.process_pool import ProcessPool, Worker, WorkerLostError
 
 LARGE = 3_000_000
 """Bytes; a pipe holds 65 536."""
@@ -18,10 +17,11 @@ def test_a_process_that_does_not_listen_is_not_sent_to_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(process_pool, "PATIENCE_S", 0.1)
-    second = Beside()
+    second = Worker(quiet=True)
     os.kill(second.process.pid, signal.SIGSTOP)
-    second.send(bytes(LARGE))
-    assert second.take([]) is None
+    with pytest.raises(WorkerLostError):
+        second.begin(bytes, bytes(LARGE))
+    second.close()
     assert second.process.returncode == -signal.SIGKILL
 
 

@@ -199,11 +199,9 @@ def test_every_number_about_views_has_its_stamp(maker: Any) -> None:
     write_views(maker.run.derived_dir)
     results = compare_run(maker.run).results()
     numbers = [m for m in results.measurements if m.id.startswith("views.all.")]
-    for metric in ("ssim_zero", "ssim_reflect", "gmsd", "ms_ssim", "ssim_objects_black"):
+    for metric in ("ssim_zero", "ssim_reflect", "ssim_objects_black"):
         assert any(m.id == f"views.all.{metric}" for m in numbers), metric
     for number in numbers:
         if number.id != "views.all.lpips" and "depth" not in number.id:
             assert "44 x 36" in number.definition
             assert "split every 8th frame" in number.definition
-    table = next(t for t in results.tables if t.id == "views_protocol")
-    assert len({row[2] for row in table.rows}) == len(table.rows)  # no two are alike

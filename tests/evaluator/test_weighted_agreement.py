@@ -1,6 +1,5 @@
 """Statistics over many weighted sets at once are the plain ones, set by set."""
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,12 +7,10 @@ import numpy as np
 import pytest
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.statistics import agreement, bootstrap
+from evaluator.statistics import agreement
 from evaluator.statistics.bootstrap import (
-    METHODS,
     SCALES,
     GroupSample,
-    expanded_tail,
     remeasure_counts,
     remeasure_paired,
 )
@@ -72,47 +69,20 @@ def test_sets_with_rates_of_their_own_are_the_plain_statistic_of_each(statistic:
             assert value == pytest.approx(wanted, abs=1e-12)
 
 
-@pytest.mark.parametrize("statistic", PLAIN)
-def test_an_exact_bootstrap_is_the_bootstrap_of_all_ordered_draws(statistic: str) -> None:
-    recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
-    found = (
-        plain(statistic, [recorded[i] for i in draw], [sim[i] for i in draw])
-        for draw in itertools.product(range(5), repeat=5)
-    )
-    values = [value for value in found if value is not None]
-    # Sets with fewer than three different groups are undefined for the plain forms in other places.
-    sample = GroupSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
-    interval = sample.interval(statistic, "bootstrap")
-    low, high = np.quantile(values, [0.025, 0.975], method="inverted_cdf")
-    assert interval.low == pytest.approx(low, abs=1e-9)
-    assert interval.high == pytest.approx(high, abs=1e-9)
-
-
 def test_a_jackknife_of_a_mean_is_students_interval() -> None:
     from evaluator.statistics.bootstrap import student_interval
 
     recorded, sim = [0.1, 0.5, 0.6, 0.9, 0.3], [0.2, 0.4, 0.9, 0.8, 0.35]
-    sample = GroupSample(recorded=recorded, sim=sim, rng=np.random.default_rng(0))
-    mine = sample.interval("bias", "jackknife")
+    sample = GroupSample(recorded=recorded, sim=sim)
+    mine = sample.interval("bias")
     theirs = student_interval([s - r for r, s in zip(recorded, sim, strict=True)])
     assert (mine.low, mine.high) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
     assert mine.method == "jackknife-points"
 
 
-def test_an_expanded_bootstrap_is_wider_and_tends_to_the_plain_one() -> None:
-    assert expanded_tail(0.025, 5) < 0.01
-    assert expanded_tail(0.025, 10_000) == pytest.approx(0.025, abs=1e-4)
-    rng = np.random.default_rng(1)
-    recorded, sim = rng.random((2, 8)).tolist()
-    sample = GroupSample(recorded=recorded, sim=sim, rng=rng)
-    plain_one, wide = (sample.interval("mae", method) for method in METHODS[:2])
-    assert wide.low <= plain_one.low
-    assert wide.high >= plain_one.high
-
-
 def test_no_interval_is_given_at_the_end_of_a_range_or_without_variation() -> None:
     up = [0.1, 0.2, 0.3, 0.4, 0.5]
-    sample = GroupSample(recorded=up, sim=up, rng=np.random.default_rng(0))
+    sample = GroupSample(recorded=up, sim=up)
     for statistic, why in (
         ("kendall", "no width"),
         ("mae", "no width"),
@@ -120,31 +90,10 @@ def test_no_interval_is_given_at_the_end_of_a_range_or_without_variation() -> No
         ("slope", "no width"),
     ):
         with pytest.raises(UndefinedStatisticError, match=why):
-            sample.interval(statistic, "jackknife")
+            sample.interval(statistic)
     counts = [(1, 9), (3, 9), (5, 9), (7, 9)]
     with pytest.raises(UndefinedStatisticError, match="1 exactly, the end of its range"):
         remeasure_counts(counts, counts, rng=np.random.default_rng(0)).band("kendall")
-
-
-def test_thousands_of_resamples_are_drawn_once_for_all_statistics(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Drawing anew for each statistic is what would take seconds."""
-    drawn: list[bootstrap.Resamples] = []
-    draw = bootstrap.resamples
-
-    def counted(*arguments: Any, **options: Any) -> bootstrap.Resamples:
-        drawn.append(draw(*arguments, **options))
-        return drawn[-1]
-
-    monkeypatch.setattr(bootstrap, "resamples", counted)
-    rng = np.random.default_rng(2)
-    recorded, sim = (rng.integers(0, 11, (2, 24)) / 10).tolist()
-    clusters = [i // 3 for i in range(24)]  # 8 policies: 6,435 resamples, all visited
-    sample = GroupSample(recorded=recorded, sim=sim, rng=rng, clusters=clusters)
-    for statistic in STATISTICS:
-        sample.interval(statistic, "bootstrap")
-    assert [len(found.weights) for found in drawn] == [6_435]
 
 
 @pytest.mark.parametrize("statistic", ["pearson", "mae", "bias", "slope", "mmrv-recorded"])

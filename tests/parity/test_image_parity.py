@@ -8,12 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch.nn import functional
 
-from bridge.media.image_quality import ms_ssim, psnr_db, ssim, ssim_maps
-from evaluator.metrics.image import gmsd
+from bridge.media.image_quality import psnr_db, ssim, ssim_maps
 
 pytestmark = pytest.mark.parity
 EXACT = 1e-9
@@ -103,84 +101,3 @@ def test_the_three_customs_are_three_numbers() -> None:
     maps = ssim_maps(*pair(0, (32, 48)))
     found = [maps.mean(padding) for padding in ("valid", "zero", "reflect")]
     assert min(abs(a - b) for a in found for b in found if a != b) > 1e-4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(176, 180), (201, 177)])
-def test_ms_ssim_agrees_with_torchmetrics_where_its_last_scale_is_mirrored(
-    size: tuple[int, int],
-) -> None:
-    from torchmetrics.functional.image import (
-        multiscale_structural_similarity_index_measure as theirs,
-    )
-
-    images = pair(1, size)
-    recorded, replayed = tensors(images)
-    expected = float(theirs(replayed, recorded, data_range=1.0))
-    # torchmetrics keeps the exponents as float32: 0.2856 is 0.28560001.
-    assert ms_ssim(*images, padding="reflect") == pytest.approx(expected, abs=2e-8)
-    weights = torch.tensor([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])
-    ours = ms_ssim(*images, padding="reflect", weights=tuple(weights.double().tolist()))
-    assert ours == pytest.approx(expected, abs=EXACT)
-
-
-def plain_ms_ssim(recorded: np.ndarray, replayed: np.ndarray) -> float:
-    """Wang 2003 word for word with scikit-image's windows: five scales, windows inside only."""
-    product = 1.0
-    for scale, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
-        mean, full = structural_similarity(
-            recorded,
-            replayed,
-            data_range=1.0,
-            channel_axis=-1,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            full=True,
-        )
-        if scale == 4:
-            return product * mean**weight
-        blurred = [blur_valid(image) for image in (recorded, replayed)]
-        luminance = (2 * blurred[0] * blurred[1] + 1e-4) / (
-            blurred[0] ** 2 + blurred[1] ** 2 + 1e-4
-        )
-        product *= (full[5:-5, 5:-5] / luminance).mean() ** weight
-        recorded, replayed = (
-            i[: i.shape[0] // 2 * 2, : i.shape[1] // 2 * 2]
-            .reshape(i.shape[0] // 2, 2, i.shape[1] // 2, 2, 3)
-            .mean(axis=(1, 3))
-            for i in (recorded, replayed)
-        )
-    raise AssertionError
-
-
-def blur_valid(image: np.ndarray) -> np.ndarray:
-    line = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
-    line /= line.sum()
-    window = np.outer(line, line)
-    return np.stack([convolve2d(image[..., c], window, mode="valid") for c in range(3)], axis=-1)
-
-
-def test_ms_ssim_is_the_paper_s_with_windows_inside() -> None:
-    images = pair(2, (181, 190))
-    assert ms_ssim(*images) == pytest.approx(plain_ms_ssim(*images), abs=EXACT)
-
-
-@pytest.mark.parametrize("size", [(12, 12), (33, 48), (60, 21)])
-def test_gmsd_is_the_published_definition(size: tuple[int, int]) -> None:
-    recorded, replayed = pair(3, size)
-    even = size[0] // 2 * 2, size[1] // 2 * 2
-
-    def steepness(image: np.ndarray) -> np.ndarray:
-        luma = 255 * (0.299 * image[..., 0] + 0.587 * image[..., 1] + 0.114 * image[..., 2])
-        # The mean over two by two pixels, at every second of them, as the authors' program has it.
-        half = convolve2d(luma[: even[0], : even[1]], np.full((2, 2), 0.25), mode="full")[1:, 1:]
-        half = half[::2, ::2]
-        prewitt = np.array([[1, 0, -1]] * 3) / 3
-        x = convolve2d(half, prewitt, mode="same")
-        y = convolve2d(half, prewitt.T, mode="same")
-        return np.sqrt(x**2 + y**2)
-
-    g, h = steepness(recorded), steepness(replayed)
-    similar = (2 * g * h + 170) / (g**2 + h**2 + 170)
-    assert gmsd(recorded, replayed) == pytest.approx(similar.std(ddof=1), abs=EXACT)

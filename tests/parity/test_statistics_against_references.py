@@ -1,6 +1,5 @@
-"""Our statistics against statsmodels, SciPy and ppi-python."""
+"""Our statistics against statsmodels and SciPy."""
 
-import json
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ from evaluator.statistics.differences import (
     tango_difference,
 )
 from evaluator.statistics.intervals import clopper_pearson, jeffreys, wilson
-from evaluator.statistics.power import power_unpaired
-from evaluator.statistics.prediction_powered import ppi_plus_plus
 
 pytestmark = pytest.mark.parity
 
@@ -39,10 +36,6 @@ def load_golden(name: str) -> Any:
     return module
 
 
-make_ppi_reference = load_golden("make_ppi_reference")
-GOLDEN = json.loads(make_ppi_reference.PATH.read_text())
-
-
 @pytest.mark.parametrize(("k", "n"), COUNTS)
 @pytest.mark.parametrize("level", [0.9, 0.95])
 def test_rate_intervals_agree_with_statsmodels(k: int, n: int, level: float) -> None:
@@ -59,18 +52,6 @@ def test_newcombe_agrees_with_statsmodels(table: tuple[int, int, int, int]) -> N
     low, high = proportion.confint_proportions_2indep(k2, n2, k1, n1, method="newcomb")
     mine = newcombe_difference(*table)
     assert (mine.low, mine.high) == pytest.approx((low, high), abs=EXACT)
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "n"), [(0.6, 0.8, 10), (0.6, 0.8, 82), (0.4, 0.8, 23), (0.8, 0.9, 50)]
-)
-def test_power_agrees_with_statsmodels(first: float, second: float, n: int) -> None:
-    for sides, alternative in ((2, "two-sided"), (1, "larger")):
-        theirs = proportion.power_proportions_2indep(
-            second - first, first, n, alternative=alternative
-        )
-        mine = power_unpaired(first, second, n, sides=sides)
-        assert mine == pytest.approx(float(theirs.power), abs=EXACT)
 
 
 @pytest.mark.parametrize(("improved", "worsened"), [(4, 0), (7, 2), (3, 3), (1, 9), (60, 30)])
@@ -129,11 +110,3 @@ def test_tango_is_where_the_restricted_score_reaches_its_quantile(
     for end, wanted in ((mine.low, z), (mine.high, -z)):
         # The optimiser knows its place to about the root of the float spacing.
         assert restricted_score(*table, end) == pytest.approx(wanted, abs=1e-6)
-
-
-@pytest.mark.parametrize("case", GOLDEN["cases"], ids=lambda case: f"seed {case['seed']}")
-def test_ppi_plus_plus_agrees_with_ppi_python(case: dict[str, float]) -> None:
-    mine = ppi_plus_plus(*make_ppi_reference.sample(int(case["seed"])))
-    assert mine.value == pytest.approx(case["value"], abs=EXACT)
-    assert mine.interval.low == pytest.approx(case["low"], abs=EXACT)
-    assert mine.interval.high == pytest.approx(case["high"], abs=EXACT)

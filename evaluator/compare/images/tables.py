@@ -206,32 +206,6 @@ def cell_of(stamped: StampedMeasurement) -> StampedValue:
     return StampedValue(value=value, stamp=stamped.stamp)
 
 
-def stamp_table(table_id: str, title: str, stamped: Sequence[StampedMeasurement]) -> Table:
-    """List every number with its full stamp; the key tells numbers that may be compared.
-
-    Args:
-        table_id: Id of the table, its file name too.
-        title: What a reader sees above it.
-        stamped: Numbers, each with the protocol it was measured by.
-    """
-    return Table(
-        id=table_id,
-        title=title,
-        columns=("id", "value", "key", PROTOCOL_COLUMN),
-        rows=tuple(
-            (
-                number.measurement.id,
-                rounded(number.measurement.value),
-                number.stamp.key,
-                number.stamp.text(),
-            )
-            for number in stamped
-        ),
-        note="Numbers may be compared where their keys are equal: then only the images and how "
-        "many there are can differ.",
-    )
-
-
 _ALIGNED = tuple(
     (f"PSNR {words} (dB)", METRICS["psnr_db"], variant)
     for words, variant in (("gain", GAIN), ("affine", AFFINE), ("pose and gain", POSE_GAIN))
@@ -276,7 +250,7 @@ def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> T
 
 def _definitions(metrics: Iterable[ImageMetric]) -> str:
     definitions = ". ".join(metric.definition for metric in metrics)
-    return f"{definitions}. LPIPS where a backbone is given. Full stamps: the table of protocols."
+    return f"{definitions}. LPIPS where a backbone is given. Full stamps: results.json."
 
 
 def rounded(value: float | str | None) -> Cell:

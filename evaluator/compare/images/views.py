@@ -36,10 +36,8 @@ from evaluator.compare.images.scores import (
 )
 from evaluator.compare.images.tables import (
     Protocol,
-    StampedMeasurement,
     per_image_table,
     resolution_words,
-    stamp_table,
     stamped_measurements,
 )
 from evaluator.compare.measure import measured
@@ -176,10 +174,9 @@ def compare_views(
         shown += _qualities(source, scores, images)
         tables.append(per_image_table(f"views_{len(tables)}", f"Held-out views: {name}", scores))
     everything = [score for scores in found.values() for score in scores]
-    measurements, stamped = _measure("all", list(found), everything, of.values(), nets)
+    measurements = _measure("all", list(found), everything, of.values(), nets)
     for source, scores in found.items() if len(found) > 1 else ():
-        measurements += _measure(slug(source), [source], scores, [of[source]], nets)[0]
-    tables.append(stamp_table("views_protocol", "Protocols of the held-out views", stamped))
+        measurements += _measure(slug(source), [source], scores, [of[source]], nets)
     return ViewReport(
         measurements=tuple(measurements),
         tables=tuple(tables),
@@ -263,7 +260,7 @@ def _measure(
     scores: Sequence[ViewScore],
     files: Iterable[DerivedFile],
     nets: Sequence[PerceptualNet],
-) -> tuple[list[Measurement], list[StampedMeasurement]]:
+) -> list[Measurement]:
     """All numbers about some views; the raw ones first."""
     settings: list[Mapping[str, Any]] = [file.derived.settings for file in files]
     described = _described(settings)
@@ -302,7 +299,7 @@ def _measure(
                 episodes=tuple(episodes),
             )
         )
-    return measurements, stamped
+    return measurements
 
 
 def _measure_depth(

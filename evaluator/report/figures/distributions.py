@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from evaluator.compare.plot_data import CurveBand, Shares
-from evaluator.motion_measurements import BAND_WIDTH
 from evaluator.report.figures.drawing import (
     LEGEND_LINE_IN,
     LIGHT,
@@ -20,7 +19,6 @@ from evaluator.report.figures.drawing import (
     log_axis,
     panel,
 )
-from evaluator.result import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from evaluator.compare.band_measurements import BandCurve
 from evaluator.compare.images.scores import ViewQuality
 from evaluator.compare.plot_data import shares_of
 from evaluator.compare.states import StateSummary
@@ -86,21 +83,6 @@ def motions(bands: Sequence[CurveBand]) -> Drawing | NotDrawn:
                 f"the end, {band.num_curves} trials"
                 for band, half in middle
             ]
-        ),
-        table=Table(
-            id="figure_motions",
-            title="",
-            columns=("against", "trials", "time (%)", "median (mm)", "10th", "90th percentile"),
-            rows=tuple(
-                (
-                    band.name,
-                    band.num_curves,
-                    round(_percent_of(len(band.median))[i], 1),
-                    *(round(1000 * side[i], 3) for side in (band.median, band.low, band.high)),
-                )
-                for band in bands
-                for i in range(0, len(band.median), max(1, len(band.median) // 20))
-            ),
         ),
         height_in=2.35 + head,
         draw=draw,
@@ -179,7 +161,7 @@ def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDra
             if index == 0:
                 legend(axes, columns=columns)
 
-    hidden = f" {len(names) - len(drawn)} more in the table." if len(names) > len(drawn) else ""
+    hidden = f" {len(names) - len(drawn)} more are not drawn." if len(names) > len(drawn) else ""
     return Drawing(
         id=subject.id,
         title=subject.title,
@@ -194,18 +176,9 @@ def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDra
                 for group in item.groups
             ]
         ),
-        table=Table(
-            id=f"figure_{subject.id}",
-            title="",
-            columns=("what", "group", "n", *(f"{round(100 * s)} % are at most" for s in STEPS)),
-            rows=tuple(_row(item, group) for item in panels for group in item.groups),
-        ),
         height_in=height,
         draw=draw,
     )
-
-
-STEPS = (0.10, 0.25, 0.50, 0.75, 0.90, 1.0)
 
 
 def _widen(axes: "Axes", groups: Sequence[Shares]) -> None:
@@ -225,10 +198,6 @@ def _decades(groups: Sequence[Shares]) -> float:
     """Powers of ten that positive values span."""
     values = [value for group in groups for value in group.values if value > 0]
     return math.log10(max(values) / min(values)) if values else 0.0
-
-
-def _row(item: Panel, group: Shares) -> tuple[Cell, ...]:
-    return (item.label, group.name, group.n, *(float(f"{_at(group, s):.4g}") for s in STEPS))
 
 
 def _at(group: Shares, share: float) -> float:
@@ -352,91 +321,3 @@ def worst_pairs(views: Sequence[ViewQuality]) -> list[ViewPair]:
         )
         found.append((score if score is not None else float("inf"), pair))
     return [pair for _, pair in sorted(found, key=lambda item: item[0])]
-
-
-BAND_COLOURS = ("sim", "third", "fourth", "executed", "soft")
-"""The recorded colour is the band's."""
-PLACES = range(0, 101, 5)
-"""Instants the table beside the figure shows."""
-
-
-def bands(curves: Sequence[BandCurve]) -> Drawing | NotDrawn:
-    """Draw how far simulated mean curves lie from recorded ones, and how far these reach."""
-    moving = [curve for curve in curves if curve.part == "moving"][: len(BAND_COLOURS)]
-    if not moving:
-        reason = "no imported motion has both recorded and simulated runs"
-        return NotDrawn(id="bands", reason=reason)
-    spreads = {curve.task: curve.recorded_spread_m for curve in moving if curve.recorded_spread_m}
-    head = 0.12 + LEGEND_LINE_IN * (len(moving) + len(spreads))
-
-    def draw(figure: "Figure") -> None:
-        axes = panel(figure, left=0.5, bottom=0.4, top=head)
-        grid(axes)
-        for task, spread in spreads.items():
-            reach = [1000 * BAND_WIDTH * value for value in spread]
-            label = f"{task}: {BAND_WIDTH:g} repeatabilities of the recorded runs"
-            axes.fill_between(
-                range(len(reach)),
-                0,
-                reach,
-                color=LIGHT["rec"],
-                alpha=0.18,
-                linewidth=0,
-                label=label,
-            )
-        for index, curve in enumerate(moving):
-            axes.plot(
-                range(len(curve.distance_m)),
-                [1000 * value for value in curve.distance_m],
-                color=LIGHT[BAND_COLOURS[index]],
-                linestyle=LINES[index],
-                linewidth=1.5,
-                label=_named(curve),
-            )
-        axes.set_xlim(0, 100)
-        axes.set_ylim(bottom=0)
-        axes.set_xlabel("time from start to end (%)")
-        axes.set_ylabel("between mean curves (mm)")
-        legend(axes, columns=1)
-
-    return Drawing(
-        id="bands",
-        title="Simulated runs against the recorded band",
-        caption="Distance of the simulated mean curve from the recorded one over the moving part, "
-        "in normalised time. Shaded: as far as the recorded runs reach themselves, "
-        f"{BAND_WIDTH:g} root mean square distances from their mean.",
-        alt="Distance of mean curves: "
-        + listed(
-            [
-                f"{_named(curve)}: up to {1000 * max(curve.distance_m):.0f} mm, "
-                f"{1000 * curve.distance_m[-1]:.1f} mm at the end"
-                for curve in moving
-            ]
-        ),
-        table=Table(
-            id="figure_bands",
-            title="",
-            columns=("runs", "time (%)", "distance (mm)", "recorded repeatability (mm)"),
-            rows=tuple(
-                (
-                    _named(curve),
-                    place,
-                    round(1000 * curve.distance_m[place], 2),
-                    round(1000 * curve.recorded_spread_m[place], 2)
-                    if curve.recorded_spread_m
-                    else None,
-                )
-                for curve in moving
-                for place in PLACES
-            ),
-        ),
-        height_in=2.35 + head,
-        draw=draw,
-    )
-
-
-def _named(curve: BandCurve) -> str:
-    return (
-        f"{curve.task}, {curve.engine} ({curve.num_simulated} runs against "
-        f"{curve.num_recorded} recorded)"
-    )

@@ -1,11 +1,10 @@
-"""What a figure is before anything draws it: its numbers, its words, its colours."""
+"""What a figure is before anything draws it: its words and its colours."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from bridge.media import palette
-from evaluator.result import Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +34,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """One figure: what is drawn stands in ``table`` too, so that it can be read and checked."""
+    """One figure; what is drawn stands in the tables of the evaluation."""
 
     id: str
     """File name without its ending."""
@@ -44,7 +43,6 @@ class Drawing:
     """What the marks mean and what the figure does not say."""
     alt: str
     """What it shows, for someone who cannot see it."""
-    table: Table
     height_in: float
     draw: Callable[["Figure"], None]
     width_in: float = COLUMN_IN
@@ -57,7 +55,6 @@ class Rendered:
     drawing: Drawing
     svg: bytes
     """A file of its own, in the colours of print."""
-    pdf: bytes
     inline: str
     """For a page that defines the colours; its ids start with the figure's."""
 

@@ -1,8 +1,9 @@
-"""Success rates: the twin's against the recorded ones, and both beside each other."""
+"""Success rates: the twin's against the recorded ones, and what the gate makes of them."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from evaluator.compare.plot_data import ReliabilityPoint
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import WITH
 from evaluator.report.figures.drawing import (
@@ -14,6 +15,7 @@ from evaluator.report.figures.drawing import (
     NotDrawn,
     framed,
     grid,
+    legend,
     listed,
     panel,
     percent_axis,
@@ -77,7 +79,6 @@ def funnel(tables: Sequence[Table]) -> Drawing | NotDrawn:
         + listed(
             [f"{words(*map(str, row[:3]))}: {row[4]} of {row[3]}" for row in table.rows], at_most=12
         ),
-        table=Table(id="figure_funnel", title="", columns=table.columns, rows=table.rows),
         height_in=0.5 + 0.2 * lines,
         draw=draw,
     )
@@ -148,22 +149,6 @@ def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:
         f"has no interval; its measurement says why.{rest}",
         alt="Gains in percentage points: "
         + listed([f"{_label(name)}, {side}: {m.value:+.1f}" for name, side, m in lines]),
-        table=Table(
-            id="figure_gains",
-            title="",
-            columns=("task", "side", "gain (pp)", "low", "high", "why no interval"),
-            rows=tuple(
-                (
-                    _label(name),
-                    word if side == "recorded" else "twin",
-                    round(m.value or 0.0, 2),
-                    None if m.interval is None else round(m.interval.low, 2),
-                    None if m.interval is None else round(m.interval.high, 2),
-                    m.reason_without_interval,
-                )
-                for name, side, m in lines
-            ),
-        ),
         height_in=0.7 + 0.56 * len(shown),
         draw=draw,
     )
@@ -234,7 +219,6 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         "optimistic. Marks that coincide are set apart.",
         alt=f"Scatter of {counted_groups(len(drawn))}: "
         + listed([f"{c.label}: twin {_text(c.pair[0])}, {word} {_text(c.pair[1])}" for c in drawn]),
-        table=_table("scatter", drawn, word, common=True),
         height_in=below + side + 0.12,
         draw=draw,
     )
@@ -336,7 +320,6 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         + listed(
             [f"{c.label}: twin {_text(c.shown_sim)}, {word} {_text(c.recorded)}" for c in known]
         ),
-        table=_table("success", known, word, common=False),
         height_in=0.7 + row * len(shown),
         draw=draw,
     )
@@ -362,28 +345,83 @@ def _text(rate: Measurement) -> str:
     return f"{rate.k}/{rate.n}"
 
 
-def _table(table_id: str, groups: Sequence[RateGroup], word: str, *, common: bool) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for group in groups:
-        sides = group.pair if common else (group.shown_sim, group.recorded)
-        numbers = [value for side in sides for value in _numbers(side)]
-        rows.append((group.task, group.condition.replace("_", " "), group.policy, *numbers))
-    sides_named = [
-        f"{side}{what}" for side in ("twin", word) for what in (" (%)", " low", " high", " k", " n")
-    ]
-    return Table(
-        id=f"figure_{table_id}",
-        title="",
-        columns=("task", "condition", "policy", *sides_named),
-        rows=tuple(rows),
+def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
+    """Draw how often trials succeeded against the probability that was stated for them."""
+    if not bins:
+        return NotDrawn(id="reliability", reason="no trial has p_success and an outcome")
+    side = COLUMN_IN - 0.62
+
+    def draw(figure: "Figure") -> None:
+        axes = framed(figure, (0.5, 1.02, side, side))
+        grid(axes)
+        percent_axis(axes, "y", "trials that succeeded")
+        axes.set_xlim(-3, 103)
+        axes.set_xticks(range(0, 101, 20), [""] * 6)
+        axes.plot([0, 100], [0, 100], color=LIGHT["soft"], linewidth=0.9, dashes=(4, 3))
+        for b in bins:
+            if b.rate_low is not None and b.rate_high is not None:
+                axes.plot(
+                    [100 * b.mean_probability] * 2, [100 * b.rate_low, 100 * b.rate_high],
+                    color=LIGHT["sim"], linewidth=1.4, alpha=0.6,
+                )  # fmt: skip
+            axes.plot(
+                [100 * b.mean_probability], [100 * b.rate], "o", color=LIGHT["sim"], markersize=5
+            )
+        counts = framed(figure, (0.5, 0.42, side, 0.5))
+        counts.bar(
+            [50 * (b.low + b.high) for b in bins], [b.n for b in bins], width=9.2,
+            color=LIGHT["sim"], alpha=0.45, linewidth=0,
+        )  # fmt: skip
+        percent_axis(counts, "x", "stated probability of success")
+        most = max(b.n for b in bins)
+        counts.set_ylim(0, 1.15 * most)
+        counts.set_yticks([0, most])
+        counts.set_ylabel("trials")
+
+    return Drawing(
+        id="reliability",
+        title="Is the stated success probability kept?",
+        caption="Bins of equal width with 95 % Wilson intervals; below: trials per bin. On the "
+        "dashed line a probability is kept; below it the twin promises too much.",
+        alt="Bins of the stated probability: "
+        + listed(
+            [
+                f"mean {100 * b.mean_probability:.0f} %, {b.succeeded} of {b.n} succeeded"
+                for b in bins
+            ],
+            at_most=10,
+        ),
+        height_in=1.02 + side + 0.12,
+        draw=draw,
     )
 
 
-def _numbers(rate: Measurement) -> tuple[Cell, ...]:
-    interval = rate.interval
-    ends = (None, None) if interval is None else (_percent(interval.low), _percent(interval.high))
-    return _percent(rate.value), *ends, rate.k, rate.n
+def costs(tables: Sequence[Table]) -> Drawing | NotDrawn:
+    """Draw what a trial costs with and without the gate, by the price of a refused good plan."""
+    table = next((table for table in tables if table.id == "gate_costs"), None)
+    if table is None or not table.rows:
+        return NotDrawn(id="costs", reason="no executed trial has an advisory verdict")
+    rows = [tuple(float(str(value)) for value in row[:3]) for row in table.rows]
 
+    def draw(figure: "Figure") -> None:
+        axes = panel(figure, left=0.5, bottom=0.4, top=0.36)
+        grid(axes)
+        price = [row[0] for row in rows]
+        axes.plot(price, [row[1] for row in rows], "o-", color=LIGHT["sim"], label="obey the gate")
+        axes.plot(
+            price, [row[2] for row in rows], "s--", color=LIGHT["rec"], label="execute everything"
+        )
+        axes.set_xlabel("price of refusing a good plan (bad executions)")
+        axes.set_ylabel("cost per trial (bad executions)")
+        axes.set_ylim(bottom=0)
+        legend(axes)
 
-def _percent(value: float | None) -> float | None:
-    return None if value is None else round(100 * value, 2)
+    return Drawing(
+        id="costs",
+        title="What the gate costs and avoids",
+        caption=f"Where the circles lie lower, obeying the gate pays. {table.note}",
+        alt="Mean cost per trial, obeying the gate against executing everything: "
+        + listed([f"at price {row[0]:g}: {row[1]:.3g} against {row[2]:.3g}" for row in rows]),
+        height_in=2.6,
+        draw=draw,
+    )

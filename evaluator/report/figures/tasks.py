@@ -16,7 +16,6 @@ from evaluator.report.figures.drawing import (
     listed,
     words,
 )
-from evaluator.result import Table
 from evaluator.statistics.agreement import counted_groups
 
 if TYPE_CHECKING:
@@ -79,7 +78,6 @@ def tasks(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         f"line the twin is optimistic.{more}",
         alt=f"{len(shown)} panels with {counted_groups(len(drawn))}: "
         + listed([f"{group.label}: {_rates(group)}" for group in drawn]),
-        table=_table(drawn, word),
         height_in=height_in,
         draw=draw,
     )
@@ -140,13 +138,3 @@ def _legend(
     if len(candidates) > len(MARKERS):
         note = f"{len(candidates)} candidates share {len(MARKERS)} marks; the table names them"
         axes.text(0.25, top_in - 0.6 * STEP_IN, note, color=LIGHT["soft"], va="center", fontsize=7)
-
-
-def _table(drawn: Sequence[RateGroup], word: str) -> Table:
-    rows = []
-    for group in drawn:
-        sim, recorded = group.pair
-        cells = [(rate.value, rate.k, rate.n) for rate in (sim, recorded)]
-        rows.append((group.task, _candidate(group), *cells[0], *cells[1]))
-    columns = ("task", "candidate", "twin", "twin k", "twin n", word, f"{word} k", f"{word} n")
-    return Table(id="figure_tasks", title="", columns=columns, rows=tuple(rows))

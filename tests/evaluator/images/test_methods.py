@@ -77,8 +77,6 @@ def test_each_method_has_its_means_over_the_same_views(folders: Path) -> None:
         assert words in psnr.definition
     assert results.get("image.poor.psnr_db").value < psnr.value
     assert results.get("image.good.ssim_zero").value > results.get("image.poor.ssim_zero").value
-    assert results.get("image.good.gmsd").value < results.get("image.poor.gmsd").value
-    assert "176 pixels" in str(results.get("image.good.ms_ssim").reason_if_undefined)
     results.to_record()  # fits the schema
 
 
@@ -92,12 +90,7 @@ def test_the_headline_is_laid_out_as_the_paper_s_with_the_protocol_in_each_row(
     assert {row[3] for row in table.rows} == {"not computed"}
     assert all("not stated: split" in str(row[-1]) for row in table.rows)
     assert all("64 x 48" in str(row[-1]) for row in table.rows)
-    assert "not stated" in str(tables["image_paper"].rows[0][-1])
-    assert {row[1] for row in tables["image_all"].rows} == {"raw", "gain", "affine"}
     assert len(tables["image_views"].rows) == 6
-    keys = {row[0]: row[2] for row in tables["image_protocol"].rows}
-    assert keys["image.good.ssim"] == keys["image.poor.ssim"]
-    assert keys["image.good.ssim"] != keys["image.good.ssim_zero"]
 
 
 def test_lpips_is_not_computed_without_a_backbone_and_says_so(folders: Path) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import html
 import io
 import json
 import re
@@ -19,8 +20,9 @@ from bridge.errors import UsageError
 from bridge.terminal import Output
 from evaluator.cli import evaluate
 from evaluator.compare import compare_csv, compare_run
+from evaluator.report import ranked
 from evaluator.report.page import page
-from evaluator.report.tables import as_csv, as_latex, as_markdown, as_text
+from evaluator.report.tables import as_csv, as_latex, as_text
 from evaluator.report.write import write_report
 from evaluator.result import Measurement, Results, Table, load_results
 
@@ -97,7 +99,7 @@ def test_what_a_stranger_wrote_is_escaped_everywhere() -> None:
         provenance={"x": HOSTILE},
     )
     parsed = Tags()
-    text = page(results)
+    text = page(results, everything=True)
     parsed.feed(text)
     assert "script" not in parsed.tags
     assert text.count("&lt;script&gt;") >= 6
@@ -117,11 +119,11 @@ def test_results_of_a_real_cell_carry_no_banner() -> None:
 def test_a_table_is_the_same_in_every_form() -> None:
     rows = list(csv.reader(io.StringIO(as_csv(TABLE))))
     assert rows == [["task", "50 %"], ["a|b_{c}", "1.5"], [HOSTILE, ""]]
-    assert r"a\|b_{c}" in as_markdown(TABLE)
     latex = as_latex(TABLE)
-    assert r"a\textbar{}b\_\{c\} & 1.5 \\" in latex
+    assert r"a|b\_\{c\} & 1.5 \\" in latex
     assert r"50 \%" in latex
-    assert latex.count(r"\begin") == latex.count(r"\end") == 4
+    assert r"\caption{T\_1 \& co}" in latex
+    assert latex.count(r"\begin") == latex.count(r"\end") == 2
     assert "a|b_{c}" in as_text(TABLE)
     assert "–" in as_text(TABLE)
 
@@ -133,11 +135,11 @@ def test_evaluate_writes_everything_and_says_where(evaluated: Evaluated) -> None
     assert "undefined: 2 groups; it needs at least 3" in shown
     assert "Stand-in:" in shown
     assert load_results(run.path).get("agreement.sim_planned.rate").k == 5
-    for name in ("report.html", "trials.csv", "figures/success.svg", "figures/success.pdf"):
-        assert (run.results_dir / name).is_file()
-    for name in ("figures/success.csv", "tables/success.tex"):
+    for name in ("report.html", "trials.csv", "figures/success.svg", "tables/layout.csv"):
         assert (run.results_dir / name).is_file()
     assert not list(run.results_dir.rglob("*.part"))
+    kept = [path for path in run.results_dir.rglob("*") if path.is_file()]
+    assert len([path for path in kept if path.parent.name != "cache"]) <= 30
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -194,27 +196,36 @@ def test_what_an_earlier_evaluation_wrote_and_this_one_does_not_is_removed(
     six_trials: Any, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    write_report(compare_run(six_trials.run), out)
+    write_report(compare_run(six_trials.run), out, everything=True, latex=True)
     mine = out / "tables" / "mine.tex"
     mine.write_text("not ours")
+    for old in ("tables/confusion.md", "tables/methods.tex", "figures/order.pdf"):
+        (out / old).write_text("of the edition before")
     assert (out / "trials.csv").is_file()
     assert (out / "tables" / "confusion.tex").is_file()
-    write_report(compare_csv(PAPER), out)
+    written = write_report(compare_csv(PAPER), out)
     assert mine.read_text() == "not ours"
-    left = {path.stem for path in (out / "tables").iterdir()}
-    left -= {"mine", "methods", "references"}
-    assert left == {table.id for table in load_results(out / "results.json").tables}
+    left = {path for path in out.rglob("*") if path.is_file()} - {mine, written.results}
+    assert left == set(written.files)
     assert not (out / "trials.csv").exists()
     assert not (out / "trials.parquet").exists()
 
 
-def test_a_markdown_row_stays_one_line() -> None:
-    odd = Table(id="t", title="t", columns=("a|b",), rows=(("first\nsecond | third",),))
-    assert as_markdown(odd).splitlines()[2:] == [
-        r"| a\|b |",
-        "| --- |",
-        r"| first second \| third |",
-    ]
+def test_a_report_shows_what_somebody_decides_by_and_all_of_it_when_asked(
+    six_trials: Any, tmp_path: Path
+) -> None:
+    comparison = compare_run(six_trials.run)
+    text = html.unescape(write_report(comparison, tmp_path).report.read_text())
+    shown = {path.stem for path in (tmp_path / "tables").iterdir()}
+    assert len(shown) <= ranked.MOST_TABLES
+    assert shown < {table.id for table in comparison.tables}
+    for name in shown:
+        assert f"Decides {ranked.decides(name)}." in text
+    everything = write_report(comparison, tmp_path, everything=True)
+    assert {path.stem for path in (tmp_path / "tables").iterdir()} == {
+        table.id for table in everything.content.tables
+    }
+    assert comparison.measurements[0].definition in html.unescape(everything.report.read_text())
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 120, 200])

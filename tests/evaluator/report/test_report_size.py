@@ -88,7 +88,10 @@ def test_a_report_about_thousands_of_trials_stays_small_and_complete(tmp_path: P
     written = write_report(comparison, tmp_path)
     text = written.report.read_text()
     assert len(text.encode()) < MAX_BYTES
-    assert f"The first {SHOWN_ROWS} of 3,000 rows; the whole is in trials.csv" in text
+    assert (
+        f"The first {SHOWN_ROWS} of 3,000 rows; the whole is in trials.csv and trials.parquet"
+        in text
+    )
     assert "monday-trial-00199" in text
     assert "monday-trial-00200<" not in text
     lines = (tmp_path / "trials.csv").read_text().splitlines()

@@ -260,8 +260,6 @@ def test_an_episode_counts_once_and_conditions_stay_apart() -> None:
         sorted(of_episode)[2],
         sorted(of_episode)[-3],
     )
-    assert median.interval.worst_coverage is not None
-    assert median.interval.worst_coverage >= 0.95
     few = by_id[f"{first}.without_replanning.position_median_m"]
     assert few.interval is None
     assert "4 values" in str(few.reason_without_interval)
@@ -283,8 +281,6 @@ def test_what_is_missing_is_named_and_stages_have_a_table() -> None:
     median = part.measurements[0]
     assert median.value is None
     assert "behind it" in str(median.reason_if_undefined)
-    stage_table = next(table for table in part.tables if table.id == "stage_states")
-    assert [row[2] for row in stage_table.rows] == ["place", "grasp"]
 
 
 def test_a_plan_has_no_extents_and_an_unknown_shape_says_so() -> None:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kinova_data import episodes
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
-from bridge.exchange.kinova import TCP_TOPIC, import_runs
 from bridge.process_pool import Serial
 from bridge.terminal import Output
 from evaluator.compare import compare_run
@@ -131,9 +131,11 @@ def test_a_real_push_ends_where_it_really_ended(tmp_path: Path) -> None:
             place.write_bytes(path.read_bytes())
     (few / "robot").symlink_to(KINOVA / "robot")
     run = RunFolder.create(tmp_path / "run")
-    for _ in import_runs(few, run):
+    for _ in episodes.import_runs(few, run):
         pass
-    tool = pose_track(Episode.open(Path(row_of(replay(run), "single_0001")["path"])), TCP_TOPIC)
+    tool = pose_track(
+        Episode.open(Path(row_of(replay(run), "single_0001")["path"])), episodes.TCP_TOPIC
+    )
     # The schedule ends at the hand link's (0.533, 0.067, 0.236) m, and the marker lies on the hand.
     assert tool.p_m[-1] == pytest.approx([0.533, 0.067, 0.236], abs=0.012)
     # What docs/real_number.md says was identified on other runs than these two.

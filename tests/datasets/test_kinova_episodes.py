@@ -6,25 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kinova_data import episodes as kinova
 
 from bridge.episode.reader import Episode, record_of
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
 from bridge.errors import PathNotFoundError
-from bridge.exchange.kinova import (
-    CUBE_TOPIC,
-    TCP_TOPIC,
-    KinovaFormatError,
-    find_runs,
-    import_runs,
-    read_real_run,
-    read_sim_run,
-    scripted_motion,
-)
 from bridge.geometry import se3
 from bridge.task.scripted_motion import RECORD_NAME, ScriptedMotion
 
-BESIDE = Path(__file__).parents[4] / "shared" / "data"
+CUBE_TOPIC, TCP_TOPIC = kinova.CUBE_TOPIC, kinova.TCP_TOPIC
+KinovaFormatError = kinova.KinovaFormatError
+find_runs, import_runs = kinova.find_runs, kinova.import_runs
+read_real_run, read_sim_run = kinova.read_real_run, kinova.read_sim_run
+scripted_motion = kinova.scripted_motion
+
+BESIDE = Path(__file__).parents[3] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
 FOLDER = DATA / "robot_realitygap_kinova_real_vs_sim"
 needs_data = pytest.mark.skipif(
@@ -86,8 +83,8 @@ def test_importing_twice_changes_nothing(tmp_path: Path) -> None:
 def test_samples_in_which_a_body_was_not_seen_are_left_out(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "data", seen=False)
     run = RunFolder.create(tmp_path / "run")
-    path, kinova = next(import_runs(folder, run))
-    assert kinova.num_lost[CUBE_TOPIC] == 3
+    path, made = next(import_runs(folder, run))
+    assert made.num_lost[CUBE_TOPIC] == 3
     assert CUBE_TOPIC not in Episode.open(path).topics()
     assert Episode.open(path).metadata_records["source"]["samples_left_out"][CUBE_TOPIC] == 3
 
@@ -116,7 +113,7 @@ def test_a_file_that_cannot_be_used_is_listed_and_the_others_are_imported(tmp_pa
     (sim / "Single_Gazebo_0.csv").write_text("0 0 1 0 0 0 1 0 0 0 0 0 0 1\n" * 5)
     (sim / "CubeExp_PyBullet_0.csv").write_text("0 0 1 0 0 0 1 0 0 0 0 0 0 1\n" * 5)
     (folder / "real" / "Experiment1" / "Single0002_6D.tsv").write_text("")
-    skipped: list[KinovaFormatError] = []
+    skipped: list[Exception] = []
     files = list(import_runs(folder, RunFolder.create(tmp_path / "run"), skipped))
     assert len(files) == 3
     assert [fault.path.name for fault in skipped] == [
@@ -237,3 +234,22 @@ def test_the_schedule_ends_where_the_authors_sent_the_joints() -> None:
     np.testing.assert_allclose(np.rad2deg(joints[-1]), [0, -67, 30, 90, 0, 0], atol=1e-6)
     assert motion.boxes["cube"].mass_kg == 0.0884
     assert scripted_motion("juggling") is None
+
+
+def test_the_script_says_what_it_made_and_draws_the_bands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, run, bands = write_folder(tmp_path / "data"), tmp_path / "run", tmp_path / "bands.svg"
+    assert kinova.main([str(folder), str(run), "--bands", str(bands)]) == 0
+    assert "1 real and 2 simulated runs" in capsys.readouterr().out
+    assert b"</svg>" in bands.read_bytes()
+    assert kinova.main([str(tmp_path / "none"), str(run)]) == 1
+    assert "real runs not found" in capsys.readouterr().err
+
+
+def test_a_band_reaches_two_root_mean_squares_and_lies_as_far_as_the_mean_curves() -> None:
+    line = np.linspace(0.0, 1.0, 101)[:, None] * np.array([1.0, 0.0, 0.0])
+    recorded = np.stack([line + np.array([0, 0.01, 0]), line - np.array([0, 0.01, 0])])
+    distance_m, reach_m = kinova.band_of(recorded, line[None] + np.array([0, 0, 0.03]))
+    np.testing.assert_allclose(distance_m, 0.03)
+    np.testing.assert_allclose(reach_m, 2 * np.sqrt(2 * 0.01**2))

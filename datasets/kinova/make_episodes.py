@@ -1,10 +1,12 @@
-"""The Kinova reality-gap runs (Collins, Howard, Leitner, ICRA 2019) as episodes.
+"""The Kinova reality-gap runs (Collins, Howard, Leitner, ICRA 2019) as episodes, and their bands.
+
+Example: python datasets/kinova/make_episodes.py data/kinova runs/kinova --bands bands.svg
 
 Real runs (``real/Experiment*/*.tsv``, motion capture at 100 Hz) become recorded episodes;
 simulator runs (``sim/Experiment*/*.csv``) become unpaired derived episodes.
 
 Three facts that the folder's notes leave open were settled by numbers (see
-``tests/bridge/exchange``): the nine ``Rot`` values are column by column (then R = Rx(roll)
+``tests/datasets``): the nine ``Rot`` values are column by column (then R = Rx(roll)
 Ry(pitch) Rz(yaw) holds to 6e-6, row by row it is off by 0.04); PyBullet and V-REP files hold
 quaternions as xyzw and MuJoCo files as wxyz (the other way round the end effector would turn 24
 degrees differently from the real one, or start upside down).
@@ -13,10 +15,12 @@ A file that cannot be used (damaged, of an unknown simulator, of a simulation th
 listed and skipped; the others are imported.
 """
 
+import argparse
 import json
 import re
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +33,12 @@ from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.provenance import hash_file, hash_settings
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
+from bridge.episode.streams import pose_track
 from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import BridgeError, PathNotFoundError
+from bridge.errors import BridgeError, GstError, PathNotFoundError
 from bridge.geometry import se3
 from bridge.task.scripted_motion import RECORD_NAME, JointTarget, PushedBox, ScriptedMotion
 
@@ -365,3 +371,84 @@ def _write_poses(writer: EpisodeWriter, kinova: KinovaRun) -> None:
                 continue
             pose = PoseSample(stamp_ns=stamp_ns, frame_id=FRAME, T_frame_body=transforms[index])
             writer.write(topic, pose.to_cdr(), type_name=schema.POSE_STAMPED, log_time_ns=stamp_ns)
+
+
+NUM_SAMPLES = 101
+"""Instants of normalised time at which runs are compared."""
+WAITING_M = 0.01
+"""A run waits while it is closer than this to where it started, or will stay."""
+BAND_WIDTH = 2.0
+"""The recorded band reaches this many root mean square distances from its mean curve."""
+Curves = Float[np.ndarray, "num_runs num_samples 3"]
+
+
+def moving_curve(path: Path) -> Float[np.ndarray, "num_samples 3"]:
+    """Return the tool's way over normalised time, from leaving the start to staying at the end."""
+    track = pose_track(Episode.open(path), TCP_TOPIC)
+    if track is None:
+        raise KinovaFormatError(path=path, found="it holds no pose of the tool")
+    p_m = track.p_m
+    away = np.linalg.norm(p_m - p_m[0], axis=1) > WAITING_M
+    left = np.linalg.norm(p_m - p_m[-1], axis=1) > WAITING_M
+    if away.any() and left.any():
+        first = max(0, int(np.argmax(away)) - 1)
+        p_m = p_m[first : int(np.flatnonzero(left)[-1]) + 2]
+    at = np.linspace(0.0, len(p_m) - 1.0, NUM_SAMPLES)
+    return np.stack([np.interp(at, np.arange(len(p_m)), p_m[:, k]) for k in range(3)], axis=1)
+
+
+def band_of(recorded: Curves, simulated: Float[np.ndarray, "others num_samples 3"]) -> np.ndarray:
+    """Return the distance of both mean curves, and how far the recorded band reaches [m]."""
+    mean_m = recorded.mean(axis=0)
+    squared = ((recorded - mean_m) ** 2).sum(axis=-1).sum(axis=0)
+    reach_m = BAND_WIDTH * np.sqrt(squared / max(1, len(recorded) - 1))
+    return np.stack([np.linalg.norm(simulated.mean(axis=0) - mean_m, axis=-1), reach_m])
+
+
+def draw_bands(files: Sequence[tuple[Path, KinovaRun]], out: Path) -> None:
+    """Draw for each task how far every simulator's mean curve lies from the recorded band."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  # episodes are made without it
+
+    curves: dict[str, dict[str | None, list[np.ndarray]]] = {}
+    for path, kinova in files:
+        curves.setdefault(kinova.task, {}).setdefault(kinova.engine, []).append(moving_curve(path))
+    shown = {task: sides for task, sides in curves.items() if None in sides and len(sides) > 1}
+    figure = Figure(figsize=(7.0, 0.3 + 2.8 * max(1, len(shown))), layout="constrained")
+    axes = figure.subplots(max(1, len(shown)), squeeze=False)[:, 0]
+    for axis, (task, sides) in zip(axes, shown.items(), strict=False):
+        recorded = np.array(sides[None])
+        for engine in sorted(name for name in sides if name):
+            distance_m, reach_m = band_of(recorded, np.array(sides[engine]))
+            axis.plot(1e3 * distance_m, label=f"{engine} (n = {len(sides[engine])})")
+        axis.fill_between(range(NUM_SAMPLES), 1e3 * reach_m, alpha=0.2, label="recorded band")
+        axis.set_title(f"{task}: {len(recorded)} recorded runs")
+        axis.set_xlabel("time from start to end (%)")
+        axis.set_ylabel("between mean curves (mm)")
+        axis.legend(fontsize=7)
+    figure.savefig(out, metadata={"Date": None})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Import the data set into a run folder; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="with real/Experiment1/*.tsv and sim/")
+    parser.add_argument("run", type=Path, help="run folder; made where needed")
+    parser.add_argument("--bands", type=Path, help="draw the bands of each task into this SVG")
+    asked = parser.parse_args(arguments)
+    skipped: list[KinovaFormatError] = []
+    try:
+        files = list(import_runs(asked.folder, RunFolder.create(asked.run), skipped))
+        if asked.bands is not None:
+            draw_bands(files, asked.bands)
+    except GstError as error:
+        print(error, file=sys.stderr)
+        return 1
+    real = sum(kinova.engine is None for _, kinova in files)
+    print(f"{real} real and {len(files) - real} simulated runs in {asked.run}")
+    for fault in skipped:
+        print(f"skipped: {fault}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
