@@ -41,16 +41,14 @@ def compare_records(
     groups, left_out = _rate_groups(records, method)
     word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
     gains = replanning_gains(groups, method=method)
-    chosen, decision_tables = decisions(groups)
-    modelled, model_tables = model_results(usable_groups(groups))
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *averages(groups, method=method),
         *group_agreement(groups),
         *gains,
         *gain_tests(groups),
-        *chosen,
-        *modelled,
+        *decisions(groups),
+        *model_results(usable_groups(groups)),
     )
     return Comparison(
         run=path.stem,
@@ -64,8 +62,6 @@ def compare_records(
             *layout_table(groups, measurements, word),
             *gains_table(gains, word),
             *agreement_intervals(groups),
-            *model_tables,
-            *decision_tables,
             *notes_table(notes(groups, measurements)),
         ),
         exclusions=tuple(left_out),
