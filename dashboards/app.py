@@ -1,4 +1,4 @@
-"""The application: addresses to pages. All state is in the address but labels and what-ifs."""
+"""The application: addresses to pages. All state is in the address but labels."""
 
 import shlex
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from dashboards.config import DashboardConfig
 from dashboards.console_door import ConsoleDoor
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
-from dashboards.library import Library, derived_path, episode_path
+from dashboards.library import Library, derived_path, episode_path, scene_stamps
 from dashboards.loading import LOADING, late
 from dashboards.overview_page import build_overview, neighbours
 from dashboards.review_routes import review_routes
@@ -34,9 +34,10 @@ from evaluator.review_index import SHOW, Selection
 
 if TYPE_CHECKING:  # reads episodes
     from dashboards.console_page import ConsolePages
-    from dashboards.trial_routes import TrialPages
 
 HERE = Path(__file__).parent
+PICTURES = "scene_pictures"
+"""Folder in the run's ``results/``."""
 SMALL = [Middleware(GZipMiddleware, minimum_size=2000, compresslevel=5)]
 """Text is compressed; images and episodes are already."""
 
@@ -63,10 +64,12 @@ def create_app(
         Route("/numbers", pages.numbers, middleware=SMALL),
         Route("/episode/{id}", pages.episode, middleware=SMALL),
         Route("/episode/{id}/frame/{camera}", pages.frame),
+        Route("/episode/{id}/frames/{camera}", pages.frames),
+        Route("/episode/{id}/scene", pages.scene, middleware=SMALL),
+        Route("/episode/{id}/scene.jpg", pages.scene_picture),
         Route("/episode/{id}/file", pages.episode_file),
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
-        *pages.trial(),
         *pages.studies.routes(),
         *(() if door is None else pages.console()),
         Route("/twin", pages.twin, middleware=SMALL),
@@ -166,21 +169,18 @@ class Pages:
             library: The runs that are shown.
             live: Where the recorder is.
             door: Lets phones in at the operator's console, where it is open.
-            looks_beside: Whether runs in the same folder may be compared with them, and images
-                outside of a run be shown.
+            looks_beside: Whether runs in the same folder may be compared with them.
         """
         self._live, self._door = live, door
         self._console: ConsolePages | None = None
         self._library = library
         self._environment = _environment()
-        self._behind_trial: TrialPages | None = None
         self.studies = StudyPages(
             self._run,
             self._page,
             lambda run: library.others(run, beside=looks_beside),
             self._part,
             live,
-            looks_outside=looks_beside,
         )
 
     def _part(self, name: str, state: object) -> str:
@@ -217,7 +217,6 @@ class Pages:
         """``/episode/<id>``: one trial and its replays."""
         with LOADING:
             from dashboards.episode_page import build_page  # noqa: PLC0415  # reads episodes
-            from dashboards.what_if import QUANTITIES  # noqa: PLC0415
 
         run = self._run(request)
         episode_id = request.path_params["id"]
@@ -232,7 +231,6 @@ class Pages:
             selection=selection,
             before=before,
             after=after,
-            quantities=QUANTITIES,
         )
 
     def frame(self, request: Request) -> Response:
@@ -247,6 +245,47 @@ class Pages:
         data, media_type = read_frame(path, request.path_params["camera"], stamp_ns)
         return kept(data, media_type)
 
+    def frames(self, request: Request) -> Response:
+        """``/episode/<id>/frames/<camera>?file=``: all pictures of a camera, or of the twin's."""
+        with LOADING:
+            from dashboards.frames import RENDERED, pack_frames  # noqa: PLC0415
+
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        camera_id, name = request.path_params["camera"], request.query_params.get("file")
+        if name:
+            path, camera_id = derived_path(run, name), RENDERED + camera_id
+        return kept(pack_frames(path, camera_id), "application/octet-stream")
+
+    def scene(self, request: Request) -> Response:
+        """``/episode/<id>/scene``: Gaussians, poses and ways for the 3D view."""
+        with LOADING:
+            from dashboards.scene_file import packed  # noqa: PLC0415  # loads the twin
+
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        data = packed(path, run.path, scene_stamps(run, path))
+        return Response(data, media_type="application/octet-stream")
+
+    def scene_picture(self, request: Request) -> Response:
+        """``/episode/<id>/scene.jpg?t=``: the recorded state, before or without the 3D view."""
+        with LOADING:
+            from dashboards.queue_page import drawn_once  # noqa: PLC0415  # reads episodes
+
+        run = self._run(request)
+        path = episode_path(run, request.path_params["id"])
+        t_s = round(_seconds(request) or 0.0, 2)
+        stamps = scene_stamps(run, path)
+
+        def draw() -> bytes:
+            with LOADING:
+                from dashboards.scene_file import drawn  # noqa: PLC0415  # loads the twin
+
+            return drawn(path, run.path, stamps, t_s)
+
+        what = (path.stem, stamps, t_s)
+        return kept(drawn_once(run.results_dir / PICTURES, path.stem, what, draw), "image/jpeg")
+
     def episode_file(self, request: Request) -> Response:
         """``/episode/<id>/file``: the recorded file itself."""
         return _download(episode_path(self._run(request), request.path_params["id"]))
@@ -258,25 +297,6 @@ class Pages:
     def reviews(self) -> list[Route]:
         """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
         return review_routes(self._run, self._page)
-
-    def trial(self) -> list[Route]:
-        """What is behind a trial's page: its 3D scene, all pictures of a camera, and what-if."""
-        load = self._trial_pages
-        return [
-            Route("/episode/{id}/scene", late(load, "scene"), middleware=SMALL),
-            Route("/episode/{id}/scene.jpg", late(load, "picture")),
-            Route("/episode/{id}/frames/{camera}", late(load, "frames")),
-            Route("/episode/{id}/what_if", late(load, "what_if")),
-            Route("/episode/{id}/what_if", late(load, "ask"), methods=["POST"]),
-            Route("/episode/{id}/what_if/cancel", late(load, "cancel"), methods=["POST"]),
-        ]
-
-    def _trial_pages(self) -> "TrialPages":
-        with LOADING:
-            from dashboards.trial_routes import TrialPages  # noqa: PLC0415  # reads episodes
-
-            self._behind_trial = self._behind_trial or TrialPages(self._run)
-            return self._behind_trial
 
     def console(self) -> list[Route]:
         """``/console``: starts, stops and answers trials from a phone, where it is open."""

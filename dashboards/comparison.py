@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 WAITED_FOR = 3_000
 """Files of a run that a page waits for; a larger run is brought up to date behind the page."""
+IMPORTED = "imported"
+"""Kind of an episode that is a motion from elsewhere."""
 RENDERS = "image."
 """Begins the ids of numbers about folders of renders."""
 LOOKED_AT_S = 5.0
@@ -61,7 +63,7 @@ class Judgement:
 
     @property
     def has_methods(self) -> bool:
-        """Whether renders of several methods were compared, which have a page of their own."""
+        """Whether renders of several methods were compared, which no trial shows."""
         return any(item.id.startswith(RENDERS) for item in self.measurements)
 
     @property
@@ -72,9 +74,10 @@ class Judgement:
     @property
     def only_motions(self) -> bool:
         """Whether the run holds imported motions and not one trial."""
-        if self.index is None or not self.about.get("paths"):
+        if self.index is None or self.index.count(Selection()):
             return False
-        return self.index.count(Selection()) == 0
+        files, _ = self.index.files(broken=False)
+        return any(file.kind == IMPORTED and file.task for file in files)
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import streams
 from bridge.episode.catalogue import outcome_of
 from bridge.episode.metadata import Outcome, why_not_counted
 from bridge.episode.reader import Episode
@@ -112,8 +111,6 @@ class EpisodePage:
     """The first divergence of recording and twin, where the replays tell one."""
     divergence_t_s: float | None
     sent_plan: Plan | None
-    movable: tuple[str, ...]
-    """Objects of the task that a what-if can put elsewhere."""
     problems: tuple[str, ...]
 
 
@@ -179,17 +176,7 @@ def build_page(
         divergence=moment,
         divergence_t_s=divergence_t_s,
         sent_plan=sent_plan,
-        movable=problems.attempt(lambda: _movable(path), ()) if sent_plan else (),
         problems=tuple(problems.texts),
-    )
-
-
-def _movable(path: Path) -> tuple[str, ...]:
-    task = streams.task_file(Episode.open(path)).task()
-    return tuple(
-        name
-        for name, model in task.objects.items()
-        if not model.fixed and name not in task.containers
     )
 
 

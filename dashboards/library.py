@@ -12,6 +12,8 @@ from dashboards.errors import NotHereError
 RESULTS = "results.json"
 MOST_BESIDE = 500
 """Folders that are looked at for runs."""
+Stamps = tuple[tuple[str, int, int], ...]
+"""Name, time of writing [ns] and size of files."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,15 @@ def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
     """
     found = run.derived(f"{escape(episode_id)}.{kind}.*")
     return [path for path in found if _is_inside(run, path)]
+
+
+def scene_stamps(run: RunFolder, path: Path) -> Stamps:
+    """Names, times of writing and sizes of what the 3D scene of a recorded episode is made of."""
+    files = [path, run.scene_dir / "scene.json", run.scene_dir / "calibration.json"]
+    for kind in ("replay", "localised"):
+        files += derived_paths(run, path.stem, kind)
+    found = [(file.name, file.stat()) for file in files if file.is_file()]
+    return tuple((name, status.st_mtime_ns, status.st_size) for name, status in found)
 
 
 def derived_path(run: RunFolder, name: str) -> Path:

@@ -14,7 +14,6 @@ from typing import Any
 
 from bridge.episode.run_folder import RunFolder
 from dashboards import wording
-from dashboards.band_charts import BandGroup, band_groups
 from dashboards.comparison import Judgement
 from dashboards.figures import RateGroup, Scatter, scatter
 from evaluator.result import Exclusion, Measurement
@@ -369,8 +368,6 @@ class Overview:
     num_broken: int
     tables: tuple[Mapping[str, Any], ...]
     """Of a run without trials: what the evaluator says of it."""
-    bands: tuple[BandGroup, ...]
-    """Imported motions: recorded against simulated."""
     undefined: tuple[Undefined, ...]
     num_undefined: int
     num_numbers: int
@@ -445,7 +442,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         broken=broken,
         num_broken=num_broken,
         tables=tuple(about.get("tables", [])),
-        bands=band_groups(about),
         undefined=undefined(numbers),
         num_undefined=sum(number.value is None for number in numbers),
         num_numbers=len(numbers),

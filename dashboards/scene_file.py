@@ -8,18 +8,26 @@ end.
 
 import json
 import struct
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from dashboards.trial_scene import RECORDED, Side, TrialScene
+from dashboards.episode_page import read_replays, sent_plan_of
+from dashboards.library import Stamps, derived_paths
+from dashboards.recording import Problems, read_recording
+from dashboards.trial_plots import shown_replays
+from dashboards.trial_scene import RECORDED, Side, TrialScene, gather_scene
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
 from twin.scene.harmonics import NUM_FIRST
 from twin.scene.movable_scene import MovableScene
@@ -57,6 +65,8 @@ UP = np.array([0.0, 0.0, 1.0])
 ASIDE_RAD, ABOVE_M = 0.35, 0.12
 """How far the first view stands from that of the recorded camera, around what is looked at."""
 PICTURE_SIZE = "960x600"
+_GATHERING = threading.Lock()
+"""Robot models keep scratch memory: one answer at a time uses them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +101,35 @@ def first_view(scene: TrialScene) -> FirstView:
         )
     camera = Camera(width=640, height=400, fx=560.0, fy=560.0, cx=320.0, cy=200.0)
     return FirstView(camera=camera, eye_m=EYE_M, target_m=target_m)
+
+
+@lru_cache(maxsize=2)
+def packed(path: Path, run_path: Path, stamps: Stamps) -> bytes:
+    """The file of a recorded episode's scene.
+
+    Args:
+        path: The recorded episode.
+        run_path: Folder of its run.
+        stamps: Of what the scene is made of; another one is gathered anew.
+    """
+    with _GATHERING:
+        return pack_scene(_gathered(path, run_path, stamps))
+
+
+def drawn(path: Path, run_path: Path, stamps: Stamps, t_s: float) -> bytes:
+    """The picture of a recorded episode's scene at a page time [s], as JPEG; else as ``packed``."""
+    with _GATHERING:
+        return draw_picture(_gathered(path, run_path, stamps), t_s)
+
+
+@lru_cache(maxsize=1)
+def _gathered(path: Path, run_path: Path, _stamps: Stamps) -> TrialScene:
+    """Gather once for the picture and for the 3D view, which are asked for together."""
+    run = RunFolder(run_path)
+    recording = read_recording(path)
+    replays = read_replays(derived_paths(run, path.stem, "replay"), recording, Problems())
+    sent_plan = sent_plan_of(recording)
+    return gather_scene(run, recording, shown_replays(replays, sent_plan), sent_plan)
 
 
 def draw_picture(scene: TrialScene, t_s: float) -> bytes:

@@ -40,8 +40,6 @@ class StudyPages:
         others_of: OthersOf,
         part: Callable[[str, object], str],
         config: DashboardConfig,
-        *,
-        looks_outside: bool,
     ) -> None:
         """Remember whom to ask.
 
@@ -51,9 +49,7 @@ class StudyPages:
             others_of: The runs that one may be compared with.
             part: Fills in a part of the page Live, by name, with what is heard.
             config: Where the recorder is.
-            looks_outside: Whether images that lie outside of a run may be shown.
         """
-        self._looks_outside = looks_outside
         self._run, self._page, self._others, self._part = run_of, page, others_of, part
         self._config = config
         self._feed: LiveFeed | None = None
@@ -69,8 +65,6 @@ class StudyPages:
             Route("/failures/clip/{id}", self.clip),
             Route("/compare", self.compare),
             Route("/share", self.share),
-            Route("/methods", self.methods),
-            Route("/methods/image", self.method_image),
             Route("/live", self.live),
             Route("/live/events", self.events),
             Route("/live/preview/{camera}", self.preview),
@@ -145,26 +139,6 @@ class StudyPages:
             raise NotHereError(str(error)) from error
         headers = {"Content-Disposition": 'attachment; filename="trials.html"'}
         return Response(made.text, media_type="text/html", headers=headers)
-
-    def methods(self, request: Request) -> Response:
-        """``/methods?metric=&method=&left=&right=&view=``: renders, worst views first."""
-        with LOADING:
-            from dashboards.methods_page import build_methods  # noqa: PLC0415  # loads the evaluator
-
-        run = self._run(request)
-        return self._page(
-            "methods.html", request, page=build_methods(run, judge(run), request.query_params)
-        )
-
-    def method_image(self, request: Request) -> Response:
-        """``/methods/image?method=&view=``: one image that was scored."""
-        with LOADING:
-            from dashboards.methods_page import method_image  # noqa: PLC0415  # loads the evaluator
-
-        run = self._run(request)
-        asked = [request.query_params.get(name, "") for name in ("method", "view")]
-        data, media_type = method_image(run, judge(run), *asked, looks_outside=self._looks_outside)
-        return kept(data, media_type)
 
     def live(self, request: Request) -> Response:
         """``/live``: the recording under way."""
