@@ -153,7 +153,6 @@ class VariationConfig:
 
 
 Mode = Literal["kinematic", "dynamic"]
-Grasp = Literal["friction", "attach"]
 
 RANGES: Mapping[str, tuple[float, float]] = {
     "start_rad": (0, 10),
@@ -163,7 +162,6 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "max_contact_depth_m": (0, 1),
     "pre_grasp_depth_m": (0, 1),
     "pre_grasp_soft_depth_m": (0, 1),
-    "max_slip_m": (0, 10),
     "moved_m": (0, 1),
     "path_step_s": (1e-3, 10),
     "max_joint_step_rad": (0, 10),
@@ -204,9 +202,6 @@ class ReplayConfig:
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
     choose it for each trajectory."""
-    grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
-    """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
-    tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
     start_rad: float = 0.05
     """A plan starts no farther than this from where each joint of the robot is [rad]."""
     start_m: float = 0.01
@@ -216,8 +211,6 @@ class ReplayConfig:
     )
     """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
     reported where it says something else. Soft bodies are pybullet's alone."""
-    engines_must_agree: Annotated[bool, Parameter(name="--engines-must-agree")] = False
-    """With --engine both: where the two say something else, the verdict is undecided."""
     start_overlap_m: float = 0.006
     """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
     are not evaluated [m]."""
@@ -230,9 +223,6 @@ class ReplayConfig:
     pre_grasp_soft_depth_m: float = 0.004
     """The same for soft objects, which give way. A finger is 12 mm thick: what it is pushed into
     lies at most 6 mm deep in it [m]."""
-    max_slip_m: float | None = None
-    """A plan is refused when an object moves farther than this in the hand that carries it [m].
-    None, the default, refuses none for it: on unused trials it cost more good plans than bad."""
     moved_m: float = 0.005
     """An object counts as carried or pushed once it is this far from its start [m]."""
     path_step_s: float = 0.04
@@ -273,9 +263,6 @@ class ReplayConfig:
         refuse_outside(self, RANGES)
         for engine in self.engines():
             require_engine(engine)
-        if self.engines_must_agree and self.engine != "both":
-            message = f"--engines-must-agree needs --engine both; it is {self.engine}."
-            raise UsageError(message)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
@@ -328,45 +315,3 @@ class ReplayRunConfig:
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be replayed."""
         refuse_outside(self, {"workers": (1, 4096), "samples": (0, 100_000)})
-
-
-CHANGES: Mapping[str, tuple[float, float]] = {
-    "friction": (0.05, 10),
-    "grip_force": (0.05, 10),
-    "mass": (0.05, 20),
-    "grip_delay_s": (0, 2),
-    "x_m": (-0.2, 0.2),
-    "y_m": (-0.2, 0.2),
-    "turn_rad": (-3.2, 3.2),
-}
-"""How far a replay may be asked to be from the nominal one, ends included."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChangeConfig:
-    """What is otherwise than in the nominal replay of a plan; as it stands, nothing."""
-
-    friction: float = 1.0
-    """Times the objects' friction, and with it that between them and all others."""
-    grip_force: float = 1.0
-    """Times the force of the gripper."""
-    mass: float = 1.0
-    """Times the masses of objects that can be moved."""
-    grip_delay_s: float = 0.0
-    """The gripper acts this much later [s]."""
-    object: str = ""
-    """Which object stands elsewhere; empty: all that can be moved, by the same."""
-    x_m: float = 0.0
-    """How far along x of the robot's base [m]."""
-    y_m: float = 0.0
-    """And along y [m]."""
-    turn_rad: float = 0.0
-    """And turned about the vertical through it [rad]."""
-
-    def __post_init__(self) -> None:
-        """Refuse what is farther than anybody means.
-
-        Raises:
-            UsageError: Naming the number and its limits.
-        """
-        refuse_outside(self, CHANGES)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
-from twin.physics.engines import Attachment, PhysicsWorld, open_world
+from twin.physics.engines import PhysicsWorld, open_world
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
@@ -164,7 +164,7 @@ def simulate(
         path: Joints and gripper widths over time.
         scene: Where the objects are at the start.
         hulls: The robot's convex pieces, which stand for its meshes.
-        config: Physics, grasp, rates and times to settle.
+        config: Physics, rates and times to settle.
 
     Raises:
         UsageError: For soft bodies in an engine that has none.
@@ -189,12 +189,9 @@ def simulate(
         for _ in range(round(config.settle_before_s * rate)):
             world.step()
         samples.take(world, 0)
-        tie = Attachment(world) if config.grasp == "attach" else None
         for step in range(total):
             world.robot.command(targets[step + 1], velocities[step], widths[step])
             world.step()
-            if tie is not None:
-                tie.update(widths[step])
             if (step + 1) % stride == 0 and not samples.take(world, stamps[step + 1]):
                 break
         return samples.states(world)

@@ -179,8 +179,8 @@ def jobs_of(item: Preparation) -> Prepared:
             else:
                 jobs.append(executed)
             # Which engine is asked makes no other kinematic replay.
-            alone = replace(replay, engine="pybullet", engines_must_agree=False)
-            jobs.append(replace(executed, config=replace(alone, mode="kinematic")))
+            alone = replace(replay, engine="pybullet", mode="kinematic")
+            jobs.append(replace(executed, config=alone))
     return Prepared(jobs=tuple(jobs), why_not=why_not)
 
 

@@ -36,10 +36,10 @@ from twin.replay.config import ReplayConfig
 from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
+from twin.replay.grasps import grasps_seen
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.slip import grasped_objects, grasps_seen, slips, unless_slipped
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
@@ -349,12 +349,9 @@ def _judge(
     path, checks, states = commanded.path, commanded.checks, moved.states
     # What was executed is judged by where things end: it is known whether they were dropped.
     planned = moved.by_physics and commanded.trajectory == "planned"
-    slipped: list[Failure] = []
     if planned:
         simulated = simulated_limit_failures(path, states, load_robot(scene.urdf))
         checks = {**checks, "limits": checks["limits"] + simulated}
-        if config.max_slip_m is not None:
-            slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
     unreachable_ns = commanded.unreachable_ns
     if moved.by_physics or config.mode == "kinematic":
         terminal = terminal_factor(
@@ -370,7 +367,7 @@ def _judge(
         result.verdict,
         ik=factor_from(commanded.failures),
         clearance=factor_from(moved.monitor.failures, undecided=undecided),
-        terminal=unless_slipped(terminal, slipped),
+        terminal=terminal,
         warnings=warnings_of(scene, result),
         findings=tuple(findings),
         checks={name: factor_from(found) for name, found in checks.items()},
@@ -457,17 +454,16 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
-    """Name what moved things: a grasp that is no friction grasp is part of the name.
+    """Name what moved things.
 
     Args:
         task: Whether it has soft objects.
-        config: Mode and kind of grasp.
+        config: Mode and engine.
     """
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
-    tied = "+attach" if config.grasp == "attach" else ""
-    return f"{engine_version(config.engines()[0])}{soft}{tied}"
+    return f"{engine_version(config.engines()[0])}{soft}"
 
 
 def _clearance_undecided(
