@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
-from twin.replay.config import ReplayConfig
+from twin.replay.config import START_M, START_RAD
 from twin.replay.dynamics import States
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
@@ -30,7 +30,6 @@ def start_failures(
     path: JointPath,
     measured_rad: Float[np.ndarray, " num_joints"],
     robot: RobotModel,
-    config: ReplayConfig,
 ) -> list[Failure]:
     """Say how far a plan's first waypoint is from where the robot stands.
 
@@ -39,13 +38,12 @@ def start_failures(
         path: Its first posture counts for the joints.
         measured_rad: What the encoders say.
         robot: Whose they are.
-        config: Both limits.
     """
     off_rad = np.abs(path.joints_rad[0] - measured_rad)
     joint = int(np.argmax(off_rad))
     place_m = robot.T_base_tcp(measured_rad)[:3, 3]
     off_m = float(np.linalg.norm(np.array(plan.tau[0].p_m) - place_m))
-    if off_rad[joint] <= config.start_rad and off_m <= config.start_m:
+    if off_rad[joint] <= START_RAD and off_m <= START_M:
         return []
     return [
         Failure(
@@ -54,7 +52,7 @@ def start_failures(
             bodies=(robot.record.joints[joint],),
             detail=f"the plan starts {off_m * 1e3:.1f} mm and {off_rad[joint]:.3f} rad "
             f"({robot.record.joints[joint]}) from where the robot is; the limits are "
-            f"{config.start_m * 1e3:.0f} mm and {config.start_rad:g} rad",
+            f"{START_M * 1e3:.0f} mm and {START_RAD:g} rad",
         )
     ]
 

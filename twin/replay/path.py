@@ -18,13 +18,18 @@ from bridge.robots.robot import Robot
 from bridge.task.plan import Plan, Waypoint
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
-from twin.replay.config import ReplayConfig
+from twin.replay.config import PATH_STEP_S
 from twin.replay.failure import Failure
 from twin.robot.collision import RobotHulls
+from twin.robot.config import IkConfig
 from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
 
+IK = IkConfig()
+"""When a pose counts as reached."""
+MAX_JOINT_STEP_RAD = 0.3
+"""Largest change of a joint within one path step; more is a jump [rad]."""
 _LIMIT_SLACK_RAD = 1e-3
 _SPEED_SLACK = 1.02
 """Recorded and rounded joints may exceed a limit by as little as this."""
@@ -68,7 +73,6 @@ def jumps(
     times_ns: Int[np.ndarray, " num_times"],
     joints_rad: Float[np.ndarray, "num_times num_joints"],
     robot: RobotModel,
-    config: ReplayConfig,
 ) -> list[Failure]:
     """Find the first jump and the first excess of speed between neighbouring postures.
 
@@ -76,7 +80,6 @@ def jumps(
         times_ns: Of the postures, ascending.
         joints_rad: Postures, joints from base to hand.
         robot: Gives the limits of speed.
-        config: Gives the largest step, ``max_joint_step_rad``.
     """
     if len(times_ns) < 2:
         return []
@@ -84,7 +87,7 @@ def jumps(
     speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
     failures = []
     for cause, values, limit, unit in (
-        ("joint_jump", steps, np.full(len(robot.joints), config.max_joint_step_rad), "rad"),
+        ("joint_jump", steps, np.full(len(robot.joints), MAX_JOINT_STEP_RAD), "rad"),
         ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
     ):
         over = values > limit
@@ -262,7 +265,6 @@ class JointPath:
 def path_of_plan(
     plan: Plan,
     robot: RobotModel,
-    config: ReplayConfig,
     *,
     clearance: Clearance | None = None,
     start_rad: Float[np.ndarray, " num_joints"] | None = None,
@@ -275,7 +277,6 @@ def path_of_plan(
     Args:
         plan: What is commanded.
         robot: What is to follow it.
-        config: Spacing and tolerances.
         clearance: Says which postures touch something, where the plan leaves the choice.
         start_rad: Where the robot stands: a plan that begins without joints goes on from there.
 
@@ -288,14 +289,12 @@ def path_of_plan(
     """
     check_usable(plan, robot)
     knots = _Knots()
-    for is_open, group in groupby(
-        _targets(plan, robot, config), key=lambda target: target.given is None
-    ):
+    for is_open, group in groupby(_targets(plan, robot), key=lambda target: target.given is None):
         run = list(group)
         if is_open:
-            _follow(knots, run, robot, config, clearance, start_rad)
+            _follow(knots, run, robot, clearance, start_rad)
         else:
-            _take_given(knots, run, robot, config)
+            _take_given(knots, run, robot)
         if knots.unreachable_ns is not None:
             break
     path = JointPath(
@@ -345,7 +344,6 @@ def _follow(
     knots: _Knots,
     run: list[_Target],
     robot: RobotModel,
-    config: ReplayConfig,
     clearance: Clearance | None,
     start_rad: Float[np.ndarray, " num_joints"] | None,
 ) -> None:
@@ -354,7 +352,7 @@ def _follow(
         robot,
         np.stack([target.T for target in run]),
         start_rad=knots.joints[-1] if knots.joints else start_rad,
-        config=config.ik,
+        config=IK,
         clearance=clearance,
     )
     for target, joints, reached in zip(run, followed.joints_rad, followed.reached, strict=True):
@@ -364,15 +362,15 @@ def _follow(
         knots.add(target.t_ns, joints)
 
 
-def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: ReplayConfig) -> None:
+def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel) -> None:
     """Take the plan's joints where they reach its own poses, and the nearest that do elsewhere."""
     for target in run:
         given = target.given
         if given is None:
             continue
-        failure = _check_given(robot, target.t_ns, given, target.T, config)
+        failure = _check_given(robot, target.t_ns, given, target.T)
         if failure is not None:
-            solution = solve_ik(robot, target.T, config.ik, warm_start_rad=given)
+            solution = solve_ik(robot, target.T, IK, warm_start_rad=given)
             given = solution.joints_rad
             if not solution.reached:
                 knots.stop(robot, target, given)
@@ -381,7 +379,7 @@ def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: Re
         knots.add(target.t_ns, given)
 
 
-def _targets(plan: Plan, robot: RobotModel, config: ReplayConfig) -> list[_Target]:
+def _targets(plan: Plan, robot: RobotModel) -> list[_Target]:
     """Waypoints, and where joints are not given the poses on the straight line between them."""
     times = plan.times_ns()
     quats = plan.quaternions_wxyz()
@@ -391,7 +389,7 @@ def _targets(plan: Plan, robot: RobotModel, config: ReplayConfig) -> list[_Targe
         [list(plan.joint_names).index(name) for name in robot.joints] if plan.joint_names else None
     )
     targets: list[_Target] = []
-    step_ns = round(config.path_step_s * 1e9)
+    step_ns = round(PATH_STEP_S * 1e9)
     for index, waypoint in enumerate(plan.tau):
         given = _given_joints(plan.id, waypoint, len(robot.joints), order)
         if given is None and index > 0:
@@ -442,14 +440,13 @@ def _check_given(
     t_ns: int,
     given: Float[np.ndarray, " num_joints"],
     T: Float[np.ndarray, "4 4"],
-    config: ReplayConfig,
 ) -> Failure | None:
     """Say why a plan's own joints are no solution for its pose; None when they are."""
     outside = outside_limits(robot, given[None])[0]
     if np.any(outside):
         return limit_failure(robot, t_ns, given, int(np.argmax(outside)))
     offset, angle = pose_error(robot, given, T)
-    if offset <= config.ik.position_tolerance_m and angle <= config.ik.rotation_tolerance_rad:
+    if offset <= IK.position_tolerance_m and angle <= IK.rotation_tolerance_rad:
         return None
     return Failure(
         t_ns=t_ns,
@@ -459,16 +456,13 @@ def _check_given(
     )
 
 
-def check_path(
-    path: JointPath, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
-) -> list[Failure]:
+def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
     """Find joint limits, jumps, excess speed and self-collision along an interpolated path.
 
     Args:
         path: Joints and gripper widths over time.
         robot: Gives limits of angle and speed.
         hulls: The same robot's convex pieces; they are moved along the path.
-        config: Step along the path [s], and the largest joint step.
     """
     failures = []
     outside = outside_limits(robot, path.joints_rad)
@@ -477,9 +471,9 @@ def check_path(
         failures.append(
             limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
         )
-    times = path.dense_times_ns(config.path_step_s)
+    times = path.dense_times_ns(PATH_STEP_S)
     joints = path.joints_at(times)
-    failures += jumps(times, joints, robot, config)
+    failures += jumps(times, joints, robot)
     widths = path.width_at(times)
     links = own_links(hulls)
     for t_ns, row, width in zip(times, joints, widths, strict=True):

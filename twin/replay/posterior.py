@@ -257,8 +257,8 @@ def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
     """
     scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
-    scene = free_start(scene, soft_models(scene), config.start_overlap_m)
-    path, _, _ = path_of_plan(trial.plan, robot, config)
+    scene = free_start(scene, soft_models(scene))
+    path, _, _ = path_of_plan(trial.plan, robot)
     states = simulate(path, scene, hulls_of(robot), config)
     rollout = Rollout(
         stamps_ns=states.stamps_ns,

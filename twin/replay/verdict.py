@@ -32,7 +32,7 @@ from twin.replay.checks import (
 )
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
-from twin.replay.config import ReplayConfig
+from twin.replay.config import PATH_STEP_S, ReplayConfig
 from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
@@ -201,11 +201,11 @@ def replay_plan(
     robot = load_robot(scene.urdf)
     free = posture_clearance(scene, hulls_of(robot), config, up_to_m=0.0)
     path, failures, unreachable_ns = path_of_plan(
-        plan, robot, config, clearance=free, start_rad=scene.start_rad
+        plan, robot, clearance=free, start_rad=scene.start_rad
     )
     checks = {"task": task_failures(plan, scene.task), "limits": path_limit_failures(path, robot)}
     if scene.start_rad is not None:
-        checks["start"] = start_failures(plan, path, scene.start_rad, robot, config)
+        checks["start"] = start_failures(plan, path, scene.start_rad, robot)
     commanded = Commanded(
         path=path.with_late_gripper(config.grip_delay_s),
         failures=failures,
@@ -275,11 +275,11 @@ def _replay(
     refuse_early: bool = False,
 ) -> ReplayResult:
     robot = load_robot(scene.urdf)
-    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot), config)
+    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot))
     commanded = replace(commanded, failures=failures)
     plan = limited_to_task(plan, scene.task)
     if config.mode == "dynamic":
-        scene = free_start(scene, soft_models(scene), config.start_overlap_m)
+        scene = free_start(scene, soft_models(scene))
     moved = _move(commanded, plan, scene, config, refuse_early=refuse_early)
     states = moved.states
     result = ReplayResult(
@@ -311,7 +311,7 @@ def _move(
     """Follow the path, with physics unless it is refused before."""
     path, hulls = commanded.path, hulls_of(load_robot(scene.urdf))
     monitor = ClearanceMonitor(scene, plan, hulls, config)
-    _pre_grasp(monitor, path, config)
+    _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
     states, by_physics, measured = None, dynamic, True
     if dynamic and refuse_early:
@@ -429,8 +429,8 @@ def first_of(states: States) -> States:
     )
 
 
-def _pre_grasp(monitor: ClearanceMonitor, path: JointPath, config: ReplayConfig) -> None:
-    times = path.dense_times_ns(config.path_step_s)
+def _pre_grasp(monitor: ClearanceMonitor, path: JointPath) -> None:
+    times = path.dense_times_ns(PATH_STEP_S)
     if path.first_close_ns is not None:
         times = times[times < path.first_close_ns]
     for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):

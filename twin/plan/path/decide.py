@@ -17,7 +17,7 @@ from twin.plan.path.world import Carried
 from twin.plan.problem import Problem, TimedPath
 from twin.replay.audit import audit
 from twin.replay.clearance.bodies import own_links
-from twin.replay.clearance.monitor import Allowed, ClearanceMonitor
+from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.result import ReplayResult
 from twin.robot.collision import hulls_of
@@ -122,7 +122,7 @@ def decide(
                 )
             )
             break
-    limits = {"deep_contact": -config.max_contact_depth_m}
+    limits = {"deep_contact": -MAX_CONTACT_DEPTH_M}
     refusals += [
         PathRefusal(
             bodies=(failure.bodies[0], failure.bodies[1]),

@@ -239,9 +239,7 @@ def test_engines_that_differ_are_named_in_the_row_and_in_what_is_said(
 
     monkeypatch.setattr(run_job_module, "replay_plan", planned)
     monkeypatch.setattr(run_job_module, "replay_joints", executed)
-    monkeypatch.setattr(
-        run_job_module, "compare", lambda *_: diverge("round-1", [], QUICK.divergence)
-    )
+    monkeypatch.setattr(run_job_module, "compare", lambda *_: diverge("round-1", []))
     replayed = replace(QUICK, engine="both")
     summary = replay_run(run, ReplayRunConfig(replay=replayed), QUIET)
     (row,) = [row for row in summary["rows"] if row["plan"] == "round-0"]
