@@ -20,7 +20,7 @@ class CalibrateConfig:
     cameras: bool = False
     """Where the cameras are, written to RUN/scene/calibration.json."""
     physics: bool = False
-    """Friction, masses, forces, delay and pose bias from executed probes and trials, written to
+    """Friction, masses, forces and pose bias from executed probes and trials, written to
     RUN/scene/calibration.json where held-out episodes confirm them."""
     posterior: bool = False
     """Which friction, masses, force and common shift agree with the trials executed in this run,
