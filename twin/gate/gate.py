@@ -20,6 +20,7 @@ from jaxtyping import Float
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION, cell_topic
 from bridge.errors import GstError
 from bridge.robots.robot import Robot, robot_name, robot_of
+from bridge.task.causes import Cause
 from bridge.task.find import Attached, find_task_file
 from bridge.task.plan import Plan
 from bridge.task.task_file import ObjectModel, Task, TaskFile
@@ -499,8 +500,10 @@ class Gate:
         if abs(p["value"] - p["k"] / p["n"]) > ROUNDING:
             told += f", and with what this session's trials say of them {p['value']:.0%} would"
         detail = f"{told}, {wanted:.0%} are asked for"
-        unlikely = Factor(value=False, cause="probability", detail=detail)
-        return replace(verdict, terminal=unlikely, reason=f"terminal: probability: {detail}")
+        unlikely = Factor(value=False, cause=Cause.PROBABILITY, detail=detail)
+        return replace(
+            verdict, terminal=unlikely, reason=f"terminal: {Cause.PROBABILITY}: {detail}"
+        )
 
     def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
         """Before a yes: the cell must still be as it was judged.

@@ -15,6 +15,7 @@ from bridge.episode.executions import NO_PLAN
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.robots.robot import Robot
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Waypoint
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
@@ -62,7 +63,7 @@ def limit_failure(
     """
     return Failure(
         t_ns=t_ns,
-        cause="joint_limit",
+        cause=Cause.JOINT_LIMIT,
         bodies=(robot.joints[joint],),
         detail=f"{robot.joints[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
         f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
@@ -87,8 +88,8 @@ def jumps(
     speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
     failures = []
     for cause, values, limit, unit in (
-        ("joint_jump", steps, np.full(len(robot.joints), MAX_JOINT_STEP_RAD), "rad"),
-        ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
+        (Cause.JOINT_JUMP, steps, np.full(len(robot.joints), MAX_JOINT_STEP_RAD), "rad"),
+        (Cause.JOINT_SPEED, speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
     ):
         over = values > limit
         if np.any(over):
@@ -429,7 +430,7 @@ def _unreachable(t_ns: int, T: Float[np.ndarray, "4 4"], error_m: float) -> Fail
     x, y, z = T[:3, 3]
     return Failure(
         t_ns=t_ns,
-        cause="unreachable",
+        cause=Cause.UNREACHABLE,
         detail=f"no joints reach ({x:.3f}, {y:.3f}, {z:.3f}) m; "
         f"the nearest miss it by {error_m * 1e3:.1f} mm",
     )
@@ -450,7 +451,7 @@ def _check_given(
         return None
     return Failure(
         t_ns=t_ns,
-        cause="joints_disagree",
+        cause=Cause.JOINTS_DISAGREE,
         detail=f"the plan's joints put the tool {offset * 1e3:.1f} mm and "
         f"{np.degrees(angle):.2f} degrees from its own pose",
     )
@@ -483,7 +484,7 @@ def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Fa
             failures.append(
                 Failure(
                     t_ns=int(t_ns),
-                    cause="self_collision",
+                    cause=Cause.SELF_COLLISION,
                     bodies=closest.links,
                     detail=f"{closest.links[0]} is {-closest.distance_m * 1e3:.1f} mm inside "
                     f"{closest.links[1]}",

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.robots.robot import robot_of
+from bridge.task.causes import Cause
 from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
@@ -74,14 +75,14 @@ def terminal_factor(
     if burst is not None:
         detail = f"{burst.object_id}: {burst.found}"
         bodies = (burst.object_id,)
-        failure = Failure(t_ns=burst.t_ns, cause="exploded", bodies=bodies, detail=detail)
+        failure = Failure(t_ns=burst.t_ns, cause=Cause.EXPLODED, bodies=bodies, detail=detail)
         return factor_from([failure])
     if unreachable_ns is not None:
         detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
         return Factor(value=None, detail=detail)
     end_ns = int(result.stamps_ns[-1])
     for name, found in result.broken.items():
-        failure = Failure(t_ns=end_ns, cause="shape", bodies=(name,), detail=f"{name} {found}")
+        failure = Failure(t_ns=end_ns, cause=Cause.SHAPE, bodies=(name,), detail=f"{name} {found}")
         return factor_from([failure])
     findings = evaluate_success(scene.task, result.rollout())
     value = all_hold(findings)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from bridge.task.verdict import Factor, Verdict
 from twin.plan.path.world import Carried
@@ -122,7 +123,7 @@ def decide(
                 )
             )
             break
-    limits = {"deep_contact": -MAX_CONTACT_DEPTH_M}
+    limits: dict[str, float] = {Cause.DEEP_CONTACT: -MAX_CONTACT_DEPTH_M}
     refusals += [
         PathRefusal(
             bodies=(failure.bodies[0], failure.bodies[1]),

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.robots.robot import Gripper
+from bridge.task.causes import Cause
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
@@ -370,7 +371,7 @@ class ClearanceMonitor:
                     )
                 )
                 if distance < -limit_m:
-                    self._fail(t_ns, "pre_grasp_penetration", link.body, name, distance)
+                    self._fail(t_ns, Cause.PRE_GRASP_PENETRATION, link.body, name, distance)
 
     def contacts(self) -> list[Contact]:
         """Stretches of time in which two bodies were closer than the margin."""
@@ -421,13 +422,14 @@ class ClearanceMonitor:
             # Neither is a finger among the nodes of a soft body that it squeezes as it may.
             solid = body not in self._objects and other not in self._scene.task.soft_objects
             if distance < -MAX_CONTACT_DEPTH_M and solid:
-                self._fail(t_ns, "deep_contact", body, other, distance)
+                self._fail(t_ns, Cause.DEEP_CONTACT, body, other, distance)
             return np.inf
         if distance < self.config.eps_col_m:
-            self._fail(t_ns, "collision" if distance < 0 else "too_close", body, other, distance)
+            cause = Cause.COLLISION if distance < 0 else Cause.TOO_CLOSE
+            self._fail(t_ns, cause, body, other, distance)
         return distance
 
-    def _fail(self, t_ns: int, cause: str, body: str, other: str, distance: float) -> None:
+    def _fail(self, t_ns: int, cause: Cause, body: str, other: str, distance: float) -> None:
         if any(failure.cause == cause for failure in self.failures):
             return
         if distance < 0:
