@@ -12,7 +12,7 @@ from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases
 from twin.calibrate.physics.emulator import cloud_size
-from twin.calibrate.physics.fit import Estimate, Fit, PhysicsFitConfig, fit
+from twin.calibrate.physics.fit import Estimate, Fit, fit
 from twin.calibrate.physics.parameters import (
     BIAS,
     FINGER_FRICTION,
@@ -172,7 +172,7 @@ def calibrate_physics(
 
     Args:
         run: Whose probes and trials are read, and in whose scene folder the calibration goes.
-        config: Evaluations, time budget, samples, workers and seed.
+        config: Evaluations, time budget, workers and seed.
         output: Shows progress.
 
     Returns:
@@ -187,9 +187,6 @@ def calibrate_physics(
     physics = PhysicsConfig()
     parameters = rigid_parameters(physics)
     total = config.evaluations + 2 * cloud_size(len(parameters))
-    settings = PhysicsFitConfig(
-        evaluations=config.evaluations, budget_s=config.budget_s, seed=config.seed
-    )
     output.say(
         f"{len(cases)} episodes: "
         + ", ".join(
@@ -199,15 +196,13 @@ def calibrate_physics(
     )
     workers = config.workers or default_size()
     with (
-        Evaluator(
-            cases, parameters, physics, num_samples=config.samples, workers=workers
-        ) as evaluator,
+        Evaluator(cases, parameters, physics, workers=workers) as evaluator,
         output.progress("physics", total) as advance,
     ):
         found = fit(
             evaluator,
             parameters,
-            settings,
+            config,
             advance=lambda done, note: advance(min(done, total), note),
         )
     record = physics_record(found, cases, physics, skipped)

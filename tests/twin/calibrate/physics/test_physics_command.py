@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import pytest
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.catalogue import write_label
 from bridge.episode.cdr.messages import JointSample
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.metadata import Derived, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import JointTrack
@@ -226,7 +224,6 @@ def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.Mon
     assert case.kind == "squeeze"
     assert len(case.held_widths_m) == 1
     assert 0.04 < case.held_widths_m[0] < 0.056
-    assert case.success is None
     assert case.objects == ("cube",)
     assert np.isfinite(case.settled).all()
     assert 0 < case.stretches_s[-1, 1] < 20
@@ -236,32 +233,6 @@ def test_recorded_probes_become_cases(probed: RunFolder, monkeypatch: pytest.Mon
     )
     with pytest.raises(NoUsableEpisodesError, match="never localised after the plan: cube"):
         read_cases(probed, Output(quiet=True))
-
-
-@pytest.mark.slow
-def test_a_label_given_afterwards_is_what_calibration_believes(
-    probed: RunFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(cases_module, "write_localised", with_localisations)
-    monkeypatch.setattr(cases_module, "NEAR_M", 0.5)
-    (path,) = probed.episodes()
-    episode, trials = Episode.open(path), RunFolder.create(tmp_path / "trials")
-    with EpisodeWriter(trials.episodes_dir / path.name) as writer:
-        writer.describe(replace(episode.info, kind="trial"), outcome=Outcome(result="success"))
-        for message in episode.messages():
-            writer.write(
-                message.topic,
-                message.data,
-                type_name=message.type_name,
-                log_time_ns=message.log_time_ns,
-                publish_time_ns=message.publish_time_ns,
-            )
-    trial = Episode.open(trials.episodes()[0])
-    assert cases_module.read_case(trials, trial).success is True
-    write_label(trials, trial.path.stem, Outcome(result="failure"))
-    assert cases_module.read_case(trials, trial).success is False
-    write_label(trials, trial.path.stem, Outcome(result="unknown"))
-    assert cases_module.read_case(trials, trial).success is None
 
 
 def test_a_clock_that_goes_back_while_a_probe_is_executed_teaches_nothing(
