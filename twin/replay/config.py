@@ -1,7 +1,7 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -51,14 +51,9 @@ class PosteriorDraw:
     wrong_no: float
     """Chance that one succeeds although this replay fails."""
 
-    def to_record(self) -> dict[str, Any]:
-        """Return plain numbers."""
-        boxes = [{**asdict(box), "centre_of_mass": list(box.centre_of_mass)} for box in self.boxes]
-        return {**asdict(self), "bias_m": list(self.bias_m), "boxes": boxes}
-
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "PosteriorDraw":
-        """The inverse of ``to_record``.
+        """Read what ``calibration.json`` keeps of one.
 
         Raises:
             KeyError, TypeError, ValueError: When something lacks or is not a number.
@@ -234,8 +229,6 @@ class ReplayRunConfig:
     robot: str = ""
     """Robot file, by name or path, whose description takes the place of the recorded one; none:
     the robot that each episode was recorded with (docs/robots.md)."""
-    relocalise: bool = False
-    """Redo the localisation of objects that is there already."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
     """How each trajectory is replayed."""
 

@@ -127,9 +127,7 @@ def jobs_of(item: Preparation) -> Prepared:
     if nothing is not None:
         return nothing
     task = streams.task_file(episode, plans[0][1].task if plans else "").task()
-    starts = localised_starts(
-        run, episode, task, scene_hash=item.scene_hash, force=config.relocalise
-    )
+    starts = localised_starts(run, episode, task, scene_hash=item.scene_hash)
     digest = episode.sha256()
     calibration = read_calibration(run)
     replay = for_task(config.replay, calibration, task)
