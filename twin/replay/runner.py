@@ -199,8 +199,10 @@ def _nothing_to_replay(
     if info.kind == "imported":
         if motion_of(episode) is not None:
             return Prepared(why_not="replayed as an imported motion", was_meant=False)
-        said = "nobody said of which task it is a trial"
-        return Prepared(why_not=f"{said}: {LABEL}" if joints else said, was_meant=bool(joints))
+        unknown = "nobody said of which task it is a trial"
+        return Prepared(
+            why_not=f"{unknown}: {LABEL}" if joints else unknown, was_meant=bool(joints)
+        )
     if is_planned:
         return None
     if not info.task:
