@@ -15,8 +15,9 @@ from measure import Target, cpu_seconds, report_targets
 from plan_cell import box_with_wall
 
 from bridge.geometry import se3
+from twin.plan.release.distances import candidate_clearance
 from twin.plan.release.final_states import ReleaseConfig, final_states
-from twin.replay.clearance.distance_grid import GridLookup, candidate_clearance
+from twin.replay.clearance.distance_grid import GridLookup
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 
 CANDIDATES, POINTS, BATCH, SEED = 8000, 200, 60, 5

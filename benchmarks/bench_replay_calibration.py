@@ -76,7 +76,6 @@ def measure_seed(seed: int, folder: Path, rounds: int, trials: int, workers: int
         "held_out": physics["held_out"],
         "promoted": physics["promoted"],
         "errors": physics["errors"],
-        "command_delay_s": physics["command_delay_s"],
         "num_evaluations": physics["num_evaluations"],
         "recorded_s": recorded_s,
         "calibrated_s": time.monotonic() - started - recorded_s,

@@ -79,7 +79,7 @@ def physics_alone(scene: object, plan: object, config: object) -> tuple[float, f
     from twin.robot.model import load_robot
 
     robot = load_robot(scene.urdf)
-    path, _, _ = path_of_plan(plan, robot, config)
+    path, _, _ = path_of_plan(plan, robot)
     start = time.process_time()
     states = simulate(path, scene, hulls_of(robot), config)
     return time.process_time() - start, float(states.stamps_ns[-1]) * 1e-9

@@ -233,7 +233,7 @@ def clearance_rows(num_states: int) -> list[Target]:
 
 def candidate_rows(lookup: object) -> list[Target]:
     from bridge.geometry import se3
-    from twin.replay.clearance.distance_grid import candidate_clearance
+    from twin.plan.release.distances import candidate_clearance
 
     rng = np.random.default_rng(SEED)
     points = rng.normal(size=(200, 3))

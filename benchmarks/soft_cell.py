@@ -18,7 +18,6 @@ from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
-from twin.replay.config import ReplayConfig
 from twin.replay.path import JointPath, path_of_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
@@ -133,7 +132,7 @@ def planned_path(
         max_joint_speed_rad_s=JOINT_SPEED_RAD_S, plan_id="bench", condition="ungated",
         start_id="0",
     )  # fmt: skip
-    path, failures, unreachable = path_of_plan(plan, load_robot(ROBOT.urdf_text()), ReplayConfig())
+    path, failures, unreachable = path_of_plan(plan, load_robot(ROBOT.urdf_text()))
     if failures or unreachable is not None:
         message = f"the scripted plan cannot be followed: {failures}"
         raise RuntimeError(message)

@@ -1,16 +1,39 @@
-"""The incline test in MuJoCo, with the contact settings of the stand-in cell."""
+"""The incline test in MuJoCo, with the contact settings of the stand-in cell.
+
+On a slope of angle a a body slides with g (sin a - mu cos a), whatever an engine makes of the two
+coefficients. The slope is made by tilting gravity, so that contact is found on level surfaces.
+"""
+
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from bridge.sources.standin.world import PAD_SOLIMP, PAD_SOLREF, STEP_S
-from twin.calibrate.physics.incline import (
-    LEAD_S,
-    REST_S,
-    SLAB_M,
-    SLIDE_S,
-    effective_friction,
-)
+
+SLOPE_RAD = np.deg2rad(45.0)
+STEEPER_RAD = np.deg2rad(4.0)
+"""The slope that is measured on is this much steeper than the one that would just hold: slow enough
+that what an engine does to fast contact does not count."""
+TURNS = 6
+SLAB_M = (0.10, 0.10, 0.02)
+"""Flat, so that it slides instead of tipping over."""
+REST_S, LEAD_S, SLIDE_S = 0.3, 0.15, 0.2
+"""At rest; sliding until contact has found its new load; sliding while it is measured."""
+
+
+def effective_friction(acceleration: Callable[[float], float], gravity_m_s2: float = 9.81) -> float:
+    """Friction of a pair from how fast a slab speeds up on a slope on which it hardly slides.
+
+    Args:
+        acceleration: Of a slab on a slope of an angle [rad], once contact is steady [m/s^2].
+        gravity_m_s2: Downward acceleration.
+    """
+    slope, found = SLOPE_RAD, 0.0
+    for _ in range(TURNS):
+        found = np.tan(slope) - acceleration(slope) / (gravity_m_s2 * np.cos(slope))
+        slope = np.arctan(found) + STEEPER_RAD
+    return float(found)
 
 
 def mujoco_friction(

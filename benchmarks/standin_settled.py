@@ -66,7 +66,7 @@ def settled_poses(run: RunFolder, row: dict[str, Any]) -> list[dict[str, Any]]:
         if case.episode not in row["held_out"]["episodes"]:
             continue
         settled = {
-            label: predict(case, values, PhysicsConfig(), 0).settled[:, :2]
+            label: predict(case, values, PhysicsConfig()).settled[:, :2]
             for label, values in sets.items()
         }
         for k in np.flatnonzero(np.isfinite(case.settled).all(axis=1)):

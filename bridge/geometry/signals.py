@@ -32,20 +32,3 @@ def lag_of_least_cost(
     """
     near = lags_s[costs <= costs.min() + equal]
     return float(near[np.argmin(np.abs(near))])
-
-
-def lag_between_steps(
-    costs: Float[np.ndarray, " num_lags"], lags_s: Float[np.ndarray, " num_lags"]
-) -> float:
-    """Find the lag where a parabola through the least cost and its neighbours is lowest [s].
-
-    Args:
-        costs: How much the signals differ at each lag, squared.
-        lags_s: The lags, evenly spaced.
-    """
-    best = int(costs.argmin())
-    if not 0 < best < len(costs) - 1:
-        return float(lags_s[best])
-    before, here, after = costs[best - 1 : best + 2]
-    share = 0.5 * (before - after) / (before - 2 * here + after)
-    return float(lags_s[best] + share * (lags_s[best + 1] - lags_s[best]))

@@ -1,24 +1,14 @@
-"""Friction of pairs by the same incline test in both engines: how each combines coefficients."""
+"""Friction of pairs by the incline test: how MuJoCo combines coefficients."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
-from twin.calibrate.physics.incline import pybullet_friction
-from twin.physics.config import PhysicsConfig
-
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from standin_incline import mujoco_friction
 
 PAIRS = [(0.8, 0.8), (0.9, 0.5), (0.5, 0.9)]
-
-
-@pytest.mark.parametrize(("first", "second"), PAIRS)
-def test_pybullet_multiplies(first: float, second: float) -> None:
-    assert pybullet_friction(first, second, PhysicsConfig()) == pytest.approx(
-        first * second, rel=0.03
-    )
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS)

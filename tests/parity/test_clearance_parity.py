@@ -8,15 +8,11 @@ import pytest
 from scipy import ndimage
 
 from bridge.geometry.mesh import box_corners
+from twin.plan.release.distances import Boxes, candidate_clearance, lower_by_grid
 from twin.replay import _clearance
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
-from twin.replay.clearance.distance_grid import (
-    Boxes,
-    GridLookup,
-    candidate_clearance,
-    lower_by_grid,
-)
+from twin.replay.clearance.distance_grid import GridLookup
 from twin.robot.collision import convex_hull, signed_distance
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 

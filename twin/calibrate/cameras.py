@@ -33,6 +33,8 @@ from twin.scene.store.calibration import CALIBRATION_FILE, write_calibration
 FIXED, MOVING, NO_DEPTH = "fixed", "moving", "no depth"
 STILL_M, STILL_RAD = 0.002, 0.0035
 NUM_LOOKS = 12
+MAX_POSTURES = 6
+"""A fixed camera is found from the robot in this many different postures, those farthest apart."""
 
 
 def placement(episodes: Sequence[Episode]) -> dict[str, str]:
@@ -91,9 +93,7 @@ class _Seen:
     posture: Posture
 
 
-def find_fixed_camera(
-    episodes: Sequence[Episode], camera_id: str, *, max_postures: int, seed: int
-) -> FixedCamera:
+def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int) -> FixedCamera:
     """Find the pose and depth scale of a fixed camera in the robot's base frame.
 
     The search begins where the recording has the camera; when the robot is not there, or the
@@ -102,7 +102,6 @@ def find_fixed_camera(
     Args:
         episodes: Whose joints and depth images are used.
         camera_id: The camera, by its name in the topics.
-        max_postures: At most so many postures at rest are looked at, those farthest apart.
         seed: Of the alignment's random draws.
 
     Raises:
@@ -124,7 +123,7 @@ def find_fixed_camera(
             hint="Stop the robot for half a second at each of several postures while recording.",
         )
     joints = np.array([item.posture.joints_rad for item in seen])
-    chosen = [seen[index] for index in distinct_postures(joints, max_postures)]
+    chosen = [seen[index] for index in distinct_postures(joints, MAX_POSTURES)]
     views = [view for episode in episodes for view in _load(episode, camera_id, chosen)]
     robot = load_robot(tracks[str(chosen[0].episode.path)].urdf)
     nominal = _nominal_pose(chosen[0], camera_id)
@@ -284,9 +283,7 @@ def _camera(
         )
         raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
-    found = find_fixed_camera(
-        with_depth, camera_id, max_postures=config.max_postures, seed=config.seed
-    )
+    found = find_fixed_camera(with_depth, camera_id, seed=config.seed)
     return fixed_record(found, base)
 
 

@@ -20,7 +20,7 @@ class CalibrateConfig:
     cameras: bool = False
     """Where the cameras are, written to RUN/scene/calibration.json."""
     physics: bool = False
-    """Friction, masses, forces, delay and pose bias from executed probes and trials, written to
+    """Friction, masses, forces and pose bias from executed probes and trials, written to
     RUN/scene/calibration.json where held-out episodes confirm them."""
     posterior: bool = False
     """Which friction, masses, force and common shift agree with the trials executed in this run,
@@ -36,8 +36,6 @@ class CalibrateConfig:
     whichever explains the pairs."""
     link: str = "tool0"
     """Link that carries the camera, or the target of a fixed camera."""
-    max_postures: int = 6
-    """A fixed camera is found from the robot in this many different postures."""
     seed: int = 0
     """Of the resampling behind the intervals; with --physics, of the search and of which episodes
     are held out."""
@@ -49,21 +47,16 @@ class CalibrateConfig:
     workers: int | None = None
     """With --physics and --posterior: processes that simulate side by side; one for each core, at
     most 8, when no number is given."""
-    samples: int = 4
-    """With --physics: noisy starts of each judged trial behind its chance of success; 0: what the
-    operator said of trials is not used."""
 
     def __post_init__(self) -> None:
         """Refuse a number of postures nothing can be found from."""
         refuse_outside(
             self,
             {
-                "max_postures": (1, 50),
                 "seed": (0, 2**31),
                 "evaluations": (1, 100_000),
                 "budget_s": (0, float("inf")),
                 "workers": (1, 1024),
-                "samples": (0, 1000),
                 "draws": (2, 100_000),
             },
         )

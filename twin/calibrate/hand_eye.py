@@ -2,7 +2,7 @@
 
 With a camera in the hand, A is ``T_base_hand``, B is ``T_target_camera``, X is ``T_hand_camera``
 and Z is ``T_base_target``. With a fixed camera and the target in the hand, B is
-``T_camera_target``, X is ``T_hand_target`` and Z is ``T_base_camera``. Closed forms give the
+``T_camera_target``, X is ``T_hand_target`` and Z is ``T_base_camera``. A closed form gives the
 start; a robust least squares refines it. The misfit of a pair is E = (Z B)^-1 A X: what is left
 between the two ways to the same frame. It does not change with the choice of base frame.
 """
@@ -68,36 +68,6 @@ def solve_hand_eye(
     right = Q[:, :3, 3] @ R.T - P[:, :3, 3]
     t, *_ = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)
     return _transform(R, t)
-
-
-def solve_robot_world(
-    Ts_a: Float[np.ndarray, "num_pairs 4 4"], Ts_b: Float[np.ndarray, "num_pairs 4 4"]
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]:
-    """Solve AX = ZB for X and Z at once.
-
-    Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product"
-    (2013): with vec(A X B^T) = (B kron A) vec(X), the first singular vectors of the sum of
-    R_B kron R_A are the stacked columns of R_X and R_Z; translations follow by least squares.
-
-    Args:
-        Ts_a: Poses A of the pairs, from the robot; see the module.
-        Ts_b: Poses B of the same pairs, from the camera.
-    """
-    R_a, R_b = Ts_a[:, :3, :3], Ts_b[:, :3, :3]
-    total = np.einsum("nij,nkl->ikjl", R_b, R_a).reshape(9, 9)
-    U, _, Vt = np.linalg.svd(total)
-    R_x = _rotation_from_columns(Vt[0])
-    R_z = _rotation_from_columns(U[:, 0])
-    minus = np.tile(-np.eye(3), (len(Ts_a), 1, 1))
-    left = np.concatenate([R_a, minus], axis=2).reshape(-1, 6)
-    right = Ts_b[:, :3, 3] @ R_z.T - Ts_a[:, :3, 3]
-    t, *_ = np.linalg.lstsq(left, right.reshape(-1), rcond=None)
-    return _transform(R_x, t[:3]), _transform(R_z, t[3:])
-
-
-def _rotation_from_columns(values: Float[np.ndarray, "9"]) -> Float[np.ndarray, "3 3"]:
-    M = values.reshape(3, 3).T
-    return se3.nearest_rotation(M * np.sign(np.linalg.det(M)))
 
 
 def _transform(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> np.ndarray:
@@ -167,7 +137,7 @@ def solve(
 ) -> RobotWorld:
     """Find X and Z with A X = Z B.
 
-    Starts from the better of two closed forms and minimises Geman and McClure's loss of the
+    Starts from the closed form and minimises Geman and McClure's loss of the
     misfits by Gauss-Newton. Intervals come from resampled pairs (Efron, 1979), each solved by one
     more step.
 
@@ -246,11 +216,9 @@ def misfits(
 
 
 def _start(Ts_a: np.ndarray, Ts_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The closed form with the smaller median misfit; neither is best on all data."""
+    """The closed form."""
     X = solve_hand_eye(Ts_a, Ts_b)
-    candidates = [(X, _middle(Ts_a @ X @ se3.invert(Ts_b))), solve_robot_world(Ts_a, Ts_b)]
-    costs = [np.median(_lengths(misfits(Ts_a, Ts_b, *found))[0]) for found in candidates]
-    return candidates[int(np.argmin(costs))]
+    return X, _middle(Ts_a @ X @ se3.invert(Ts_b))
 
 
 def _middle(Ts: Float[np.ndarray, "num_pairs 4 4"]) -> Float[np.ndarray, "4 4"]:

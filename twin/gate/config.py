@@ -32,9 +32,6 @@ class GateConfig:
     max_steps: int = 100_000
     """Simulated steps behind one verdict, the varied replays' among them: the deadline that gives
     the same verdict on every machine. A plan that alone needs more gets no verdict."""
-    max_audit_distances: int = 20_000
-    """Distances between bodies that python-fcl measures again before a yes; a plan that needs more
-    gets no verdict."""
     deadline_s: Annotated[float, Parameter(name="--deadline", converter=convert_duration)] = 300.0
     """Last resort against what hangs: without an answer after this long on the wall clock (20s,
     5min or plain seconds) there is no verdict, and its reason names this limit."""
@@ -46,26 +43,8 @@ class GateConfig:
     min_p_success: float = 0.0
     """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
     fraction; 0 leaves the nominal replay alone to decide."""
-    frames: int = 3
-    """Frames per camera that are averaged to find the objects."""
     frame_wait_s: float = 10.0
     """Wait this long for fresh frames before giving up."""
-    max_frame_age_s: float = 5.0
-    """A camera that has been silent for longer, on the cell's clock, is not trusted."""
-    max_silence_s: float = 30.0
-    """When nothing at all arrived for this long, not counting the time spent on a verdict, the
-    cell is not trusted to be as it was last seen."""
-    max_joint_age_s: float = 1.0
-    """Joint states that are older, on the cell's clock or since they arrived, do not say where the
-    robot is."""
-    other_scene_m: float = 0.1
-    """A plan whose planner expected an object to be farther than this from where it is seen was
-    made for another scene [m]."""
-    moved_m: float = 0.01
-    """An object seen this far from where the verdict has it, before the answer is given, has been
-    moved [m]."""
-    moved_rad: float = 0.3
-    """Or turned by this much [rad]."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
     """How each plan is replayed."""
 
@@ -76,19 +55,11 @@ class GateConfig:
             self,
             {
                 "max_steps": (1, 10**9),
-                "max_audit_distances": (0, 10**9),
                 "deadline_s": (0, day_s),
                 "waiting": (0, 1000),
                 "samples": (0, 100_000),
                 "min_p_success": (0, 1),
-                "frames": (1, 100),
                 "frame_wait_s": (0, day_s),
-                "max_frame_age_s": (0, day_s),
-                "max_silence_s": (0, day_s),
-                "max_joint_age_s": (0, day_s),
-                "other_scene_m": (0, 1000),
-                "moved_m": (0, 10),
-                "moved_rad": (0, 10),
             },
         )
         if self.min_p_success > 0 and self.samples == 0:

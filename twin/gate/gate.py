@@ -20,35 +20,44 @@ from jaxtyping import Float
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION, cell_topic
 from bridge.errors import GstError
 from bridge.robots.robot import Robot, robot_name, robot_of
+from bridge.task.causes import Cause
 from bridge.task.find import Attached, find_task_file
 from bridge.task.plan import Plan
 from bridge.task.task_file import ObjectModel, Task, TaskFile
 from bridge.task.verdict import Factor, Verdict
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
+from twin.replay.config import START_RAD
 from twin.replay.failure import with_reasons
 from twin.scene.shape.known import yaw_period_rad
 
+FRAMES = 3
+"""Frames per camera that are averaged to find the objects."""
+MAX_FRAME_AGE_S = 5.0
+"""A camera that has been silent for longer, on the cell's clock, is not trusted."""
+MAX_SILENCE_S = 30.0
+"""When nothing at all arrived for this long, not counting the time spent on a verdict, the cell is
+not trusted to be as it was last seen."""
+MAX_JOINT_AGE_S = 1.0
+"""Joint states that are older, on the cell's clock or since they arrived, do not say where the
+robot is."""
+OTHER_SCENE_M = 0.1
+"""A plan whose planner expected an object to be farther than this from where it is seen was made
+for another scene."""
+MOVED_M, MOVED_RAD = 0.01, 0.3
+"""An object seen this far from where the verdict has it, or turned by this much, before the answer
+is given, has been moved, unless localisation is less sure than that."""
 SIGMAS = 4.0
 """What localisation says of its own errors, so many times, is no motion."""
 
 
-def who_moved(
-    before: Mapping[str, Any],
-    after: Mapping[str, Any],
-    task: Task,
-    *,
-    moved_m: float,
-    moved_rad: float,
-) -> list[str]:
+def who_moved(before: Mapping[str, Any], after: Mapping[str, Any], task: Task) -> list[str]:
     """Name the objects that lie elsewhere than before, with how far.
 
     Args:
         before: Objects as localised for the verdict.
         after: As localised just now.
         task: Knows which turns look the same.
-        moved_m: Shift that counts [m], unless localisation is less sure than that.
-        moved_rad: Turn about the vertical that counts [rad], unless it is less sure than that.
     """
     told = []
     for name, old in before.items():
@@ -56,13 +65,13 @@ def who_moved(
         shift_m = float(np.linalg.norm(new.T_base_object[:3, 3] - old.T_base_object[:3, 3]))
         turn_rad = turn_between(old.T_base_object, new.T_base_object, task.objects[name])
         sigma_m, sigma_rad = _sigmas(old)
-        near = shift_m <= max(moved_m, SIGMAS * sigma_m)
-        if not (near and turn_rad <= max(moved_rad, SIGMAS * sigma_rad)):  # also what is no number
+        near = shift_m <= max(MOVED_M, SIGMAS * sigma_m)
+        if not (near and turn_rad <= max(MOVED_RAD, SIGMAS * sigma_rad)):  # also what is no number
             told.append(f"{name} by {shift_m * 1e3:.0f} mm and {np.degrees(turn_rad):.0f} degrees")
     return told
 
 
-def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: float) -> str:
+def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
     """Name the first object that a plan has elsewhere than it is seen; "" when there is none.
 
     Objects that look alike may be confused; entities without a position say nothing.
@@ -71,7 +80,6 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: 
         plan: Its ``entities`` are where its planner expected the objects to be.
         found: Where they were localised.
         task: Knows which look alike.
-        limit_m: How far they may be apart.
     """
     for name, entity in plan.entities.items():
         p_m = entity.get("p_m") if isinstance(entity, Mapping) else None
@@ -80,10 +88,10 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task, limit_m: 
         like = [key for key in found if _looks(task.objects[key]) == _looks(task.objects[name])]
         places = np.stack([found[key].T_base_object[:3, 3] for key in like])
         away_m = float(np.linalg.norm(places - np.array(p_m, dtype=np.float64), axis=1).min())
-        if not away_m <= limit_m:
+        if not away_m <= OTHER_SCENE_M:
             return (
                 f"it has {name} {away_m * 1e3:.0f} mm from where it is seen, and at most "
-                f"{limit_m * 1e3:.0f} mm are a planner's error (--other-scene-m)"
+                f"{OTHER_SCENE_M * 1e3:.0f} mm are a planner's error"
             )
     return ""
 
@@ -322,7 +330,7 @@ class Gate:
         self._refuse_silence(silent_ns)
 
     def _refuse_silence(self, silent_ns: int) -> None:
-        if silent_ns > self._config.max_silence_s * 1e9:
+        if silent_ns > MAX_SILENCE_S * 1e9:
             raise UndecidedError(f"nothing has arrived from the cell for {silent_ns * 1e-9:.0f} s")
 
     def _in_time(self, plan: Plan, arrived_ns: int, ends_s: float) -> Verdict:
@@ -392,11 +400,11 @@ class Gate:
             )
         behind_ns = self._perception.newest_ns() - heard.stamp_ns
         silent_ns = arrived_ns - max(heard.received_ns, self._contact_ns)
-        age_s, limit_s = max(behind_ns, silent_ns) * 1e-9, self._config.max_joint_age_s
+        age_s, limit_s = max(behind_ns, silent_ns) * 1e-9, MAX_JOINT_AGE_S
         if age_s > limit_s:
             raise UndecidedError(
                 f"the joint states on {topic} are {age_s:.1f} s old, and only those of the last "
-                f"{limit_s:g} s say where the robot is (--max-joint-age-s)"
+                f"{limit_s:g} s say where the robot is"
             )
         order = [heard.names.index(name) for name in robot.joints]
         values: Joints = np.asarray(heard.position_rad, dtype=np.float64)
@@ -409,7 +417,7 @@ class Gate:
     ) -> Verdict:
         frames = self._wait_for_frames()
         found = self._find_objects(task, frames, ends_s)
-        elsewhere = of_another_scene(plan, found, task, self._config.other_scene_m)
+        elsewhere = of_another_scene(plan, found, task)
         if elsewhere:
             raise UndecidedError(f"plan {plan.id} was made for another scene: {elsewhere}")
         verdict = self._replay(plan, task, found, urdf, start_rad, ends_s)
@@ -471,8 +479,8 @@ class Gate:
 
     def _frames(self) -> Any:
         return self._perception.frames(
-            max_age_ns=round(self._config.max_frame_age_s * 1e9),
-            max_per_camera=self._config.frames,
+            max_age_ns=round(MAX_FRAME_AGE_S * 1e9),
+            max_per_camera=FRAMES,
         )
 
     def _likely(self, verdict: Verdict) -> Verdict:
@@ -492,8 +500,10 @@ class Gate:
         if abs(p["value"] - p["k"] / p["n"]) > ROUNDING:
             told += f", and with what this session's trials say of them {p['value']:.0%} would"
         detail = f"{told}, {wanted:.0%} are asked for"
-        unlikely = Factor(value=False, cause="probability", detail=detail)
-        return replace(verdict, terminal=unlikely, reason=f"terminal: probability: {detail}")
+        unlikely = Factor(value=False, cause=Cause.PROBABILITY, detail=detail)
+        return replace(
+            verdict, terminal=unlikely, reason=f"terminal: {Cause.PROBABILITY}: {detail}"
+        )
 
     def _look_again(self, task: Task, found: Mapping[str, Any], frames: Any, ends_s: float) -> None:
         """Before a yes: the cell must still be as it was judged.
@@ -511,13 +521,7 @@ class Gate:
             )
         if _newest(live.frames) <= _newest(frames):
             return
-        moved = who_moved(
-            found,
-            self._find_objects(task, live.frames, ends_s),
-            task,
-            moved_m=self._config.moved_m,
-            moved_rad=self._config.moved_rad,
-        )
+        moved = who_moved(found, self._find_objects(task, live.frames, ends_s), task)
         if moved:
             raise UndecidedError(f"moved while the plan was being judged: {'; '.join(moved)}")
 
@@ -530,7 +534,7 @@ class Gate:
         arrived_ns = self._contact_ns  # a cell that waits may be silent meanwhile
         off_rad = np.abs(self._where_the_arm_is(arrived_ns, robot) - start_rad)
         joint = int(np.argmax(off_rad))
-        if not off_rad[joint] <= self._config.replay.start_rad:
+        if not off_rad[joint] <= START_RAD:
             raise UndecidedError(
                 f"the arm moved while the plan was being judged: {robot.joints[joint]} by "
                 f"{off_rad[joint]:.3f} rad"

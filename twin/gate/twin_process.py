@@ -50,8 +50,6 @@ class Question:
     """Simulated steps, the samples' among them."""
     start_rad: Float[np.ndarray, " num_joints"] | None = None
     """Where the arm stands; None: not asked."""
-    max_audit_distances: int = 20_000
-    """Distances that are asked again before a yes."""
     any_robot: bool = False
     """The scene may be another robot's, for somebody named the robot (``--robot``)."""
 
@@ -115,8 +113,7 @@ def answer(question: Question) -> Verdict:
     verdict = in_each_engine(scene.task, config, judge_nominal)[0]
     if verdict.accepted is True:
         kept = limited_to_task(plan, scene.task)
-        most = question.max_audit_distances
-        audited = audit(made[0], kept, scene, config, max_queries=most)
+        audited = audit(made[0], kept, scene, config)
         verdict = replace(verdict, checks={**verdict.checks, "audit": audited})
         verdict = replace(verdict, reason=reason_of(verdict))
     samples = replay_samples(
@@ -198,7 +195,6 @@ def judge_of(run_path: Path, scene: ReplayScene) -> Callable[[Plan], Verdict]:
                 config=replay,
                 max_steps=config.max_steps,
                 start_rad=scene.start_rad,
-                max_audit_distances=config.max_audit_distances,
             )
         )
 
@@ -221,7 +217,6 @@ class TwinProcess:
         self._run_path, self._output = run_path, output
         self._config = replace(config.replay, mode="dynamic", samples=config.samples)
         self._max_steps = config.max_steps
-        self._max_audit_distances = config.max_audit_distances
         self._any_robot = bool(config.robot)
         self._swapping = threading.Lock()
         self._closed = False
@@ -291,7 +286,6 @@ class TwinProcess:
             config=self._config,
             max_steps=self._max_steps,
             start_rad=start_rad,
-            max_audit_distances=self._max_audit_distances,
             any_robot=self._any_robot,
         )
         verdict: Verdict = self._do("replay", answer, question, ends_s)

@@ -54,10 +54,6 @@ class PhysicsWorld(Protocol):
     def soft_bodies(self) -> SoftWorld:
         """What is soft in this world; an engine for rigid bodies only raises ``UsageError``."""
 
-    @property
-    def free_objects(self) -> Sequence[str]:
-        """Rigid objects that move, in the order in which they were added."""
-
     def add_table(self, height_m: float) -> object:
         """Add the table: a slab whose top is at the height."""
 
@@ -91,12 +87,6 @@ class PhysicsWorld(Protocol):
 
     def arm_force_N(self) -> float:
         """Size of the force that rigid bodies exert on the arm in all; a grasp's cancel out."""
-
-    def tie(self, object_id: str) -> None:
-        """Fix a rigid object to the tool where it is."""
-
-    def untie(self) -> None:
-        """Let go of what is tied."""
 
     def __enter__(self) -> "PhysicsWorld":
         """Use as a context manager."""
@@ -152,44 +142,3 @@ def installed_versions() -> str:
         with suppress(MissingDependencyError):
             found.append(engine_version(engine))
     return ", ".join(found)
-
-
-# Tie an object to the tool instead of holding it by friction: ``--grasp attach``, not the
-# default.
-# For robots or grippers whose friction nobody knows. What is tied cannot slip, so a verdict made
-# this way says nothing about the grasp; the engine's name carries the word wherever it is shown.
-
-PRESS_M = 0.001
-"""Fingers that are told to go this much farther than they are press on something."""
-OPEN_M = 0.002
-"""An object is let go when the fingers are told to be this much wider than when it was tied."""
-
-
-class Attachment:
-    """Holds at most one rigid object by a fixed joint, from the touch to the command to open."""
-
-    def __init__(self, world: PhysicsWorld) -> None:
-        """Start with empty fingers."""
-        self._world = world
-        self._tied = False
-        self._width_m = 0.0
-
-    def update(self, command_m: float) -> None:
-        """Tie what the fingers press on, or let go. Call once per step.
-
-        Args:
-            command_m: The distance the fingers are told to have.
-        """
-        if self._tied:
-            if command_m > self._width_m + OPEN_M:
-                self._world.untie()
-                self._tied = False
-            return
-        width_m = self._world.robot.width_m()
-        if command_m > width_m - PRESS_M:
-            return
-        for object_id in self._world.free_objects:
-            if self._world.finger_touches(object_id):
-                self._world.tie(object_id)
-                self._tied, self._width_m = True, width_m
-                return

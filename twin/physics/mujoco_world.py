@@ -350,15 +350,6 @@ class MujocoWorld:
         shapes = [f"{name}/{k}" if k else name for k in range(len(solids))]
         for shape, extents in zip(shapes, solids, strict=True):
             body.add_geom(name=shape, mass=mass_kg, **_box(extents))
-        weld = self._spec.add_equality(
-            name=name,
-            type=mujoco.mjtEq.mjEQ_WELD,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=self._record.tool_frame,
-            name2=name,
-            active=False,
-        )
-        weld.solref = _CONTACT["solref"]
         self.free_objects.append(object_id)
         for shape in shapes:
             friction = self.config.object_friction
@@ -452,21 +443,6 @@ class MujocoWorld:
             message = f"no object {object_id!r} moves in this world. There are: {known}."
             raise PhysicsError(message)
         return self._addresses[object_id]
-
-    def tie(self, object_id: str) -> None:
-        """Fix a rigid object to the tool where it is."""
-        T_base_tool = self.robot.T_base_link(self._record.tool_frame)
-        T_tool_object = se3.invert(T_base_tool) @ self.T_base_object(object_id)
-        q, p = se3.split(T_tool_object)
-        weld = self._model.equality(_OBJECT + object_id).id
-        # Anchor at the object's centre; turning counts a metre for a radian.
-        self._model.eq_data[weld] = np.concatenate([np.zeros(3), p, q, [1.0], np.zeros(1)])
-        self._data.eq_active[weld] = 1
-
-    def untie(self) -> None:
-        """Let go of what is tied."""
-        for object_id in self.free_objects:
-            self._data.eq_active[self._model.equality(_OBJECT + object_id).id] = 0
 
     def __enter__(self) -> "MujocoWorld":
         """Use as a context manager."""

@@ -309,40 +309,9 @@ class World:
                 total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
         return float(np.linalg.norm(total))
 
-    def tie(self, object_id: str) -> None:
-        """Fix a rigid object to the tool where it is."""
-        tool = self.robot.record.tool_frame
-        T_tcp_base = se3.invert(self.robot.T_base_link(tool))
-        q, p = se3.split(T_tcp_base @ self.T_base_object(object_id))
-        w, x, y, z = q.tolist()
-        self._constraint = int(
-            pybullet.createConstraint(
-                self.robot.id,
-                self.robot.links[tool],
-                self.free_ids[object_id],
-                -1,
-                pybullet.JOINT_FIXED,
-                [0, 0, 0],
-                np.asarray(p).tolist(),
-                (-self._centres_m.get(object_id, np.zeros(3))).tolist(),
-                [x, y, z, w],
-                [0, 0, 0, 1],
-                physicsClientId=self._client,
-            )
-        )
-
-    def untie(self) -> None:
-        """Let go of what is tied."""
-        pybullet.removeConstraint(self._constraint, physicsClientId=self._client)
-
     def soft_bodies(self) -> SoftWorld:
         """What is soft in this world."""
         return self.soft
-
-    @property
-    def free_objects(self) -> list[str]:
-        """Rigid objects that move, in the order in which they were added."""
-        return list(self.free_ids)
 
     def _free(self, object_id: str) -> int:
         if object_id not in self.free_ids:

@@ -31,7 +31,7 @@ from bridge.task.verdict import Factor
 from twin.replay.clearance.bodies import SCENE, TABLE, names_of, placed_panels
 from twin.replay.clearance.monitor import MAX_LEAP_M, Allowed, active_stage, allowed_pairs
 from twin.replay.clearance.static_obstacles import stationary_links
-from twin.replay.config import ReplayConfig
+from twin.replay.config import MOVED_M, ReplayConfig
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import collision_geometry, hulls_of
@@ -236,7 +236,7 @@ class _Audit:
     def _moved(self, Ts: Float[np.ndarray, "num_states 4 4"]) -> Bool[np.ndarray, " num_states"]:
         """Whether an object belongs to somebody's motion; a millimetre later than the monitor."""
         away = np.linalg.norm(Ts[:, :3, 3] - Ts[0, :3, 3], axis=1)
-        return np.asarray(away > self._config.moved_m + 0.001)
+        return np.asarray(away > MOVED_M + 0.001)
 
     def _placed_links(self, states: _States) -> list[_Placed]:
         robot = self._robot

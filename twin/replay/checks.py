@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import Task
-from twin.replay.config import ReplayConfig
+from twin.replay.config import START_M, START_RAD
 from twin.replay.dynamics import States
 from twin.replay.failure import Failure
 from twin.replay.path import JointPath
@@ -30,7 +31,6 @@ def start_failures(
     path: JointPath,
     measured_rad: Float[np.ndarray, " num_joints"],
     robot: RobotModel,
-    config: ReplayConfig,
 ) -> list[Failure]:
     """Say how far a plan's first waypoint is from where the robot stands.
 
@@ -39,22 +39,21 @@ def start_failures(
         path: Its first posture counts for the joints.
         measured_rad: What the encoders say.
         robot: Whose they are.
-        config: Both limits.
     """
     off_rad = np.abs(path.joints_rad[0] - measured_rad)
     joint = int(np.argmax(off_rad))
     place_m = robot.T_base_tcp(measured_rad)[:3, 3]
     off_m = float(np.linalg.norm(np.array(plan.tau[0].p_m) - place_m))
-    if off_rad[joint] <= config.start_rad and off_m <= config.start_m:
+    if off_rad[joint] <= START_RAD and off_m <= START_M:
         return []
     return [
         Failure(
             t_ns=0,
-            cause="start_elsewhere",
+            cause=Cause.START_ELSEWHERE,
             bodies=(robot.record.joints[joint],),
             detail=f"the plan starts {off_m * 1e3:.1f} mm and {off_rad[joint]:.3f} rad "
             f"({robot.record.joints[joint]}) from where the robot is; the limits are "
-            f"{config.start_m * 1e3:.0f} mm and {config.start_rad:g} rad",
+            f"{START_M * 1e3:.0f} mm and {START_RAD:g} rad",
         )
     ]
 
@@ -73,22 +72,24 @@ def task_failures(plan: Plan, task: Task) -> list[Failure]:
         latest_ns = max(begun.values(), default=0)
         if table is None:
             detail = f"stage {stage.id!r} is not one of task {task.name}: {', '.join(tables)}"
-            failures.append(_stage_failure(stage, "unknown_stage", detail))
+            failures.append(_stage_failure(stage, Cause.UNKNOWN_STAGE, detail))
             continue
         if stage.id in begun:
-            failures.append(_stage_failure(stage, "repeated_stage", f"{stage.id!r} is there twice"))
+            failures.append(
+                _stage_failure(stage, Cause.REPEATED_STAGE, f"{stage.id!r} is there twice")
+            )
         elif stage.t_start_ns < latest_ns or stage.t_end_ns < stage.t_start_ns:
             detail = (
                 f"stage {stage.id!r} runs from {_s(stage.t_start_ns)} to {_s(stage.t_end_ns)}, the "
                 f"one before it begins at {_s(latest_ns)}"
             )
-            failures.append(_stage_failure(stage, "stage_times", detail))
+            failures.append(_stage_failure(stage, Cause.STAGE_TIMES, detail))
         extra = [pair for pair in stage.allowed_contacts if set(pair) not in _pairs(table)]
         if extra:
             one, other = extra[0]
             detail = f"the plan lets {one} touch {other} in stage {stage.id!r}; the task does not"
             bodies = (one, other)
-            failures.append(_stage_failure(stage, "contact_not_allowed", detail, bodies))
+            failures.append(_stage_failure(stage, Cause.CONTACT_NOT_ALLOWED, detail, bodies))
         begun[stage.id] = stage.t_start_ns
         failures += _grasp_failures(plan, stage, tables, begun)
     return failures
@@ -116,10 +117,12 @@ def _grasp_failures(
         f"stage {stage.id!r} begins at {_s(stage.t_start_ns)}, before the gripper has closed in "
         f"{grasping[0]!r}"
     )
-    return [_stage_failure(stage, "stage_order", detail)]
+    return [_stage_failure(stage, Cause.STAGE_ORDER, detail)]
 
 
-def _stage_failure(stage: Stage, cause: str, detail: str, bodies: tuple[str, ...] = ()) -> Failure:
+def _stage_failure(
+    stage: Stage, cause: Cause, detail: str, bodies: tuple[str, ...] = ()
+) -> Failure:
     return Failure(t_ns=max(0, stage.t_start_ns), cause=cause, detail=detail, bodies=bodies)
 
 
@@ -150,8 +153,8 @@ def limited_to_task(plan: Plan, task: Task) -> Plan:
 # What the robot itself would refuse, or stop at.
 
 
-_SPEED = ("joint_speed", "moves at", "rad/s")
-_ACCELERATION = ("joint_acceleration", "is accelerated at", "rad/s^2")
+_SPEED = (Cause.JOINT_SPEED, "moves at", "rad/s")
+_ACCELERATION = (Cause.JOINT_ACCELERATION, "is accelerated at", "rad/s^2")
 
 
 def path_limit_failures(path: JointPath, robot: RobotModel) -> list[Failure]:
@@ -179,7 +182,7 @@ def path_limit_failures(path: JointPath, robot: RobotModel) -> list[Failure]:
                 f"{record.tool_speed_m_s:g} m/s"
             )
             t_ns = int(path.times_ns[index])
-            failures.append(Failure(t_ns=t_ns, cause="tool_speed", detail=detail))
+            failures.append(Failure(t_ns=t_ns, cause=Cause.TOOL_SPEED, detail=detail))
     return failures
 
 
@@ -188,7 +191,7 @@ def _over(
     values: Float[np.ndarray, "num_times num_joints"],
     limit: Float[np.ndarray, " num_joints"],
     robot: RobotModel,
-    words: tuple[str, str, str],
+    words: tuple[Cause, str, str],
 ) -> list[Failure]:
     """Name the first joint that is beyond its limit; ``words`` are cause, verb and unit."""
     over = ~(values <= limit * _SLACK)
@@ -240,7 +243,7 @@ def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel)
             )
             t_ns = int(states.stamps_ns[index])
             failures.append(
-                Failure(t_ns=t_ns, cause="tracking_error", bodies=(name,), detail=detail)
+                Failure(t_ns=t_ns, cause=Cause.TRACKING_ERROR, bodies=(name,), detail=detail)
             )
     if limit_N is not None and len(states.arm_force_N):
         over_N = np.flatnonzero(~(states.arm_force_N <= limit_N))
@@ -251,5 +254,5 @@ def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel)
                 f"{limit_N:g} N"
             )
             t_ns = int(states.stamps_ns[index])
-            failures.append(Failure(t_ns=t_ns, cause="contact_force", detail=detail))
+            failures.append(Failure(t_ns=t_ns, cause=Cause.CONTACT_FORCE, detail=detail))
     return failures

@@ -78,9 +78,7 @@ def compare(
         for name, reason in recording.end.reasons.items()
         if name in recording.scene.movable()
     ]
-    return diverge(
-        job.plan_id, traces, job.config.divergence, findings=findings, not_compared=missing
-    )
+    return diverge(job.plan_id, traces, findings=findings, not_compared=missing)
 
 
 def _planned(job: ReplayJob, engine: Engine, recording: Recording) -> tuple[Trace | str, Findings]:

@@ -1,14 +1,13 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, require_engine
-from twin.robot.config import IkConfig
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
@@ -52,14 +51,9 @@ class PosteriorDraw:
     wrong_no: float
     """Chance that one succeeds although this replay fails."""
 
-    def to_record(self) -> dict[str, Any]:
-        """Return plain numbers."""
-        boxes = [{**asdict(box), "centre_of_mass": list(box.centre_of_mass)} for box in self.boxes]
-        return {**asdict(self), "bias_m": list(self.bias_m), "boxes": boxes}
-
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "PosteriorDraw":
-        """The inverse of ``to_record``.
+        """Read what ``calibration.json`` keeps of one.
 
         Raises:
             KeyError, TypeError, ValueError: When something lacks or is not a number.
@@ -73,55 +67,28 @@ class PosteriorDraw:
         return cls(**{**record, "bias_m": (float(x), float(y)), "boxes": tuple(boxes)})
 
 
+UNKNOWN_POSE_M = 0.005
+"""Standard deviation along x and y of an object whose localisation states none [m]."""
+UNKNOWN_POSE_RAD = 0.05
+"""Standard deviation about the vertical of such an object [rad]."""
+FRICTION_LOG = 0.2
+"""Spread of the logarithm of each friction coefficient: two of three samples lie within 20 %."""
+GRIP_FORCE_LOG = 0.15
+"""Spread of the logarithm of the grip force."""
+MASS_LOG = 0.2
+"""Spread of the logarithm of each movable object's mass."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class VariationConfig:
-    """Priors that samples are drawn from; where calibration knows better, its spread counts.
+    """What calibration knows better than the priors that samples are drawn from."""
 
-    Factors are log-normal around the value the nominal replay uses: a spread of 0.2 means that two
-    of three samples lie within 20 %.
-    """
-
-    pose_scale: float = 1.0
-    """Times the standard deviations that localisation states for each object."""
-    unknown_pose_m: float = 0.005
-    """Standard deviation along x and y of an object whose localisation states none [m]."""
-    unknown_pose_rad: float = 0.05
-    """Standard deviation about the vertical of such an object [rad]."""
-    friction_log: float = 0.2
-    """Spread of the logarithm of each friction coefficient."""
-    grip_force_log: float = 0.15
-    """Spread of the logarithm of the grip force."""
-    mass_log: float = 0.2
-    """Spread of the logarithm of each movable object's mass."""
-    young_log: float = 0.3
-    """Spread of the logarithm of each soft object's Young's modulus."""
-    grip_delay_s: float = 0.1
-    """The gripper lags behind the arm by up to this long, evenly drawn [s]."""
-    calibrated: Annotated[tuple[tuple[str, float], ...], Parameter(parse=False)] = ()
+    calibrated: tuple[tuple[str, float], ...] = ()
     """Fields of ``PhysicsConfig``, and the masses of rigid objects, with the spread of their
-    logarithm that calibration found; they replace the priors above. No flag: read from the scene's
-    calibration."""
-    posterior: Annotated[tuple[PosteriorDraw, ...], Parameter(parse=False)] = ()
+    logarithm that calibration found; they replace the priors."""
+    posterior: tuple[PosteriorDraw, ...] = ()
     """What the session's own trials left of wide priors; samples draw frictions, force, masses and
-    a common shift of all poses from it instead of from the spreads above. No flag: read from the
-    scene's calibration."""
-
-    def __post_init__(self) -> None:
-        """Refuse spreads that are none."""
-        most = 2.0
-        refuse_outside(
-            self,
-            {
-                "pose_scale": (0, 100),
-                "unknown_pose_m": (0, most),
-                "unknown_pose_rad": (0, most),
-                "friction_log": (0, most),
-                "grip_force_log": (0, most),
-                "mass_log": (0, most),
-                "young_log": (0, most),
-                "grip_delay_s": (0, most),
-            },
-        )
+    a common shift of all poses from it instead of from the priors."""
 
     def draw_at(self, share: float) -> PosteriorDraw | None:
         """The draw at a share of the posterior's weight, 0 to 1; None: there is no posterior."""
@@ -140,7 +107,9 @@ class VariationConfig:
         What a calibration finds of fingers and surfaces is found together with the objects: their
         own coefficient is then not varied once more.
         """
-        spreads = dict.fromkeys(FRICTIONS, self.friction_log) | {GRIP_FORCE: self.grip_force_log}
+        spreads = dict.fromkeys(FRICTIONS, FRICTION_LOG) | {GRIP_FORCE: GRIP_FORCE_LOG}
+        if self.posterior:
+            spreads = dict.fromkeys(spreads, 0.0)
         known = dict(self.calibrated)
         if known.keys() & set(FRICTIONS[1:]):
             spreads[FRICTIONS[0]] = 0.0
@@ -149,52 +118,18 @@ class VariationConfig:
 
     def mass_spread(self, *, soft: bool) -> float:
         """Spread of the logarithm of an object's mass; calibration weighs rigid ones only."""
-        return self.mass_log if soft else dict(self.calibrated).get(RIGID_MASSES, self.mass_log)
+        prior = 0.0 if self.posterior else MASS_LOG
+        return prior if soft else dict(self.calibrated).get(RIGID_MASSES, prior)
 
 
 Mode = Literal["kinematic", "dynamic"]
-Grasp = Literal["friction", "attach"]
 
-RANGES: Mapping[str, tuple[float, float]] = {
-    "start_rad": (0, 10),
-    "start_m": (0, 10),
-    "start_overlap_m": (0, 1),
-    "eps_col_m": (0, 1),
-    "max_contact_depth_m": (0, 1),
-    "pre_grasp_depth_m": (0, 1),
-    "pre_grasp_soft_depth_m": (0, 1),
-    "max_slip_m": (0, 10),
-    "moved_m": (0, 1),
-    "path_step_s": (1e-3, 10),
-    "max_joint_step_rad": (0, 10),
-    "settle_before_s": (0, 60),
-    "settle_after_s": (0, 60),
-    "squeeze_m": (0, 0.1),
-    "grip_delay_s": (0, 60),
-    "samples": (0, 100_000),
-}
-"""Of the numbers of a replay, ends included."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DivergenceConfig:
-    """Limits beyond which planned, executed and recorded are apart."""
-
-    tool_m: float = 0.01
-    """Tool position, after the lag between the two is taken out [m]."""
-    tool_rad: float = 0.05
-    """Tool rotation [rad]."""
-    width_m: float = 0.004
-    """Width of the gripper [m]."""
-    object_m: float = 0.02
-    """Position of an object; the recorded one is localised to a few millimetres [m]."""
-    contact_s: float = 0.25
-    """When fingers begin or cease to touch an object [s]."""
-
-    def __post_init__(self) -> None:
-        """Refuse limits that are none."""
-        names = ("tool_m", "tool_rad", "width_m", "object_m", "contact_s")
-        refuse_outside(self, dict.fromkeys(names, (0, 1000)))
+START_RAD, START_M = 0.05, 0.01
+"""A plan starts no farther than this from where each joint of the robot is, nor its tool."""
+MOVED_M = 0.005
+"""An object counts as carried or pushed once it is this far from its start [m]."""
+PATH_STEP_S = 0.04
+"""Spacing at which the path between waypoints is checked [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,62 +139,30 @@ class ReplayConfig:
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
     choose it for each trajectory."""
-    grasp: Annotated[Grasp, Parameter(name="--grasp")] = "friction"
-    """What holds objects: friction between the fingers, or attach, which ties rigid objects to the
-    tool at the first touch. The engine's name says attach wherever such a verdict is shown."""
-    start_rad: float = 0.05
-    """A plan starts no farther than this from where each joint of the robot is [rad]."""
-    start_m: float = 0.01
-    """Nor its tool farther than this [m]."""
     engine: Annotated[Literal["pybullet", "mujoco", "both"], Parameter(name="--engine")] = (
         "pybullet"
     )
     """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
     reported where it says something else. Soft bodies are pybullet's alone."""
-    engines_must_agree: Annotated[bool, Parameter(name="--engines-must-agree")] = False
-    """With --engine both: where the two say something else, the verdict is undecided."""
-    start_overlap_m: float = 0.006
-    """Rigid objects that were localised into each other by up to this are moved apart; deeper ones
-    are not evaluated [m]."""
     eps_col_m: float = 0.002
     """Smallest distance between bodies that may not touch, the paper's epsilon_col [m]."""
-    max_contact_depth_m: float = 0.005
-    """Bodies that may touch may not lie deeper in each other than this [m]."""
-    pre_grasp_depth_m: float = 0.002
-    """Deepest overlap with an object before the first grasp that localisation may explain [m]."""
-    pre_grasp_soft_depth_m: float = 0.004
-    """The same for soft objects, which give way. A finger is 12 mm thick: what it is pushed into
-    lies at most 6 mm deep in it [m]."""
-    max_slip_m: float | None = None
-    """A plan is refused when an object moves farther than this in the hand that carries it [m].
-    None, the default, refuses none for it: on unused trials it cost more good plans than bad."""
-    moved_m: float = 0.005
-    """An object counts as carried or pushed once it is this far from its start [m]."""
-    path_step_s: float = 0.04
-    """Spacing at which the path between waypoints is checked [s]."""
-    max_joint_step_rad: float = 0.3
-    """Largest change of a joint within one path step; more is a jump [rad]."""
     sample_rate_hz: int = 60
     """States per second that a replay keeps; divides the physics rate."""
     settle_before_s: float = 0.25
     """Objects come to rest for this long before the trajectory starts [s]."""
     settle_after_s: float = 1.0
     """The robot holds still for this long before the terminal predicate is read [s]."""
-    squeeze_m: float = 0.01
-    """How far below the recorded width an executed grasp is commanded, so that it presses [m]."""
     seed: int = 0
     """Seed of the samples; nominal replays draw nothing, so it only labels them."""
-    grip_delay_s: float = 0.0
+    grip_delay_s: Annotated[float, Parameter(parse=False)] = 0.0
     """The gripper acts this much later than the arm [s]; planned trajectories only, a recorded one
-    has its own times."""
+    has its own times. No flag: samples draw it."""
     samples: Annotated[int, Parameter(parse=False)] = 0
     """Varied replays behind each nominal one. No flag here: the commands have --samples."""
-    variation: VariationConfig = field(default_factory=VariationConfig)
-    """What the samples vary, and how far."""
-    divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
-    """From which size on planned, executed and recorded are apart."""
-    ik: IkConfig = field(default_factory=IkConfig)
-    """When a pose counts as reached."""
+    variation: Annotated[VariationConfig, Parameter(parse=False)] = field(
+        default_factory=VariationConfig
+    )
+    """No flag: read from the scene's calibration."""
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     """Nominal physics."""
 
@@ -270,12 +173,18 @@ class ReplayConfig:
             UsageError: Saying what does not fit.
             MissingDependencyError: When an engine is not installed.
         """
-        refuse_outside(self, RANGES)
+        second = (0, 60)
+        refuse_outside(
+            self,
+            {
+                "eps_col_m": (0, 1),
+                "settle_before_s": second,
+                "settle_after_s": second,
+                "grip_delay_s": second,
+            },
+        )
         for engine in self.engines():
             require_engine(engine)
-        if self.engines_must_agree and self.engine != "both":
-            message = f"--engines-must-agree needs --engine both; it is {self.engine}."
-            raise UsageError(message)
         if self.sample_rate_hz < 1 or self.physics.rate_hz % self.sample_rate_hz:
             message = (
                 f"sample_rate_hz {self.sample_rate_hz} does not divide the physics rate "
@@ -320,53 +229,9 @@ class ReplayRunConfig:
     robot: str = ""
     """Robot file, by name or path, whose description takes the place of the recorded one; none:
     the robot that each episode was recorded with (docs/robots.md)."""
-    relocalise: bool = False
-    """Redo the localisation of objects that is there already."""
     replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
     """How each trajectory is replayed."""
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be replayed."""
         refuse_outside(self, {"workers": (1, 4096), "samples": (0, 100_000)})
-
-
-CHANGES: Mapping[str, tuple[float, float]] = {
-    "friction": (0.05, 10),
-    "grip_force": (0.05, 10),
-    "mass": (0.05, 20),
-    "grip_delay_s": (0, 2),
-    "x_m": (-0.2, 0.2),
-    "y_m": (-0.2, 0.2),
-    "turn_rad": (-3.2, 3.2),
-}
-"""How far a replay may be asked to be from the nominal one, ends included."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChangeConfig:
-    """What is otherwise than in the nominal replay of a plan; as it stands, nothing."""
-
-    friction: float = 1.0
-    """Times the objects' friction, and with it that between them and all others."""
-    grip_force: float = 1.0
-    """Times the force of the gripper."""
-    mass: float = 1.0
-    """Times the masses of objects that can be moved."""
-    grip_delay_s: float = 0.0
-    """The gripper acts this much later [s]."""
-    object: str = ""
-    """Which object stands elsewhere; empty: all that can be moved, by the same."""
-    x_m: float = 0.0
-    """How far along x of the robot's base [m]."""
-    y_m: float = 0.0
-    """And along y [m]."""
-    turn_rad: float = 0.0
-    """And turned about the vertical through it [rad]."""
-
-    def __post_init__(self) -> None:
-        """Refuse what is farther than anybody means.
-
-        Raises:
-            UsageError: Naming the number and its limits.
-        """
-        refuse_outside(self, CHANGES)

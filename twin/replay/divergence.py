@@ -30,8 +30,17 @@ from jaxtyping import Bool, Float, Int
 from bridge.geometry import se3
 from bridge.geometry.signals import LAGS_S, lag_of_least_cost
 from bridge.task.record import check_record
-from twin.replay.config import DivergenceConfig
 from twin.replay.trace import Touch, Trace
+
+TOOL_M, TOOL_RAD = 0.01, 0.05
+"""Limits beyond which planned, executed and recorded are apart: tool position [m] and rotation
+[rad], after the lag between the two is taken out."""
+WIDTH_M = 0.004
+"""Width of the gripper [m]."""
+OBJECT_M = 0.02
+"""Position of an object; the recorded one is localised to a few millimetres [m]."""
+CONTACT_S = 0.25
+"""When fingers begin or cease to touch an object [s]."""
 
 LAG_STEP_NS = 66_666_668
 """Between the instants at which tools are compared: four steps of the physics."""
@@ -145,7 +154,6 @@ class Divergence:
 def diverge(
     plan_id: str,
     traces: Sequence[Trace],
-    config: DivergenceConfig,
     *,
     findings: Mapping[str, Mapping[tuple[str, str], bool | None]] | None = None,
     not_compared: Sequence[str] = (),
@@ -155,7 +163,6 @@ def diverge(
     Args:
         plan_id: Whose.
         traces: Two or three of planned, executed and recorded.
-        config: From which size on things differ.
         findings: Per side what each predicate (its kind and object) said; compared where nothing
             else diverges.
         not_compared: Why a side is missing.
@@ -166,7 +173,7 @@ def diverge(
     for first, second in combinations(ordered, 2):
         pair = (first.side, second.side)
         lags[pair] = lag_s(first, second)
-        found = sorted(_quantities(first, without_lag(second, lags[pair]), config), key=_rank)
+        found = sorted(_quantities(first, without_lag(second, lags[pair])), key=_rank)
         if found:
             found = [replace(one, attribution=found[0].attribution) for one in found]
         else:
@@ -180,9 +187,7 @@ def diverge(
     )
 
 
-def _quantities(
-    first: Trace, second: Trace, config: DivergenceConfig
-) -> Iterator[DivergedQuantity]:
+def _quantities(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:
     times = np.arange(0, max(min(first.end_ns, second.end_ns), 1), STEP_NS)
     pair = (first.side, second.side)
     one, two = first.tool.at(times), second.tool.at(times)
@@ -194,9 +199,9 @@ def _quantities(
     recorded = "recorded" in pair
     held = _held(first, times) | _held(second, times)
     for quantity, values, limit in (
-        ("tool_position", shifted, config.tool_m),
-        ("tool_rotation", turned, config.tool_rad),
-        ("gripper_width", widths, config.width_m),
+        ("tool_position", shifted, TOOL_M),
+        ("tool_rotation", turned, TOOL_RAD),
+        ("gripper_width", widths, WIDTH_M),
     ):
         index = _first_above(values, limit)
         if index is None:
@@ -205,8 +210,8 @@ def _quantities(
         if quantity == "gripper_width" and held[index]:
             cause = "perception" if recorded else "contact"
         yield _quantity(pair, quantity, int(times[index]), values[index:].max(), limit, cause)
-    yield from _touches(first, second, config)
-    yield from _objects(first, second, config)
+    yield from _touches(first, second)
+    yield from _objects(first, second)
 
 
 def _resting_difference(
@@ -245,7 +250,7 @@ def _first_above(
     return int(found[0]) if len(found) else None
 
 
-def _touches(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[DivergedQuantity]:
+def _touches(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:
     pair = (first.side, second.side)
     whose = "perception" if "recorded" in pair else "contact"
     for name in sorted(set(first.touches) & set(second.touches)):
@@ -253,16 +258,14 @@ def _touches(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[
         if one is None and two is None:
             continue
         if one is None or two is None:
-            yield _only_one(pair, name, one or two or (0, 0), pair[one is None], config, whose)
+            yield _only_one(pair, name, one or two or (0, 0), pair[one is None], whose)
             continue
         for end, cause, word in ((0, whose, "touched"), (1, "contact", "let go of")):
             gap_s = abs(one[end] - two[end]) * 1e-9
-            if gap_s > config.contact_s:
+            if gap_s > CONTACT_S:
                 earlier = pair[0] if one[end] < two[end] else pair[1]
                 yield replace(
-                    _quantity(
-                        pair, "contact", min(one[end], two[end]), gap_s, config.contact_s, cause
-                    ),
+                    _quantity(pair, "contact", min(one[end], two[end]), gap_s, CONTACT_S, cause),
                     body=name,
                     detail=f"{name} is {word} {gap_s:.2f} s earlier {_where(earlier)}",
                 )
@@ -270,14 +273,14 @@ def _touches(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[
 
 
 def _only_one(
-    pair: tuple[str, str], name: str, touch: Touch, side: str, config: DivergenceConfig, cause: str
+    pair: tuple[str, str], name: str, touch: Touch, side: str, cause: str
 ) -> DivergedQuantity:
     lasted_s = (touch[1] - touch[0]) * 1e-9
-    found = _quantity(pair, "contact", touch[0], lasted_s, config.contact_s, cause)
+    found = _quantity(pair, "contact", touch[0], lasted_s, CONTACT_S, cause)
     return replace(found, body=name, detail=f"only {_where(side)} do the fingers touch {name}")
 
 
-def _objects(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[DivergedQuantity]:
+def _objects(first: Trace, second: Trace) -> Iterator[DivergedQuantity]:
     """Positions, at the instants that the side with fewer of them knows."""
     pair = (first.side, second.side)
     for name in sorted(set(first.objects) & set(second.objects)):
@@ -285,13 +288,11 @@ def _objects(first: Trace, second: Trace, config: DivergenceConfig) -> Iterator[
         times = min(one, two, key=len).stamps_ns
         shifted = np.linalg.norm(one.at(times).p_m - two.at(times).p_m, axis=1)
         # A recording looks twice; of two replays, one drops a moment later than the other.
-        index = _first_above(shifted, config.object_m, 1 if len(times) < FALL_STEPS else FALL_STEPS)
+        index = _first_above(shifted, OBJECT_M, 1 if len(times) < FALL_STEPS else FALL_STEPS)
         if index is not None:
             size = float(shifted[index:].max())
             yield replace(
-                _quantity(
-                    pair, "object_position", int(times[index]), size, config.object_m, "contact"
-                ),
+                _quantity(pair, "object_position", int(times[index]), size, OBJECT_M, "contact"),
                 body=name,
                 detail=f"{name} lies {size * 1e3:.0f} mm apart, {pair[0]} against {pair[1]}",
             )

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
 from bridge.task.task_file import ObjectModel
-from twin.physics.engines import Attachment, PhysicsWorld, open_world
+from twin.physics.engines import PhysicsWorld, open_world
 from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
@@ -164,7 +164,7 @@ def simulate(
         path: Joints and gripper widths over time.
         scene: Where the objects are at the start.
         hulls: The robot's convex pieces, which stand for its meshes.
-        config: Physics, grasp, rates and times to settle.
+        config: Physics, rates and times to settle.
 
     Raises:
         UsageError: For soft bodies in an engine that has none.
@@ -189,12 +189,9 @@ def simulate(
         for _ in range(round(config.settle_before_s * rate)):
             world.step()
         samples.take(world, 0)
-        tie = Attachment(world) if config.grasp == "attach" else None
         for step in range(total):
             world.robot.command(targets[step + 1], velocities[step], widths[step])
             world.step()
-            if tie is not None:
-                tie.update(widths[step])
             if (step + 1) % stride == 0 and not samples.take(world, stamps[step + 1]):
                 break
         return samples.states(world)
@@ -295,6 +292,9 @@ def burst_of(health: SoftHealth) -> str | None:
     return health.describe() if burst else None
 
 
+START_OVERLAP_M = 0.006
+"""Rigid objects that were localised into each other by up to this are moved apart; deeper ones are
+not evaluated [m]."""
 GAP_M = 0.0002
 """What was moved apart stays this far apart."""
 TOUCH_M = 0.0005
@@ -314,9 +314,7 @@ class _Solid:
     fixed: bool = False
 
 
-def free_start(
-    scene: ReplayScene, soft: Mapping[str, SoftModel], max_depth_m: float
-) -> ReplayScene:
+def free_start(scene: ReplayScene, soft: Mapping[str, SoftModel]) -> ReplayScene:
     """Move objects apart that lie in each other or in a container by little.
 
     The object that can move is moved, along the direction of least depth; of two, each by half.
@@ -325,7 +323,6 @@ def free_start(
     Args:
         scene: Where the objects were localised.
         soft: The soft ones' bodies.
-        max_depth_m: Deeper overlaps of rigid objects are refused.
 
     Raises:
         NotEvaluatedError: Naming both objects and the depth.
@@ -338,7 +335,7 @@ def free_start(
     moved = {name: T.copy() for name, T in movable.items()}
     for _ in range(ROUNDS):
         solids = [_Solid(n, shapes[n], T, soft=n in soft) for n, T in moved.items()]
-        if not _separate(solids, fixed, moved, max_depth_m):
+        if not _separate(solids, fixed, moved):
             break
     else:
         names = ", ".join(moved)
@@ -352,7 +349,6 @@ def _separate(
     solids: list[_Solid],
     fixed: list[_Solid],
     moved: dict[str, Float[np.ndarray, "4 4"]],
-    max_depth_m: float,
 ) -> bool:
     """One round; says whether anything had to be moved."""
     anything = False
@@ -361,7 +357,7 @@ def _separate(
             depth, normal = _overlap(solid, other)
             if depth <= TOUCH_M:
                 continue
-            limit = max_depth_m * (SOFT_SHARE if solid.soft or other.soft else 1.0)
+            limit = START_OVERLAP_M * (SOFT_SHARE if solid.soft or other.soft else 1.0)
             if depth > limit:
                 raise NotEvaluatedError(
                     f"{solid.name} starts {depth * 1e3:.0f} mm inside {other.name}; up to "

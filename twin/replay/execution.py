@@ -14,6 +14,8 @@ from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
+SQUEEZE_M = 0.01
+"""How far below the recorded width an executed grasp is commanded, so that it presses [m]."""
 LARGEST_GAP_NS = 500_000_000
 """What was not recorded for longer than this is not made up."""
 
@@ -139,14 +141,14 @@ def path_of_execution(
 
     A recorded grasp stops at the object's width. Commanding that width would touch without
     pressing, so while the plan wants the gripper closed and the fingers have stopped, the command
-    is ``squeeze_m`` narrower and the force limit holds the object. A kinematic replay shows the
+    is ``SQUEEZE_M`` narrower and the force limit holds the object. A kinematic replay shows the
     recorded width.
 
     Args:
         track: Recorded joints; the first sample is time 0 of the path.
         widths: Recorded widths of the gripper, on the same clock.
         plan: What was executed: says when the gripper was to be closed.
-        config: Mode and ``squeeze_m``.
+        config: Its mode counts.
         robot: Whose joints are wanted.
 
     Raises:
@@ -177,7 +179,7 @@ def path_of_execution(
     width_times, width_keep = np.unique(widths.stamps_ns - first_ns, return_index=True)
     width = widths.position[width_keep, 0].astype(np.float64)
     closed = closed_mask(width_times, width, plan)
-    squeeze_m = config.squeeze_m if config.mode == "dynamic" else 0.0
+    squeeze_m = SQUEEZE_M if config.mode == "dynamic" else 0.0
     return JointPath(
         times_ns=times,
         joints_rad=arm.position[keep].astype(np.float64),

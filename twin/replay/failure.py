@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from bridge.task.causes import Cause
 from bridge.task.verdict import Factor
 from twin.errors import TwinError
 
@@ -24,7 +25,7 @@ class Failure:
     """What went wrong, when, and between whom."""
 
     t_ns: int
-    cause: str
+    cause: Cause
     detail: str
     bodies: tuple[str, ...] = ()
 

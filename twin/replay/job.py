@@ -93,8 +93,6 @@ class ReplayJob:
         name: str = self.engines()[0] if engine is None else engine
         if self.config.mode == "kinematic":
             name = KINEMATIC_ENGINE
-        elif self.config.grasp == "attach":
-            name += "-attach"
         parts = (
             self.episode_path.stem,
             "replay",
@@ -115,7 +113,9 @@ class ReplayJob:
         """What the settings hash covers: settings, inputs, engine and code version."""
         return {
             "replay_version": REPLAY_VERSION,
-            "engine": " and ".join(self._engine_names()),
+            "engine": " and ".join(
+                engine_of(self.task, replace(self.config, engine=each)) for each in self.engines()
+            ),
             "episode_sha256": self.episode_sha256,
             "plan_index": self.plan_index,
             "start_ns": self.start_ns,
@@ -130,10 +130,6 @@ class ReplayJob:
             **self._sampled_from(),
             **self._compared_with(),
         }
-
-    def _engine_names(self) -> list[str]:
-        config = replace(self.config, engines_must_agree=False)
-        return [engine_of(self.task, replace(config, engine=each)) for each in self.engines()]
 
     def _named_robot(self) -> dict[str, Any]:
         if not self.robot:

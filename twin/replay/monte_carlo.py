@@ -20,10 +20,21 @@ from bridge.task.task_file import ObjectModel
 from bridge.task.verdict import Verdict
 from twin.physics.config import PhysicsConfig
 from twin.physics.unseen import Unseen
-from twin.replay.config import BoxDraw, PosteriorDraw, ReplayConfig, VariationConfig
+from twin.replay.config import (
+    UNKNOWN_POSE_M,
+    UNKNOWN_POSE_RAD,
+    BoxDraw,
+    PosteriorDraw,
+    ReplayConfig,
+    VariationConfig,
+)
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad
 
+YOUNG_LOG = 0.3
+"""Spread of the logarithm of each soft object's Young's modulus."""
+GRIP_DELAY_S = 0.1
+"""The gripper lags behind the arm by up to this long, evenly drawn [s]."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 RESTS_M = 1e-4
@@ -157,7 +168,6 @@ def draw_variation(
     drawn = settings.draw_at(halving(index))
     if drawn is not None:
         scene, config = with_draw(drawn, scene, config)
-        settings = replace(settings, friction_log=0.0, grip_force_log=0.0, mass_log=0.0)
     factors = {
         name: float(np.exp(spread * rng.standard_normal()))
         for name, spread in settings.physics_spreads().items()
@@ -165,7 +175,7 @@ def draw_variation(
     physics = replace(
         config.physics, **{name: getattr(config.physics, name) * f for name, f in factors.items()}
     )
-    delay_s = config.grip_delay_s + settings.grip_delay_s * float(rng.random())
+    delay_s = config.grip_delay_s + GRIP_DELAY_S * float(rng.random())
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
     objects: dict[str, ObjectModel] = {}
     for name in sorted(scene.task.objects):
@@ -175,7 +185,7 @@ def draw_variation(
         objects[name] = _varied_model(model, z[6:], settings)
         if name in scene.Ts_base_object:
             T = scene.Ts_base_object[name]
-            root = _root(T, model, scene, settings, name)
+            root = _root(T, model, scene, name)
             poses[name] = _moved(T, root @ z[:6], model)
     return Variation(
         Ts_base_object=poses,
@@ -193,7 +203,7 @@ def _varied_model(
         return model
     soft = model.soft
     if soft is not None:
-        soft = replace(soft, young_pa=soft.young_pa * float(np.exp(settings.young_log * z[1])))
+        soft = replace(soft, young_pa=soft.young_pa * float(np.exp(YOUNG_LOG * z[1])))
     mass_kg = model.mass_kg * float(np.exp(settings.mass_spread(soft=soft is not None) * z[0]))
     return replace(model, mass_kg=mass_kg, soft=soft)
 
@@ -202,19 +212,18 @@ def _root(
     T: Float[np.ndarray, "4 4"],
     model: ObjectModel,
     scene: ReplayScene,
-    settings: VariationConfig,
     name: str,
 ) -> Float[np.ndarray, "6 6"]:
     """Symmetric square root of what is unsure of a pose."""
     covariance = scene.covariances.get(name)
     if covariance is None:
-        m, rad = settings.unknown_pose_m**2, settings.unknown_pose_rad**2
+        m, rad = UNKNOWN_POSE_M**2, UNKNOWN_POSE_RAD**2
         covariance = np.diag([m, m, 0.0, 0.0, 0.0, rad])
     rest_m = scene.table_height_m + model.rest_height_m
     if T[2, 2] > UPRIGHT and abs(T[2, 3] - rest_m) < RESTS_M:
         covariance = given_upright(covariance)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    deviations = settings.pose_scale * np.sqrt(np.maximum(values, 0.0))
+    deviations = np.sqrt(np.maximum(values, 0.0))
     return np.asarray((vectors * deviations) @ vectors.T)
 
 

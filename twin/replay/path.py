@@ -15,16 +15,22 @@ from bridge.episode.executions import NO_PLAN
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.robots.robot import Robot
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Waypoint
 from twin.errors import TwinError
 from twin.replay.clearance.bodies import own_links
-from twin.replay.config import ReplayConfig
+from twin.replay.config import PATH_STEP_S
 from twin.replay.failure import Failure
 from twin.robot.collision import RobotHulls
+from twin.robot.config import IkConfig
 from twin.robot.follow import Clearance, follow_poses
 from twin.robot.inverse import pose_error, solve_ik
 from twin.robot.model import RobotModel
 
+IK = IkConfig()
+"""When a pose counts as reached."""
+MAX_JOINT_STEP_RAD = 0.3
+"""Largest change of a joint within one path step; more is a jump [rad]."""
 _LIMIT_SLACK_RAD = 1e-3
 _SPEED_SLACK = 1.02
 """Recorded and rounded joints may exceed a limit by as little as this."""
@@ -57,7 +63,7 @@ def limit_failure(
     """
     return Failure(
         t_ns=t_ns,
-        cause="joint_limit",
+        cause=Cause.JOINT_LIMIT,
         bodies=(robot.joints[joint],),
         detail=f"{robot.joints[joint]} is at {joints_rad[joint]:.3f} rad, its limits are "
         f"{robot.lower_rad[joint]:.3f} to {robot.upper_rad[joint]:.3f} rad",
@@ -68,7 +74,6 @@ def jumps(
     times_ns: Int[np.ndarray, " num_times"],
     joints_rad: Float[np.ndarray, "num_times num_joints"],
     robot: RobotModel,
-    config: ReplayConfig,
 ) -> list[Failure]:
     """Find the first jump and the first excess of speed between neighbouring postures.
 
@@ -76,7 +81,6 @@ def jumps(
         times_ns: Of the postures, ascending.
         joints_rad: Postures, joints from base to hand.
         robot: Gives the limits of speed.
-        config: Gives the largest step, ``max_joint_step_rad``.
     """
     if len(times_ns) < 2:
         return []
@@ -84,8 +88,8 @@ def jumps(
     speeds = steps / (np.diff(times_ns)[:, None] * 1e-9)
     failures = []
     for cause, values, limit, unit in (
-        ("joint_jump", steps, np.full(len(robot.joints), config.max_joint_step_rad), "rad"),
-        ("joint_speed", speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
+        (Cause.JOINT_JUMP, steps, np.full(len(robot.joints), MAX_JOINT_STEP_RAD), "rad"),
+        (Cause.JOINT_SPEED, speeds, robot.velocity_limit_rad_s * _SPEED_SLACK, "rad/s"),
     ):
         over = values > limit
         if np.any(over):
@@ -262,7 +266,6 @@ class JointPath:
 def path_of_plan(
     plan: Plan,
     robot: RobotModel,
-    config: ReplayConfig,
     *,
     clearance: Clearance | None = None,
     start_rad: Float[np.ndarray, " num_joints"] | None = None,
@@ -275,7 +278,6 @@ def path_of_plan(
     Args:
         plan: What is commanded.
         robot: What is to follow it.
-        config: Spacing and tolerances.
         clearance: Says which postures touch something, where the plan leaves the choice.
         start_rad: Where the robot stands: a plan that begins without joints goes on from there.
 
@@ -288,14 +290,12 @@ def path_of_plan(
     """
     check_usable(plan, robot)
     knots = _Knots()
-    for is_open, group in groupby(
-        _targets(plan, robot, config), key=lambda target: target.given is None
-    ):
+    for is_open, group in groupby(_targets(plan, robot), key=lambda target: target.given is None):
         run = list(group)
         if is_open:
-            _follow(knots, run, robot, config, clearance, start_rad)
+            _follow(knots, run, robot, clearance, start_rad)
         else:
-            _take_given(knots, run, robot, config)
+            _take_given(knots, run, robot)
         if knots.unreachable_ns is not None:
             break
     path = JointPath(
@@ -345,7 +345,6 @@ def _follow(
     knots: _Knots,
     run: list[_Target],
     robot: RobotModel,
-    config: ReplayConfig,
     clearance: Clearance | None,
     start_rad: Float[np.ndarray, " num_joints"] | None,
 ) -> None:
@@ -354,7 +353,7 @@ def _follow(
         robot,
         np.stack([target.T for target in run]),
         start_rad=knots.joints[-1] if knots.joints else start_rad,
-        config=config.ik,
+        config=IK,
         clearance=clearance,
     )
     for target, joints, reached in zip(run, followed.joints_rad, followed.reached, strict=True):
@@ -364,15 +363,15 @@ def _follow(
         knots.add(target.t_ns, joints)
 
 
-def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: ReplayConfig) -> None:
+def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel) -> None:
     """Take the plan's joints where they reach its own poses, and the nearest that do elsewhere."""
     for target in run:
         given = target.given
         if given is None:
             continue
-        failure = _check_given(robot, target.t_ns, given, target.T, config)
+        failure = _check_given(robot, target.t_ns, given, target.T)
         if failure is not None:
-            solution = solve_ik(robot, target.T, config.ik, warm_start_rad=given)
+            solution = solve_ik(robot, target.T, IK, warm_start_rad=given)
             given = solution.joints_rad
             if not solution.reached:
                 knots.stop(robot, target, given)
@@ -381,7 +380,7 @@ def _take_given(knots: _Knots, run: list[_Target], robot: RobotModel, config: Re
         knots.add(target.t_ns, given)
 
 
-def _targets(plan: Plan, robot: RobotModel, config: ReplayConfig) -> list[_Target]:
+def _targets(plan: Plan, robot: RobotModel) -> list[_Target]:
     """Waypoints, and where joints are not given the poses on the straight line between them."""
     times = plan.times_ns()
     quats = plan.quaternions_wxyz()
@@ -391,7 +390,7 @@ def _targets(plan: Plan, robot: RobotModel, config: ReplayConfig) -> list[_Targe
         [list(plan.joint_names).index(name) for name in robot.joints] if plan.joint_names else None
     )
     targets: list[_Target] = []
-    step_ns = round(config.path_step_s * 1e9)
+    step_ns = round(PATH_STEP_S * 1e9)
     for index, waypoint in enumerate(plan.tau):
         given = _given_joints(plan.id, waypoint, len(robot.joints), order)
         if given is None and index > 0:
@@ -431,7 +430,7 @@ def _unreachable(t_ns: int, T: Float[np.ndarray, "4 4"], error_m: float) -> Fail
     x, y, z = T[:3, 3]
     return Failure(
         t_ns=t_ns,
-        cause="unreachable",
+        cause=Cause.UNREACHABLE,
         detail=f"no joints reach ({x:.3f}, {y:.3f}, {z:.3f}) m; "
         f"the nearest miss it by {error_m * 1e3:.1f} mm",
     )
@@ -442,33 +441,29 @@ def _check_given(
     t_ns: int,
     given: Float[np.ndarray, " num_joints"],
     T: Float[np.ndarray, "4 4"],
-    config: ReplayConfig,
 ) -> Failure | None:
     """Say why a plan's own joints are no solution for its pose; None when they are."""
     outside = outside_limits(robot, given[None])[0]
     if np.any(outside):
         return limit_failure(robot, t_ns, given, int(np.argmax(outside)))
     offset, angle = pose_error(robot, given, T)
-    if offset <= config.ik.position_tolerance_m and angle <= config.ik.rotation_tolerance_rad:
+    if offset <= IK.position_tolerance_m and angle <= IK.rotation_tolerance_rad:
         return None
     return Failure(
         t_ns=t_ns,
-        cause="joints_disagree",
+        cause=Cause.JOINTS_DISAGREE,
         detail=f"the plan's joints put the tool {offset * 1e3:.1f} mm and "
         f"{np.degrees(angle):.2f} degrees from its own pose",
     )
 
 
-def check_path(
-    path: JointPath, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
-) -> list[Failure]:
+def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Failure]:
     """Find joint limits, jumps, excess speed and self-collision along an interpolated path.
 
     Args:
         path: Joints and gripper widths over time.
         robot: Gives limits of angle and speed.
         hulls: The same robot's convex pieces; they are moved along the path.
-        config: Step along the path [s], and the largest joint step.
     """
     failures = []
     outside = outside_limits(robot, path.joints_rad)
@@ -477,9 +472,9 @@ def check_path(
         failures.append(
             limit_failure(robot, int(path.times_ns[knot]), path.joints_rad[knot], joint)
         )
-    times = path.dense_times_ns(config.path_step_s)
+    times = path.dense_times_ns(PATH_STEP_S)
     joints = path.joints_at(times)
-    failures += jumps(times, joints, robot, config)
+    failures += jumps(times, joints, robot)
     widths = path.width_at(times)
     links = own_links(hulls)
     for t_ns, row, width in zip(times, joints, widths, strict=True):
@@ -489,7 +484,7 @@ def check_path(
             failures.append(
                 Failure(
                     t_ns=int(t_ns),
-                    cause="self_collision",
+                    cause=Cause.SELF_COLLISION,
                     bodies=closest.links,
                     detail=f"{closest.links[0]} is {-closest.distance_m * 1e3:.1f} mm inside "
                     f"{closest.links[1]}",

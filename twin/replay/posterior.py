@@ -9,8 +9,8 @@ the draws that are left keep them together. Friction and mass belong to the obje
 each task is weighed by its own trials alone.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -216,7 +216,7 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     if urdf is None:
         raise UsageError("no robot description was recorded")
     task = streams.task_file(episode, plan.task).task()
-    states = localised_starts(run, episode, task, scene_hash=scene_hash_of(run), force=False)
+    states = localised_starts(run, episode, task, scene_hash=scene_hash_of(run))
     start, after = states.at(stamp_ns), states.after(plan.id)
     scene = read_rebuilt_scene(run, task).scene(task, urdf, start.Ts_base_object)
     if scene.missing():
@@ -257,8 +257,8 @@ def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
     """
     scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
-    scene = free_start(scene, soft_models(scene), config.start_overlap_m)
-    path, _, _ = path_of_plan(trial.plan, robot, config)
+    scene = free_start(scene, soft_models(scene))
+    path, _, _ = path_of_plan(trial.plan, robot)
     states = simulate(path, scene, hulls_of(robot), config)
     rollout = Rollout(
         stamps_ns=states.stamps_ns,
@@ -391,7 +391,7 @@ def calibrate_posterior(
         beforehand = draw_beforehand(num_draws, rigid_movers(trials[0].scene.task))
         draws = weighed(beforehand, trials, workers=workers, output=output)
         tasks[name] = {
-            "draws": [draw.to_record() for draw in draws],
+            "draws": [asdict(draw) for draw in draws],
             "effective_draws": effective(draws),
             "sources": {trial.episode: trial.to_record() for trial in trials},
         }
@@ -413,52 +413,15 @@ def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
     """
     lines = [f"posterior: {len(record['tasks'])} tasks; calibration {calibration_id}"]
     for name, found in record["tasks"].items():
-        lines += _described(name, found)
+        draws, trials = found["draws"], found["sources"]
+        good = sum(item["success"] for item in trials.values())
+        lines.append(
+            f"{name}: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
+            f"succeeded; as much as {found['effective_draws']:.1f} equal ones"
+        )
     lines += [
         f"{name}: no trial of it can be used, so its samples draw from the priors"
         for name in record["without_trials"]
     ]
     lines += [f"  {name} not used: {why}" for name, why in record["skipped"].items()]
     return "\n".join(lines)
-
-
-def _described(name: str, found: Mapping[str, Any]) -> list[str]:
-    """What the trials of one task left, in lines."""
-    draws, trials = found["draws"], found["sources"]
-    good = sum(item["success"] for item in trials.values())
-    lines = [
-        f"{name}: {len(draws)} draws weighed by {len(trials)} trials, {good} of which "
-        f"succeeded; as much as {found['effective_draws']:.1f} equal ones"
-    ]
-    weights = np.array([draw["weight"] for draw in draws])
-    for label, values in _columns(draws):
-        order = np.argsort(values)
-        share = np.cumsum(weights[order])
-        low, middle, high = (values[order][np.searchsorted(share, q)] for q in (0.1, 0.5, 0.9))
-        lines.append(f"  {label:<22} {middle:8.3g}, eight of ten in [{low:.3g}, {high:.3g}]")
-    return lines
-
-
-def _columns(
-    draws: Sequence[Mapping[str, Any]],
-) -> Iterator[tuple[str, Float[np.ndarray, " num_draws"]]]:
-    """Each number of the draws but their weight, with its name."""
-    for key in draws[0]:
-        if key == "boxes":
-            yield from _box_columns([draw[key] for draw in draws])
-        elif key == "bias_m":
-            for axis in range(2):
-                yield f"{key} {'xy'[axis]}", np.array([draw[key][axis] for draw in draws])
-        elif key != "weight":
-            yield key, np.array([draw[key] for draw in draws])
-
-
-def _box_columns(
-    rows: Sequence[Sequence[Mapping[str, Any]]],
-) -> Iterator[tuple[str, Float[np.ndarray, " num_draws"]]]:
-    for boxes in zip(*rows, strict=True):
-        name = boxes[0]["name"]
-        yield f"{name} edge_share", np.array([box["edge_share"] for box in boxes])
-        centres = np.array([box["centre_of_mass"] for box in boxes])
-        for axis in range(3):
-            yield f"{name} centre of mass {'xyz'[axis]}", centres[:, axis]

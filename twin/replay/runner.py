@@ -127,9 +127,7 @@ def jobs_of(item: Preparation) -> Prepared:
     if nothing is not None:
         return nothing
     task = streams.task_file(episode, plans[0][1].task if plans else "").task()
-    starts = localised_starts(
-        run, episode, task, scene_hash=item.scene_hash, force=config.relocalise
-    )
+    starts = localised_starts(run, episode, task, scene_hash=item.scene_hash)
     digest = episode.sha256()
     calibration = read_calibration(run)
     replay = for_task(config.replay, calibration, task)
@@ -179,8 +177,8 @@ def jobs_of(item: Preparation) -> Prepared:
             else:
                 jobs.append(executed)
             # Which engine is asked makes no other kinematic replay.
-            alone = replace(replay, engine="pybullet", engines_must_agree=False)
-            jobs.append(replace(executed, config=replace(alone, mode="kinematic")))
+            alone = replace(replay, engine="pybullet", mode="kinematic")
+            jobs.append(replace(executed, config=alone))
     return Prepared(jobs=tuple(jobs), why_not=why_not)
 
 

@@ -123,7 +123,7 @@ class StartStates:
 
 
 def localised_starts(
-    run: RunFolder, episode: Episode, task: Task, *, scene_hash: str | None, force: bool
+    run: RunFolder, episode: Episode, task: Task, *, scene_hash: str | None
 ) -> StartStates:
     """Localise an episode's objects once, keep the answer as a derived episode, and read it.
 
@@ -134,11 +134,10 @@ def localised_starts(
         episode: What was recorded.
         task: Whose objects are looked for.
         scene_hash: Of the scene the poses are meant for; None: there is none.
-        force: Localise again even where an answer is kept.
     """
     phases = quiet_phases(episode)
     try:
-        path = write_localised(run, episode, task, scene_hash=scene_hash, force=force)
+        path = write_localised(run, episode, task, scene_hash=scene_hash)
         records = streams.localisations(Episode.open(path))
     except GstError as error:
         nothing = StartState(reasons=dict.fromkeys(task.objects, str(error)))

@@ -35,8 +35,6 @@ def count_verdicts(rows: Rows) -> dict[str, dict[str, int]]:
         key = f"{row['trajectory']} {row['mode']}"
         if key == "planned dynamic" and not row["executed"]:
             key = "planned dynamic, never executed"
-        if "+attach" in (row.get("engine") or ""):
-            key += ", attached grasp"
         if row.get("engines") == ["mujoco"]:
             key += ", mujoco"
         counts.setdefault(key, Counter())["failed" if row["error"] else WORDS[row["accepted"]]] += 1

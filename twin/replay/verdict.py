@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from bridge.episode.streams import JointTrack
 from bridge.robots.robot import robot_of
+from bridge.task.causes import Cause
 from bridge.task.check import REFERENCES
 from bridge.task.plan import Plan
 from bridge.task.predicate import (
@@ -32,14 +33,14 @@ from twin.replay.checks import (
 )
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
-from twin.replay.config import ReplayConfig
+from twin.replay.config import PATH_STEP_S, ReplayConfig
 from twin.replay.dynamics import Burst, States, free_start, simulate, soft_models
 from twin.replay.execution import path_of_execution
 from twin.replay.failure import Failure, factor_from
+from twin.replay.grasps import grasps_seen
 from twin.replay.path import JointPath, check_path, path_of_plan
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
-from twin.replay.slip import grasped_objects, grasps_seen, slips, unless_slipped
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 
@@ -74,14 +75,14 @@ def terminal_factor(
     if burst is not None:
         detail = f"{burst.object_id}: {burst.found}"
         bodies = (burst.object_id,)
-        failure = Failure(t_ns=burst.t_ns, cause="exploded", bodies=bodies, detail=detail)
+        failure = Failure(t_ns=burst.t_ns, cause=Cause.EXPLODED, bodies=bodies, detail=detail)
         return factor_from([failure])
     if unreachable_ns is not None:
         detail = f"the trajectory cannot be executed beyond {unreachable_ns * 1e-9:.2f} s"
         return Factor(value=None, detail=detail)
     end_ns = int(result.stamps_ns[-1])
     for name, found in result.broken.items():
-        failure = Failure(t_ns=end_ns, cause="shape", bodies=(name,), detail=f"{name} {found}")
+        failure = Failure(t_ns=end_ns, cause=Cause.SHAPE, bodies=(name,), detail=f"{name} {found}")
         return factor_from([failure])
     findings = evaluate_success(scene.task, result.rollout())
     value = all_hold(findings)
@@ -201,11 +202,11 @@ def replay_plan(
     robot = load_robot(scene.urdf)
     free = posture_clearance(scene, hulls_of(robot), config, up_to_m=0.0)
     path, failures, unreachable_ns = path_of_plan(
-        plan, robot, config, clearance=free, start_rad=scene.start_rad
+        plan, robot, clearance=free, start_rad=scene.start_rad
     )
     checks = {"task": task_failures(plan, scene.task), "limits": path_limit_failures(path, robot)}
     if scene.start_rad is not None:
-        checks["start"] = start_failures(plan, path, scene.start_rad, robot, config)
+        checks["start"] = start_failures(plan, path, scene.start_rad, robot)
     commanded = Commanded(
         path=path.with_late_gripper(config.grip_delay_s),
         failures=failures,
@@ -275,11 +276,11 @@ def _replay(
     refuse_early: bool = False,
 ) -> ReplayResult:
     robot = load_robot(scene.urdf)
-    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot), config)
+    failures = commanded.failures + check_path(commanded.path, robot, hulls_of(robot))
     commanded = replace(commanded, failures=failures)
     plan = limited_to_task(plan, scene.task)
     if config.mode == "dynamic":
-        scene = free_start(scene, soft_models(scene), config.start_overlap_m)
+        scene = free_start(scene, soft_models(scene))
     moved = _move(commanded, plan, scene, config, refuse_early=refuse_early)
     states = moved.states
     result = ReplayResult(
@@ -311,7 +312,7 @@ def _move(
     """Follow the path, with physics unless it is refused before."""
     path, hulls = commanded.path, hulls_of(load_robot(scene.urdf))
     monitor = ClearanceMonitor(scene, plan, hulls, config)
-    _pre_grasp(monitor, path, config)
+    _pre_grasp(monitor, path)
     dynamic = config.mode == "dynamic"
     states, by_physics, measured = None, dynamic, True
     if dynamic and refuse_early:
@@ -349,12 +350,9 @@ def _judge(
     path, checks, states = commanded.path, commanded.checks, moved.states
     # What was executed is judged by where things end: it is known whether they were dropped.
     planned = moved.by_physics and commanded.trajectory == "planned"
-    slipped: list[Failure] = []
     if planned:
         simulated = simulated_limit_failures(path, states, load_robot(scene.urdf))
         checks = {**checks, "limits": checks["limits"] + simulated}
-        if config.max_slip_m is not None:
-            slipped = slips(grasped_objects(plan, path, result), config.max_slip_m)
     unreachable_ns = commanded.unreachable_ns
     if moved.by_physics or config.mode == "kinematic":
         terminal = terminal_factor(
@@ -370,7 +368,7 @@ def _judge(
         result.verdict,
         ik=factor_from(commanded.failures),
         clearance=factor_from(moved.monitor.failures, undecided=undecided),
-        terminal=unless_slipped(terminal, slipped),
+        terminal=terminal,
         warnings=warnings_of(scene, result),
         findings=tuple(findings),
         checks={name: factor_from(found) for name, found in checks.items()},
@@ -432,8 +430,8 @@ def first_of(states: States) -> States:
     )
 
 
-def _pre_grasp(monitor: ClearanceMonitor, path: JointPath, config: ReplayConfig) -> None:
-    times = path.dense_times_ns(config.path_step_s)
+def _pre_grasp(monitor: ClearanceMonitor, path: JointPath) -> None:
+    times = path.dense_times_ns(PATH_STEP_S)
     if path.first_close_ns is not None:
         times = times[times < path.first_close_ns]
     for t_ns, joints, width in zip(times, path.joints_at(times), path.width_at(times), strict=True):
@@ -457,17 +455,16 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
-    """Name what moved things: a grasp that is no friction grasp is part of the name.
+    """Name what moved things.
 
     Args:
         task: Whether it has soft objects.
-        config: Mode and kind of grasp.
+        config: Mode and engine.
     """
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""
-    tied = "+attach" if config.grasp == "attach" else ""
-    return f"{engine_version(config.engines()[0])}{soft}{tied}"
+    return f"{engine_version(config.engines()[0])}{soft}"
 
 
 def _clearance_undecided(

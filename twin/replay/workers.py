@@ -9,13 +9,12 @@ import os
 import secrets
 import socket
 import tempfile
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
@@ -36,70 +35,6 @@ from bridge.process_pool import (
 from bridge.terminal import Output
 from twin.errors import TwinError
 from twin.replay.config import ReplayRunConfig
-
-# Pieces of work put together into tasks, where each task costs something beside its work.
-# A task of Ray costs processors some 10 ms (measured), which many short pieces together save;
-# single pieces at the end keep all processors busy (guided self-scheduling; Polychronopoulos and
-# Kuck 1987).
-
-TASK_S = 2.0
-"""About as long as a task may take; a piece that takes longer is a task of its own."""
-SHARE = 4
-"""A task takes so many times less than a processor's part of what is left."""
-
-
-class Batches(Generic[Item]):
-    """What is to be done, the longest first, by tasks whose length it learns from those before."""
-
-    def __init__(
-        self, items: Sequence[Item], cost: Callable[[Item], float], processors: int
-    ) -> None:
-        """Have everything to do.
-
-        Args:
-            items: The pieces.
-            cost: How long one takes, in any unit.
-            processors: Among which they are shared.
-        """
-        self._cost = cost
-        self._shares = SHARE * processors
-        self._todo = deque(sorted(items, key=cost, reverse=True))
-        self._alone: deque[Item] = deque()
-        self._spent_s = self._done_cost = 0.0
-
-    def __bool__(self) -> bool:
-        """Whether something is left to take."""
-        return bool(self._todo or self._alone)
-
-    def take(self) -> list[Item]:
-        """Take the next task; alone what was lost, and what comes before any length is known."""
-        if self._alone:
-            return [self._alone.popleft()]
-        most_pieces = len(self._todo) // self._shares
-        most_cost = TASK_S * self._done_cost / self._spent_s if self._spent_s > 0 else 0.0
-        batch = [self._todo.popleft()]
-        total = self._cost(batch[0])
-        while len(batch) < most_pieces:
-            total += self._cost(self._todo[0])
-            if total > most_cost:
-                break
-            batch.append(self._todo.popleft())
-        return batch
-
-    def learn(self, batch: Sequence[Item], seconds: float) -> None:
-        """Remember how long a task took where it was done.
-
-        Args:
-            batch: The items that were done together.
-            seconds: Time that took on the worker.
-        """
-        self._spent_s += seconds
-        self._done_cost += sum(self._cost(item) for item in batch)
-
-    def again(self, batch: Sequence[Item]) -> None:
-        """Take each piece of a lost task once more, alone: one of them may be to blame."""
-        self._alone.extend(batch)
-
 
 LOCAL = "local"
 LOOPBACK = "127.0.0.1"
@@ -178,9 +113,7 @@ class RayRunner:
     def run(
         self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
     ) -> Iterator[tuple[Item, Answer | Failed]]:
-        """See ``Runner``. What shared a task with work that lost its node is done again alone.
-
-        Alone it is tried once more by Ray itself.
+        """See ``Runner``; Ray itself begins what lost its node once more.
 
         Args:
             function: Done with each item, on whichever node is free.
@@ -188,27 +121,20 @@ class RayRunner:
             cost: How long an item takes, in any unit: the longest are begun first.
         """
         ray = self._ray
-        processors = self._processors()
-        task = ray.remote(num_cpus=1)(_tasks)
-        todo = Batches(items, cost, processors)
-        running: dict[Any, list[Item]] = {}
+        most = WINDOW * self._processors()
+        task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_task)
+        todo = deque(sorted(items, key=cost, reverse=True))
+        running: dict[Any, Item] = {}
         while todo or running:
-            while todo and len(running) < WINDOW * processors:
-                batch = todo.take()
-                retries = ATTEMPTS - 1 if len(batch) == 1 else 0
-                one = task.options(max_retries=retries)
-                running[one.remote(function, batch, code_version())] = batch
+            while todo and len(running) < most:
+                item = todo.popleft()
+                running[task.remote(function, item, code_version())] = item
             for reference in self._done(list(running)):
-                batch = running.pop(reference)
+                item = running.pop(reference)
                 try:
-                    answers, seconds = ray.get(reference)
-                    todo.learn(batch, seconds)
+                    yield item, ray.get(reference)
                 except ray.exceptions.RayError as error:
-                    if len(batch) > 1:
-                        todo.again(batch)
-                        continue
-                    answers = [lost(f"Ray lost it: {_first_line(error)}")]
-                yield from zip(batch, answers, strict=True)
+                    yield item, lost(f"Ray lost it: {_first_line(error)}")
 
     def _done(self, running: list[Any]) -> list[Any]:
         """Wait until something is done.
@@ -349,15 +275,6 @@ def code_version() -> str:
 
     about = provenance.software()
     return f"{about['version']}, replays {REPLAY_VERSION}, {installed_versions()}"
-
-
-def _tasks(
-    function: Function, items: Sequence[Any], version: str
-) -> tuple[list[Answer | Failed], float]:
-    """Do pieces of work on some node, one after another, and say how long all took [s]."""
-    before = time.monotonic()
-    answers = [_task(function, item, version) for item in items]
-    return answers, time.monotonic() - before
 
 
 def _task(function: Function, item: Any, version: str) -> Answer | Failed:

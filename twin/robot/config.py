@@ -1,9 +1,6 @@
 """Settings of the kinematics; imports nothing heavy."""
 
-import math
 from dataclasses import dataclass
-
-from bridge.errors import refuse_outside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,16 +18,3 @@ class IkConfig:
     nearest known postures; 0: none."""
     seed: int = 0
     """Seed of the random starts."""
-
-    def __post_init__(self) -> None:
-        """Refuse tolerances within which everything, or nothing, would count as reached."""
-        refuse_outside(
-            self,
-            {
-                "position_tolerance_m": (0, 0.1),
-                "rotation_tolerance_rad": (0, math.pi),
-                "max_iterations": (1, 100_000),
-                "restarts": (0, 100_000),
-                "seed": (0, 2**63),
-            },
-        )

@@ -259,9 +259,7 @@ def test_the_search_begins_where_tf_believes_the_camera_also_below_a_world(
 
     monkeypatch.setattr(cameras, "align_robot", look)
     with pytest.raises(RobotNotAlignedError):
-        cameras.find_fixed_camera(
-            [Episode.open(path) for path in run.episodes()], "side", max_postures=2, seed=0
-        )
+        cameras.find_fixed_camera([Episode.open(path) for path in run.episodes()], "side", seed=0)
     first, whole_table = begun
     assert whole_table is None
     assert first is not None
@@ -320,7 +318,7 @@ def test_turning_about_one_axis_is_said_in_one_sentence(
         (("--physics", "--workers", "0"), "--workers 0"),
         (("--cameras", "--pairs", "x.json"), "--pairs needs --camera"),
         (("--cameras", "--camera", "front"), "camera front has neither"),
-        (("--cameras", "--max-postures", "0"), "--max-postures 0"),
+        (("--physics", "--evaluations", "0"), "--evaluations 0"),
     ],
 )
 def test_wrong_use_is_exit_code_two(

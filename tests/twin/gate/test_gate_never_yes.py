@@ -177,15 +177,15 @@ def test_without_a_newer_picture_nobody_looks_again() -> None:
 
 def test_what_localisation_is_not_sure_of_is_no_motion() -> None:
     before, after = seen(pose(), sigma_m=0.01), seen(pose(0.53), sigma_m=0.01)
-    assert who_moved(before, after, TASK, moved_m=0.01, moved_rad=0.3) == []
+    assert who_moved(before, after, TASK) == []
 
 
 def test_a_place_that_is_no_number_is_not_where_it_was() -> None:
     before, after = seen(pose()), seen(pose(np.nan))
-    assert who_moved(before, after, TASK, moved_m=0.01, moved_rad=0.3)
+    assert who_moved(before, after, TASK)
     turned = pose()
     turned[0, 0] = np.nan
-    assert who_moved(before, seen(turned), TASK, moved_m=0.01, moved_rad=0.3)
+    assert who_moved(before, seen(turned), TASK)
 
 
 def test_a_cube_turned_by_a_quarter_did_not_turn() -> None:

@@ -93,20 +93,5 @@ def test_what_rests_rests_on_its_own_face_wherever_its_weight_is(
     np.testing.assert_allclose(p, [0.8, 0.3, 0.02], atol=5e-4)
 
 
-@each_engine
-def test_what_is_tied_to_the_tool_stays_where_it_was(engine: str) -> None:
-    unseen = Unseen(edge_m=0.004, centre_of_mass_m=(0.008, 0.0, -0.004))
-    with cell(engine) as world:
-        world.reset_robot(HOME, 0.05)
-        world.add_free("cube", CUBE, MASS_KG, world.robot.T_base_link("tcp"), unseen)
-        world.reset_robot(HOME, 0.05)
-        world.tie("cube")
-        for _ in range(60):
-            world.robot.command(HOME, np.zeros(6), 0.05)
-            world.step()
-        T_tcp_cube = se3.invert(world.robot.T_base_link("tcp")) @ world.T_base_object("cube")
-    np.testing.assert_allclose(T_tcp_cube, np.eye(4), atol=3e-3)
-
-
 def test_inertia_is_that_of_the_textbook() -> None:
     assert box_inertia(np.array([0.1, 0.2, 0.3]), 12.0) == pytest.approx((0.13, 0.1, 0.05))

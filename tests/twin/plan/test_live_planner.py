@@ -101,7 +101,7 @@ def test_it_remembers_nothing(planner: LivePlanner) -> None:
         mode="dynamic",
         ik=Factor(value=True),
         clearance=Factor(value=True),
-        terminal=Factor(value=False, cause="slipped", bodies=("cube",)),
+        terminal=Factor(value=False, cause="exploded", bodies=("cube",)),
         engine="test",
         seed=0,
     )
@@ -109,7 +109,7 @@ def test_it_remembers_nothing(planner: LivePlanner) -> None:
     second = planner.answer(steered)
     assert second.plan is not None
     assert second.plan.steered_by is not None
-    assert second.plan.steered_by.clause == "terminal.slipped"
+    assert second.plan.steered_by.clause == "terminal.exploded"
     assert planner.answer(request().to_json()).to_json() == first.to_json()
     assert planner.answer(steered).to_json() == second.to_json()
 

@@ -29,7 +29,7 @@ def problem() -> Problem:
     return Problem(scene=replace(scene, start_rad=start), robot=robot, shapes={})
 
 
-def said(plan: Plan, accepted: bool | None, cause: str = "slipped", **more: object) -> Verdict:
+def said(plan: Plan, accepted: bool | None, cause: str = "exploded", **more: object) -> Verdict:
     return Verdict(
         plan_id=plan.id,
         trajectory="planned",

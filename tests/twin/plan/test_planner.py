@@ -87,10 +87,10 @@ def test_the_order_of_candidates_is_that_of_a_longer_list(problem: Problem) -> N
 
 def test_a_refused_grasp_gives_another_grasp(problem: Problem) -> None:
     first = chosen(problem, 0)
-    no = refusal(first, terminal=Factor(value=False, cause="slipped", bodies=("cube",)))
+    no = refusal(first, terminal=Factor(value=False, cause="exploded", bodies=("cube",)))
     second = chosen(problem, 1, (no,))
     assert second.steered_by is not None
-    assert second.steered_by.clause == "terminal.slipped"
+    assert second.steered_by.clause == "terminal.exploded"
     (one,), (other,) = tried_in(first), tried_in(second)
     away_m = np.linalg.norm(one.T_object_tcp[:3, 3] - other.T_object_tcp[:3, 3])
     turned = se3.rotation_angle_rad(one.T_object_tcp[:3, :3].T @ other.T_object_tcp[:3, :3])

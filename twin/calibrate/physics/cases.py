@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bridge.episode import streams
-from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES, ROBOT_DESCRIPTION
@@ -68,8 +67,6 @@ class Case:
     hold_times_s: Float[np.ndarray, " num_holds"]
     """When the fingers stood still on something although they were told to close further."""
     held_widths_m: Float[np.ndarray, " num_holds"]
-    success: bool | None
-    """What the operator said of a trial; None: a probe, or unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +75,6 @@ class Prediction:
 
     settled: Float[np.ndarray, "num_objects 3"]
     held_widths_m: Float[np.ndarray, " num_holds"]
-    success: float
-    """Share of noisy starts that succeed; NaN where nobody asks."""
 
 
 def planar(T_base_object: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
@@ -305,7 +300,6 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
         turn_period_rad=np.array([yaw_period_rad(task.objects[key]) for key in objects]),
         hold_times_s=hold_times[kept.astype(bool)],
         held_widths_m=held[kept.astype(bool)],
-        success=_success(run, episode),
     )
 
 
@@ -322,14 +316,6 @@ def _moving(task: Task, before: Mapping[str, Found], after: Mapping[str, Found])
         message = f"never localised after the plan: {', '.join(objects)}."
         raise UnusableCaseError(message)
     return objects
-
-
-def _success(run: RunFolder, episode: Episode) -> bool | None:
-    """What was said last of a trial; None of a probe, and where nobody knows."""
-    outcome = outcome_of(run, episode)
-    if episode.info.kind != "trial" or outcome is None or outcome.result == "unknown":
-        return None
-    return outcome.result == "success"
 
 
 def _executed(episode: Episode) -> tuple[Plan, int, int]:

@@ -1,7 +1,7 @@
 """How sure the parameters are: an emulator around the best point, and profiles of the likelihood.
 
 Contact makes the likelihood rough on a small scale. Around the best point every predicted number is
-therefore laid through a quadratic (least squares over a cloud of points, all with the same noise),
+therefore laid through a quadratic (least squares over a cloud of points),
 and what the quadratic does not explain counts as the prediction's own variance. On the emulator
 maxima and profiles cost next to nothing.
 """

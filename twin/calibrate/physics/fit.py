@@ -9,6 +9,7 @@ import numpy as np
 from cmaes import CMA
 from jaxtyping import Float
 
+from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, Prediction
 from twin.calibrate.physics.emulator import (
     Emulator,
@@ -84,7 +85,6 @@ def judge(
     cases: Sequence[Case],
     predictions: Sequence[Prediction],
     posterior: DiscrepancyPosterior,
-    num_samples: int,
 ) -> HeldOut:
     """Compare predictions of held-out cases with what was seen.
 
@@ -92,9 +92,8 @@ def judge(
         cases: The held-out ones.
         predictions: Theirs.
         posterior: Of errors, as the training episodes left them for the same parameters.
-        num_samples: Noisy starts behind each share of successes.
     """
-    observed = observations_of(cases, num_samples)
+    observed = observations_of(cases)
     predicted = features_of(cases, predictions)
     found = score(observed, predicted, prior=posterior)
     off = np.linalg.norm((observed.settled - predicted.settled)[:, :2], axis=1)
@@ -114,10 +113,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 # Look for the best point: the covariance matrix adaptation evolution strategy.
-# Hansen, "The CMA evolution strategy: a tutorial" (2016), in the package ``cmaes``. All points
-# see the same noise (common random numbers), so that differences between them are the parameters'
-# own.
-
+# Hansen, "The CMA evolution strategy: a tutorial" (2016), in the package ``cmaes``.
 SIGMA = 0.6
 """First step size in units of the prior."""
 NARROW = 0.03
@@ -200,10 +196,6 @@ class Predictor(Protocol):
     def cases(self) -> Sequence[Case]:
         """All of them."""
 
-    @property
-    def num_samples(self) -> int:
-        """Noisy starts of each judged trial."""
-
     def predict(
         self, points: Float[np.ndarray, "num_points num_parameters"], chosen: Sequence[int]
     ) -> list[list[Prediction]]:
@@ -213,19 +205,6 @@ class Predictor(Protocol):
             points: Parameters, in units of the prior.
             chosen: Positions in ``cases``.
         """
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhysicsFitConfig:
-    """How hard to look."""
-
-    evaluations: int = 50
-    """Points of the search; the intervals take about 60 more."""
-    budget_s: float = 3600.0
-    """A last resort, told where it strikes: wall time after which the search ends. The intervals
-    are still computed."""
-    seed: int = 0
-    """Of the search, of the split and of the clouds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +244,7 @@ class Fit:
 def fit(
     predictor: Predictor,
     parameters: Sequence[PhysicsParameter],
-    config: PhysicsFitConfig,
+    config: CalibrateConfig,
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> Fit:
     """Find parameters from the training cases and judge them on the held-out ones.
@@ -277,10 +256,10 @@ def fit(
         advance: Told how many points were tried.
     """
     started = time.monotonic()
-    cases, samples = predictor.cases, predictor.num_samples
+    cases = predictor.cases
     split = split_cases(cases, config.seed)
     training = [cases[index] for index in split.training]
-    observed = observations_of(training, samples)
+    observed = observations_of(training)
     bounds = np.array([item.bounds for item in parameters])
 
     def score_at(x: Float[np.ndarray, " num_parameters"]) -> Score:
@@ -335,11 +314,11 @@ def _emulate(
     split: Split,
     centre: Float[np.ndarray, " num_parameters"],
     bounds: Float[np.ndarray, "num_parameters 2"],
-    config: PhysicsFitConfig,
+    config: CalibrateConfig,
     advance: Callable[[int, str], None],
 ) -> tuple[Emulator, int]:
     """Two clouds: the first says how wide the second has to be."""
-    observed = observations_of(training, predictor.num_samples)
+    observed = observations_of(training)
     width = np.full(len(centre), CLOUD_WIDTHS[0])
     count = 0
     emulator: Emulator | None = None
@@ -425,7 +404,6 @@ def _held_out(
         [predictor.cases[index] for index in split.held_out],
         predictor.predict(x[None], split.held_out)[0],
         trained.posterior,
-        predictor.num_samples,
     )
 
 

@@ -1,7 +1,7 @@
 """How likely observations are under predictions: robust, with the twin's own error in it.
 
 Settled poses and held widths follow Student's t with few degrees of freedom, because a twin that
-is otherwise right still misses a contact now and then; success is a coin. No model is exact: on top
+is otherwise right still misses a contact now and then. No model is exact: on top
 of localisation's noise there is a discrepancy of the twin, of unknown size, for each kind of
 episode one of its own: where pushed objects stop is nearly certain, how far they slide is not.
 Every size has its say by how likely it is (Kennedy and O'Hagan, Bayesian calibration of computer
@@ -148,14 +148,11 @@ class Observations:
     pose_kind: Int[np.ndarray, " num_poses"]
     widths_m: Float[np.ndarray, " num_holds"]
     width_kind: Int[np.ndarray, " num_holds"]
-    success: Float[np.ndarray, " num_judged"]
-    """1 or 0."""
-    num_samples: int
 
     @property
     def count(self) -> int:
         """How many numbers there are."""
-        return 3 * len(self.settled) + len(self.widths_m) + len(self.success)
+        return 3 * len(self.settled) + len(self.widths_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,11 +161,10 @@ class Features:
 
     settled: Float[np.ndarray, "num_poses 3"]
     widths_m: Float[np.ndarray, " num_holds"]
-    success: Float[np.ndarray, " num_judged"]
 
     def flat(self) -> Float[np.ndarray, " num_features"]:
         """All in one row, for the emulator."""
-        return np.concatenate([self.settled.ravel(), self.widths_m, self.success])
+        return np.concatenate([self.settled.ravel(), self.widths_m])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +175,11 @@ class Score:
     posterior: DiscrepancyPosterior
 
 
-def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
+def observations_of(cases: Sequence[Case]) -> Observations:
     """Put the observations of cases into flat arrays; objects not found again are left out.
 
     Args:
         cases: What was recorded.
-        num_samples: Noisy starts from which the success of each trial is predicted.
     """
     seen = [np.isfinite(case.settled).all(axis=1) for case in cases]
     rows = list(zip(cases, seen, strict=True))
@@ -211,8 +206,6 @@ def observations_of(cases: Sequence[Case], num_samples: int) -> Observations:
         width_kind=np.array(
             [kinds.index(case.kind) for case in cases for _ in case.held_widths_m], dtype=np.int64
         ),
-        success=np.array([float(case.success) for case in cases if case.success is not None]),
-        num_samples=num_samples,
     )
 
 
@@ -241,13 +234,6 @@ def features_of(cases: Sequence[Case], predictions: Sequence[Prediction]) -> Fea
     return Features(
         settled=np.concatenate(settled),
         widths_m=np.concatenate([none, *(item.held_widths_m for item in predictions)]),
-        success=np.array(
-            [
-                item.success
-                for case, item in zip(cases, predictions, strict=True)
-                if case.success is not None
-            ]
-        ),
     )
 
 
@@ -255,14 +241,13 @@ def unflatten(row: Float[np.ndarray, " num_features"], like: Observations) -> Fe
     """The inverse of ``Features.flat``.
 
     Args:
-        row: Settled poses, held widths and shares of success, one after another.
+        row: Settled poses and held widths, one after another.
         like: Says how many of each there are.
     """
     poses, holds = 3 * len(like.settled), len(like.widths_m)
     return Features(
         settled=row[:poses].reshape(-1, 3),
         widths_m=row[poses : poses + holds],
-        success=np.clip(row[poses + holds :], 0.0, 1.0),
     )
 
 
@@ -322,7 +307,7 @@ def score(
     after, total = before.after(
         _poses(observed, predicted, known), _widths(observed, predicted, known)
     )
-    return Score(log_likelihood=total + _coins(observed, predicted), posterior=after)
+    return Score(log_likelihood=total, posterior=after)
 
 
 def _poses(
@@ -376,12 +361,3 @@ def _log_t(
     half = (DEGREES + dimensions) / 2
     constant = gammaln(half) - gammaln(DEGREES / 2) - dimensions / 2 * np.log(DEGREES * np.pi)
     return np.asarray(constant - half * np.log1p(distance / DEGREES))
-
-
-def _coins(observed: Observations, predicted: Features) -> float:
-    """Bernoulli with the share of noisy starts that succeed, never quite 0 or 1."""
-    if len(observed.success) == 0 or observed.num_samples == 0:
-        return 0.0
-    count = observed.num_samples
-    p = (predicted.success * count + 0.5) / (count + 1)
-    return float(np.sum(np.log(np.where(observed.success > 0.5, p, 1 - p))))

@@ -1,25 +1,18 @@
-"""``robot-gst calibrate RUN --physics``: fit contact and delay, write the record and its table."""
+"""``robot-gst calibrate RUN --physics``: fit contact, write the record and its table."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.stats import t as student
 
-from bridge.episode import provenance, streams
-from bridge.episode.reader import Episode
+from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError
-from bridge.geometry.signals import lag_between_steps
 from bridge.process_pool import default_size
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case, read_cases
 from twin.calibrate.physics.emulator import cloud_size
-from twin.calibrate.physics.fit import Estimate, Fit, PhysicsFitConfig, fit
-from twin.calibrate.physics.incline import pybullet_friction
+from twin.calibrate.physics.fit import Estimate, Fit, fit
 from twin.calibrate.physics.parameters import (
     BIAS,
     FINGER_FRICTION,
@@ -39,79 +32,6 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.scene.store.calibration import write_physics
 
-DELAYS_S = np.arange(101) * 0.005
-FIRST_S = 3.0
-"""Later, controllers that wait for the gripper run behind the plan for other reasons."""
-MOVES_RAD = 0.05
-FEWEST = 3
-"""Episodes from which an interval can be given."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Delay:
-    """The delay over episodes, with a 95 % interval of its mean."""
-
-    value_s: float
-    low_s: float
-    high_s: float
-    num_episodes: int
-
-
-def delay_of(episode: Episode) -> float | None:
-    """Shift that lays the recorded joints best over those of the executed plan [s].
-
-    None where the plan has no joints of its own, was not executed, or hardly moves.
-    """
-    for _, plan in streams.plans(episode):
-        interval = streams.executed_interval_ns(episode, plan.id)
-        if interval is None or any(item.joints_rad is None for item in plan.tau):
-            continue
-        track = streams.joint_track(episode)
-        names = streams.recorded_robot(episode).joints
-        if set(names) - set(track.names):
-            return None
-        told = np.array([item.joints_rad for item in plan.tau], dtype=np.float64)
-        end_s = min((interval[1] - interval[0]) * 1e-9, FIRST_S)
-        times_s = np.arange(0.0, end_s, 0.008)
-        stamps = interval[0] + np.rint(times_s * 1e9).astype(np.int64)
-        seen = track.at(stamps)[:, [track.names.index(name) for name in names]]
-        return best_shift_s(plan.times_ns() * 1e-9, told, times_s, seen)
-    return None
-
-
-def best_shift_s(
-    told_s: Float[np.ndarray, " num_waypoints"],
-    told_rad: Float[np.ndarray, "num_waypoints num_joints"],
-    seen_s: Float[np.ndarray, " num_samples"],
-    seen_rad: Float[np.ndarray, "num_samples num_joints"],
-) -> float | None:
-    """Delay with the least squared distance between two tracks; None when nothing moves.
-
-    Args:
-        told_s: When the waypoints were to be reached.
-        told_rad: The joints of the waypoints.
-        seen_s: When joints were recorded, from the same zero.
-        seen_rad: The joints that were recorded.
-    """
-    if len(seen_s) < 2 or float(np.ptp(seen_rad, axis=0).max()) < MOVES_RAD:
-        return None
-
-    asked = seen_s[None, :] - DELAYS_S[:, None]
-    told = np.stack([np.interp(asked, told_s, column) for column in told_rad.T], axis=2)
-    costs = np.mean((told - seen_rad) ** 2, axis=(1, 2))
-    return lag_between_steps(costs, DELAYS_S)
-
-
-def mean_delay(delays_s: list[float]) -> Delay | None:
-    """Mean of several episodes; None with too few for an interval."""
-    if len(delays_s) < FEWEST:
-        return None
-    values = np.array(delays_s)
-    mean = float(values.mean())
-    half = float(student.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
-    return Delay(value_s=mean, low_s=mean - half, high_s=mean + half, num_episodes=len(values))
-
-
 FIELDS = {
     FINGER_FRICTION: "finger_friction",
     SURFACE_FRICTION: "surface_friction",
@@ -125,7 +45,6 @@ def physics_record(
     found: Fit,
     cases: Sequence[Case],
     config: PhysicsConfig,
-    delay: Delay | None,
     skipped: Mapping[str, str],
 ) -> dict[str, Any]:
     """The ``physics`` part of ``calibration.json``.
@@ -137,7 +56,6 @@ def physics_record(
         found: What the fit gave.
         cases: What it was fitted to, in the order its split refers to.
         config: Nominal physics; identified frictions are shares of its ``object_friction``.
-        delay: Between commands and motion; None: it was not measured.
         skipped: Why episodes were not used, by id.
     """
     by_name = {item.parameter.name: item for item in found.estimates}
@@ -149,8 +67,6 @@ def physics_record(
         "pose_bias": _others(by_name, BIAS, promoted=found.promoted),
         "masses": _others(by_name, (MASS_SCALE,), promoted=found.promoted),
         "parameters": {name: _parameter(item) for name, item in by_name.items()},
-        "command_delay_s": _delay_record(delay),
-        "effective_friction": _effective(by_name, config) if found.promoted else {},
         "held_out": {
             "episodes": [cases[index].episode for index in found.split.held_out],
             "nominal": found.nominal.to_record(),
@@ -208,29 +124,6 @@ def _parameter(item: Estimate) -> dict[str, Any]:
     }
 
 
-def _delay_record(delay: Delay | None) -> dict[str, Any]:
-    if delay is None:
-        return {"identified": False, "why": "fewer than 3 executed plans with joints of their own"}
-    return {
-        "identified": True,
-        "value": delay.value_s,
-        "low": delay.low_s,
-        "high": delay.high_s,
-        "num_episodes": delay.num_episodes,
-        "why": "recorded joints laid over the commanded ones",
-    }
-
-
-def _effective(by_name: Mapping[str, Estimate], config: PhysicsConfig) -> dict[str, float]:
-    """What the engine makes of the found coefficients, by the incline test."""
-    own = config.object_friction
-    return {
-        name: pybullet_friction(own, by_name[name].value / own, config)
-        for name in (FINGER_FRICTION, SURFACE_FRICTION)
-        if name in by_name and by_name[name].identified
-    }
-
-
 def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
     """Say in a line per parameter what was found.
 
@@ -252,13 +145,6 @@ def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
             f"  {name:<22} {item['value']:>8.4g} [{item['low']:.4g}, {item['high']:.4g}] "
             f"{item['unit']:<3} {word}: {item['why']}"
         )
-    delay = record["command_delay_s"]
-    told = (
-        f"{delay['value']:>8.4g} [{delay['low']:.4g}, {delay['high']:.4g}] s   identified"
-        if delay["identified"]
-        else "         not identified"
-    )
-    lines.append(f"  {'command_delay_s':<22} {told}: {delay['why']}")
     errors = record["errors"]
     own = ", ".join(f"{kind} {size * 1e3:.2g} mm" for kind, size in errors["pose_m"].items())
     lines.append(
@@ -286,7 +172,7 @@ def calibrate_physics(
 
     Args:
         run: Whose probes and trials are read, and in whose scene folder the calibration goes.
-        config: Evaluations, time budget, samples, workers and seed.
+        config: Evaluations, time budget, workers and seed.
         output: Shows progress.
 
     Returns:
@@ -301,9 +187,6 @@ def calibrate_physics(
     physics = PhysicsConfig()
     parameters = rigid_parameters(physics)
     total = config.evaluations + 2 * cloud_size(len(parameters))
-    settings = PhysicsFitConfig(
-        evaluations=config.evaluations, budget_s=config.budget_s, seed=config.seed
-    )
     output.say(
         f"{len(cases)} episodes: "
         + ", ".join(
@@ -313,28 +196,14 @@ def calibrate_physics(
     )
     workers = config.workers or default_size()
     with (
-        Evaluator(
-            cases, parameters, physics, num_samples=config.samples, workers=workers
-        ) as evaluator,
+        Evaluator(cases, parameters, physics, workers=workers) as evaluator,
         output.progress("physics", total) as advance,
     ):
         found = fit(
             evaluator,
             parameters,
-            settings,
+            config,
             advance=lambda done, note: advance(min(done, total), note),
         )
-    record = physics_record(found, cases, physics, _measured_delay(run), skipped)
+    record = physics_record(found, cases, physics, skipped)
     return record, str(write_physics(run, record)["calibration_id"])
-
-
-def _measured_delay(run: RunFolder) -> Delay | None:
-    delays = []
-    for path in run.episodes():
-        try:
-            found = delay_of(Episode.open(path))
-        except GstError:
-            continue
-        if found is not None:
-            delays.append(found)
-    return mean_delay(delays)

@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from bridge.process_pool import Failed, ProcessPool
 from bridge.robots.robot import robot_of
-from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from twin.calibrate.physics.cases import Case, Prediction, planar
 from twin.calibrate.physics.parameters import (
     BIAS,
@@ -33,46 +32,17 @@ SETTLE_S = 0.6
 """The robot stands still for this long before the final state is read, or until all lies still."""
 REST_S, REST = 0.05, 2e-5
 """Whatever moves or turns by less [m and quaternion] in this time lies still."""
-TAIL_HZ = 60
-SAMPLE_STREAM = 606
 
 
-def predict(
-    case: Case, values: Mapping[str, float], config: PhysicsConfig, num_samples: int
-) -> Prediction:
-    """Say what a case would have shown if the parameters were these.
-
-    The nominal start gives settled poses and widths. For a trial that was judged, noisy starts, the
-    same for all parameters (common random numbers), give the share that succeeds.
+def predict(case: Case, values: Mapping[str, float], config: PhysicsConfig) -> Prediction:
+    """Say what a case would have shown if the parameters were these: settled poses and widths.
 
     Args:
         case: What the robot did, and where the objects were.
         values: By name; what is missing counts as nominal.
         config: Everything that is not a parameter.
-        num_samples: Noisy starts of a judged trial.
     """
     physics = apply_values(values, config)
-    nominal = _simulated(case, values, physics, np.zeros((len(case.objects), 3)))
-    success = float("nan")
-    if case.success is not None and num_samples > 0:
-        seed = int(case.sha256[:15] or "0", 16)
-        rng = np.random.default_rng([SAMPLE_STREAM, seed])
-        results = []
-        for _ in range(num_samples):
-            noise = np.stack(
-                [rng.multivariate_normal(np.zeros(3), C) for C in case.start_covariance]
-            )
-            results.append(_simulated(case, values, physics, noise).success)
-        success = float(np.mean(results))
-    return Prediction(settled=nominal.settled, held_widths_m=nominal.held_widths_m, success=success)
-
-
-def _simulated(
-    case: Case,
-    values: Mapping[str, float],
-    physics: PhysicsConfig,
-    noise: Float[np.ndarray, "num_objects 3"],
-) -> Prediction:
     rate = physics.rate_hz
     steps = int(np.ceil(case.stretches_s[-1, 1] * rate))
     times_s = np.arange(steps + 1) / rate
@@ -89,7 +59,7 @@ def _simulated(
         key: shifted(T, bias) for key, T in case.Ts_base_start.items() if key not in case.objects
     }
     with World(gripper_only(case.urdf), {}, physics) as world:
-        _spawn(world, case, values, statics, bias + noise)
+        _spawn(world, case, values, statics, bias)
         for begin_s, end_s in case.stretches_s:
             first, last = int(begin_s * rate), min(int(np.ceil(end_s * rate)), steps)
             world.reset_robot(targets[first], float(widths[first]))
@@ -98,12 +68,11 @@ def _simulated(
                 world.step()
                 if step in holds:
                     held[step] = world.robot.width_m()
-        success = _settle(world, case, statics, targets[-1], float(widths[-1]))
+        _settle(world, case, targets[-1], float(widths[-1]))
         settled = np.stack([planar(world.T_base_object(key)) for key in case.objects])
     return Prediction(
         settled=settled - bias,
         held_widths_m=np.array([held[int(step)] for step in holds], dtype=np.float64),
-        success=success,
     )
 
 
@@ -112,12 +81,12 @@ def _spawn(
     case: Case,
     values: Mapping[str, float],
     statics: Mapping[str, Float[np.ndarray, "4 4"]],
-    shifts: Float[np.ndarray, "num_objects 3"],
+    shift: Float[np.ndarray, "3"],
 ) -> None:
     world.add_table(0.0)
     for key, T in statics.items():
         world.add_static(case.task.objects[key].panels(), T)
-    for key, shift in zip(case.objects, shifts, strict=True):
+    for key in case.objects:
         model = case.task.objects[key]
         mass_kg = model.mass_kg * values.get(MASS_SCALE, 1.0)
         world.add_free(
@@ -126,41 +95,20 @@ def _spawn(
 
 
 def _settle(
-    world: World,
-    case: Case,
-    statics: Mapping[str, Float[np.ndarray, "4 4"]],
-    joints_rad: Float[np.ndarray, " num_joints"],
-    width_m: float,
-) -> float:
-    """Let things come to rest, and say whether the task's goal holds then."""
+    world: World, case: Case, joints_rad: Float[np.ndarray, " num_joints"], width_m: float
+) -> None:
+    """Let things come to rest."""
     rate = world.config.rate_hz
-    stamps: list[int] = []
-    poses: dict[str, list[Float[np.ndarray, "4 4"]]] = {key: [] for key in case.objects}
-    touches: dict[str, list[bool]] = {key: [] for key in case.objects}
     at_rest = np.zeros(len(joints_rad))
     before: Float[np.ndarray, "num_objects 7"] | None = None
     for step in range(round(SETTLE_S * rate)):
         world.robot.command(joints_rad, at_rest, width_m)
         world.step()
-        if case.success is None and step % round(REST_S * rate) == 0:
+        if step % round(REST_S * rate) == 0:
             now = np.array([world.object_pose(key) for key in case.objects])
             if before is not None and np.abs(now - before).max() < REST:
                 break
             before = now
-        if case.success is not None and step % (rate // TAIL_HZ) == 0:
-            stamps.append(round(step * 1e9 / rate))
-            for key in case.objects:
-                poses[key].append(world.T_base_object(key))
-                touches[key].append(world.finger_touches(key))
-    if case.success is None:
-        return float("nan")
-    fixed = {key: np.repeat(T[None], len(stamps), axis=0) for key, T in statics.items()}
-    rollout = Rollout(
-        stamps_ns=np.array(stamps, dtype=np.int64),
-        Ts_base_object={**{key: np.array(Ts) for key, Ts in poses.items()}, **fixed},
-        finger_contact={key: np.array(rows, dtype=bool) for key, rows in touches.items()},
-    )
-    return float(all_hold(evaluate_success(case.task, rollout)) is True)
 
 
 @lru_cache(maxsize=4)
@@ -175,7 +123,7 @@ def gripper_only(urdf: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig, int]
+Piece = tuple[int, Case, Mapping[str, float], PhysicsConfig]
 """Its number, and what ``predict`` takes."""
 
 
@@ -192,7 +140,6 @@ class Evaluator:
         parameters: Sequence[PhysicsParameter],
         config: PhysicsConfig,
         *,
-        num_samples: int,
         workers: int = 1,
     ) -> None:
         """Have processes ready, where there is more than one.
@@ -201,13 +148,11 @@ class Evaluator:
             cases: Everything that will be asked for.
             parameters: What the numbers of a point mean.
             config: Everything that is not a parameter.
-            num_samples: Noisy starts of each judged trial.
             workers: Processes.
         """
         self.cases = list(cases)
         self._parameters = list(parameters)
         self._config = config
-        self.num_samples = num_samples
         self._pool = ProcessPool(workers) if workers > 1 else None
 
     def predict(
@@ -233,7 +178,7 @@ class Evaluator:
 
     def _piece(self, number: int, x: Float[np.ndarray, " num_parameters"], index: int) -> Piece:
         values = values_of(self._parameters, x)
-        return number, self.cases[index], values, self._config, self.num_samples
+        return number, self.cases[index], values, self._config
 
     def __enter__(self) -> "Evaluator":
         """Use as a context manager."""
@@ -270,12 +215,11 @@ def _error_of(case: Case, failed: Failed) -> Exception:
     )
 
 
-def _cost(piece: Piece) -> float:
-    """Count the simulations."""
-    _, case, _, _, num_samples = piece
-    return 1.0 if case.success is None else 1.0 + num_samples
+def _cost(_: Piece) -> float:
+    """All take about as long."""
+    return 1.0
 
 
 def _predict(piece: Piece) -> Prediction:
-    _, case, values, config, num_samples = piece
-    return predict(case, values, config, num_samples)
+    _, case, values, config = piece
+    return predict(case, values, config)

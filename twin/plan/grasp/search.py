@@ -20,7 +20,7 @@ from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
 from twin.plan.grasp.reach import ArmReach, Reached
 from twin.plan.problem import Grasp, Problem
-from twin.replay.config import VariationConfig
+from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
 CAUSES: Mapping[str, str] = {
     "cone": "no two surfaces face each other within the friction cone",
@@ -284,8 +284,7 @@ class GraspSearcher:
         known = self.problem.scene.covariances.get(object_id)
         if known is not None:
             return known
-        prior = VariationConfig()
-        sigma = [prior.unknown_pose_m] * 3 + [prior.unknown_pose_rad] * 3
+        sigma = [UNKNOWN_POSE_M] * 3 + [UNKNOWN_POSE_RAD] * 3
         return np.diag(np.square(sigma))
 
     def _surface(self, object_id: str) -> SampledSurface:
@@ -484,7 +483,7 @@ class GraspSearcher:
         scene = self.problem.scene
         remarks = [f"surface: {self.problem.shapes[object_id].source}"]
         if object_id not in scene.covariances:
-            sigma_m = VariationConfig().unknown_pose_m
+            sigma_m = UNKNOWN_POSE_M
             remarks.append(f"nobody says how sure its pose is: {sigma_m * 1e3:.0f} mm assumed")
         if hand.open_m < self.max_width_m:
             remarks.append(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, SteeredBy, Waypoint
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
@@ -19,9 +20,15 @@ ALIKE_M = 0.01
 ALIKE_RAD = np.radians(10.0)
 """Two grasps or releases nearer than both are one."""
 
-_BRANCH = ("unreachable", "joints_disagree", "joint_limit", "joint_jump", "self_collision")
-_SQUEEZED = ("exploded", "shape", "slipped", "probability")
-_IN_OBJECT = ("deep_contact", "pre_grasp_penetration")
+_BRANCH = (
+    Cause.UNREACHABLE,
+    Cause.JOINTS_DISAGREE,
+    Cause.JOINT_LIMIT,
+    Cause.JOINT_JUMP,
+    Cause.SELF_COLLISION,
+)
+_SQUEEZED = (Cause.EXPLODED, Cause.SHAPE, Cause.PROBABILITY)
+_IN_OBJECT = (Cause.DEEP_CONTACT, Cause.PRE_GRASP_PENETRATION)
 
 
 @dataclass(frozen=True, kw_only=True)

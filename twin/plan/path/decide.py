@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
 from bridge.task.verdict import Factor, Verdict
 from twin.plan.path.world import Carried
 from twin.plan.problem import Problem, TimedPath
 from twin.replay.audit import audit
 from twin.replay.clearance.bodies import own_links
-from twin.replay.clearance.monitor import Allowed, ClearanceMonitor
+from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
 from twin.replay.result import ReplayResult
 from twin.robot.collision import hulls_of
@@ -119,7 +120,7 @@ def decide(
                 )
             )
             break
-    limits = {"deep_contact": -config.max_contact_depth_m}
+    limits: dict[str, float] = {Cause.DEEP_CONTACT: -MAX_CONTACT_DEPTH_M}
     refusals += [
         PathRefusal(
             bodies=(failure.bodies[0], failure.bodies[1]),

@@ -21,6 +21,7 @@ from twin.plan.path.world import SPARE_M, Carried, World, build_world
 from twin.plan.problem import Problem, TimedPath
 from twin.replay.clearance.monitor import Allowed
 from twin.replay.config import ReplayConfig
+from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.model import RobotModel
 
@@ -381,7 +382,7 @@ def _straight_knots(
             for share in shares
         ]
     )
-    followed = follow_poses(robot, Ts, start_rad=start_rad, config=config.replay.ik)
+    followed = follow_poses(robot, Ts, start_rad=start_rad, config=IkConfig())
     if not followed.reached.all():
         share = shares[int(np.argmin(followed.reached))]
         detail = f"no joints reach the pose at {share * way_m * 1e3:.0f} of {way_m * 1e3:.0f} mm"

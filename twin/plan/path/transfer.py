@@ -102,9 +102,7 @@ def plan_transfer(
     taken = transfer.take(start_rad)
     lifted_rad = taken[-1].movement.path.joints_rad[-1]
     failure = NoPathError(reason="unreachable", detail="no joints reach the release pose")
-    for joints_rad in nearest_solutions(
-        problem.robot, release.T_base_tcp, lifted_rad, config.replay.ik
-    ):
+    for joints_rad in nearest_solutions(problem.robot, release.T_base_tcp, lifted_rad, IkConfig()):
         try:
             return (*taken, *transfer.put(lifted_rad, joints_rad))
         except NoPathError as error:

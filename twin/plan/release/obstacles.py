@@ -14,13 +14,9 @@ from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
 from twin.plan.problem import Problem
+from twin.plan.release.distances import Boxes, candidate_clearance, lower_by_grid
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
-from twin.replay.clearance.distance_grid import (
-    Boxes,
-    GridLookup,
-    candidate_clearance,
-    lower_by_grid,
-)
+from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.static_obstacles import (
     PanelBox,
     stationary_links,

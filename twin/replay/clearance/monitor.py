@@ -18,12 +18,13 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from bridge.robots.robot import Gripper
+from bridge.task.causes import Cause
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.plan import Plan, Stage
 from bridge.task.predicate import Contact
 from twin.replay.clearance.bodies import GRIPPER, names_of, placement_of, planes_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
-from twin.replay.config import ReplayConfig
+from twin.replay.config import MOVED_M, ReplayConfig
 from twin.replay.failure import Failure
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, signed_distance
@@ -34,6 +35,11 @@ from twin.robot.model import RobotModel
 # of them. Two bodies that were d0 and d1 apart and travelled s together therefore kept at least
 # (d0 + d1 - s) / 2. Where that is not enough, the state half way is looked at, and so on.
 
+MAX_CONTACT_DEPTH_M = 0.005
+"""Bodies that may touch may not lie deeper in each other than this [m]."""
+PRE_GRASP_DEPTH_M, PRE_GRASP_SOFT_DEPTH_M = 0.002, 0.004
+"""Deepest overlap with an object before the first grasp that localisation may explain [m]; soft
+ones give way. A finger is 12 mm thick: what it is pushed into lies at most 6 mm deep in it."""
 MAX_LEAP_M = 0.05
 """An object that is this far away at the next state did not move there: something else became
 known of it. Nothing is said of its way."""
@@ -311,7 +317,7 @@ class ClearanceMonitor:
                 # Objects push each other and the fingers; only what stands still can be run into.
                 if piece < 0 or other in objects_m:
                     continue
-                limit = -self.config.max_contact_depth_m
+                limit = -MAX_CONTACT_DEPTH_M
             known = first < limit or last < limit  # judged at that state already
             if not known and first + last - travel < 2 * limit:
                 return True
@@ -349,9 +355,9 @@ class ClearanceMonitor:
         for name, T in self._scene.movable().items():
             model = self._scene.task.objects[name]
             solid = self._objects[name]
-            limit_m = self.config.pre_grasp_depth_m
+            limit_m = PRE_GRASP_DEPTH_M
             if model.soft is not None:  # it gives way, and is localised less exactly
-                limit_m = self.config.pre_grasp_soft_depth_m
+                limit_m = PRE_GRASP_SOFT_DEPTH_M
             away = np.linalg.norm(centres - se3.apply(T, solid.centre), axis=1)
             for index in np.flatnonzero(away <= self._radii + solid.radius_m).tolist():
                 link = self._links[index]
@@ -365,7 +371,7 @@ class ClearanceMonitor:
                     )
                 )
                 if distance < -limit_m:
-                    self._fail(t_ns, "pre_grasp_penetration", link.body, name, distance)
+                    self._fail(t_ns, Cause.PRE_GRASP_PENETRATION, link.body, name, distance)
 
     def contacts(self) -> list[Contact]:
         """Stretches of time in which two bodies were closer than the margin."""
@@ -391,13 +397,13 @@ class ClearanceMonitor:
 
     def _has_moved(self, name: str, T: Float[np.ndarray, "4 4"]) -> bool:
         start = self._scene.Ts_base_object[name]
-        return hypot(*(T[:3, 3] - start[:3, 3]).tolist()) > self.config.moved_m
+        return hypot(*(T[:3, 3] - start[:3, 3]).tolist()) > MOVED_M
 
     def _nodes_have_moved(self, name: str, nodes: Float[np.ndarray, "num_nodes 3"]) -> bool:
         """Against where the body had come to rest, because it sags when it is put down."""
         centre = nodes.mean(axis=0)
         start = self._first_centre.setdefault(name, centre)
-        return bool(np.linalg.norm(centre - start) > self.config.moved_m)
+        return bool(np.linalg.norm(centre - start) > MOVED_M)
 
     def _allowed_at(self, t_ns: int) -> Allowed:
         """As ``allowed_pairs``, worked out once for each stage."""
@@ -415,14 +421,15 @@ class ClearanceMonitor:
             # An object that drops may lie deep for one step: the solver's doing, not the plan's.
             # Neither is a finger among the nodes of a soft body that it squeezes as it may.
             solid = body not in self._objects and other not in self._scene.task.soft_objects
-            if distance < -self.config.max_contact_depth_m and solid:
-                self._fail(t_ns, "deep_contact", body, other, distance)
+            if distance < -MAX_CONTACT_DEPTH_M and solid:
+                self._fail(t_ns, Cause.DEEP_CONTACT, body, other, distance)
             return np.inf
         if distance < self.config.eps_col_m:
-            self._fail(t_ns, "collision" if distance < 0 else "too_close", body, other, distance)
+            cause = Cause.COLLISION if distance < 0 else Cause.TOO_CLOSE
+            self._fail(t_ns, cause, body, other, distance)
         return distance
 
-    def _fail(self, t_ns: int, cause: str, body: str, other: str, distance: float) -> None:
+    def _fail(self, t_ns: int, cause: Cause, body: str, other: str, distance: float) -> None:
         if any(failure.cause == cause for failure in self.failures):
             return
         if distance < 0:

@@ -19,7 +19,7 @@ SIGMA_M, SIGMA_RAD, SIGMA_WIDTH_M = 0.001, 0.01, 0.0003
 START = np.array([0.5, -0.1, 0.2])
 
 
-def make_case(kind: str, number: int, *, num_holds: int = 0, success: bool | None = None) -> Case:
+def make_case(kind: str, number: int, *, num_holds: int = 0) -> Case:
     """A case in which nothing is seen yet."""
     covariance = np.diag([SIGMA_M**2, SIGMA_M**2, SIGMA_RAD**2])[None]
     none = np.zeros((1, 3, 3))
@@ -42,14 +42,11 @@ def make_case(kind: str, number: int, *, num_holds: int = 0, success: bool | Non
         turn_period_rad=np.array([np.pi / 2]),
         hold_times_s=np.zeros(num_holds),
         held_widths_m=np.zeros(num_holds),
-        success=success,
     )
 
 
 class Formulas:
     """Lives cases through in microseconds: a predictor as ``fit`` asks for."""
-
-    num_samples = 0
 
     def __init__(self, cases: Sequence[Case], parameters: Sequence[PhysicsParameter]) -> None:
         """Know the cases and what the numbers of a point mean."""
@@ -71,7 +68,6 @@ class Formulas:
         return Prediction(
             settled=pose[None],
             held_widths_m=np.full(len(case.hold_times_s), width),
-            success=float("nan"),
         )
 
 

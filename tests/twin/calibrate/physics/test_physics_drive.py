@@ -15,9 +15,10 @@ from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.probes import plan_probe
 from bridge.task.plan import Plan
 from bridge.task.task_file import load_task
+from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics import simulate
 from twin.calibrate.physics.cases import Case, Prediction, planar
-from twin.calibrate.physics.fit import PhysicsFitConfig, fit
+from twin.calibrate.physics.fit import fit
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     SURFACE_FRICTION,
@@ -86,7 +87,6 @@ def case_of(kind: str, T: np.ndarray, number: int = 0) -> Case:
         turn_period_rad=np.array([np.pi / 2]),
         hold_times_s=holds,
         held_widths_m=np.zeros(len(holds)),
-        success=None,
     )
 
 
@@ -101,7 +101,7 @@ def squeeze() -> Case:
 
 
 def told(case: Case, **values: float) -> Prediction:
-    return predict(case, values, CONFIG, 0)
+    return predict(case, values, CONFIG)
 
 
 def test_twice_the_friction_halves_how_far_a_pushed_object_slides_on(slide: Case) -> None:
@@ -161,11 +161,11 @@ def test_friction_of_simulated_slides_is_recovered_within_its_interval_in_proces
     cases = []
     for number, yaw in enumerate((0.3, -0.4, 0.1)):
         case = case_of("slide", cube_at(0.48, -0.1, yaw), number)
-        seen = predict(case, {SURFACE_FRICTION: 0.45}, CONFIG, 0)
+        seen = predict(case, {SURFACE_FRICTION: 0.45}, CONFIG)
         noise = rng.standard_normal((1, 3)) * [0.001, 0.001, 0.01]
         cases.append(Case(**{**vars(case), "settled": seen.settled + noise}))
-    with Evaluator(cases, some, CONFIG, num_samples=0, workers=2) as evaluator:
-        found = fit(evaluator, some, PhysicsFitConfig(evaluations=8))
+    with Evaluator(cases, some, CONFIG, workers=2) as evaluator:
+        found = fit(evaluator, some, CalibrateConfig(evaluations=8))
         (pooled,) = evaluator.predict(np.zeros((1, 1)), [0])
     (item,) = found.estimates
     assert item.identified
@@ -188,8 +188,8 @@ def test_a_process_that_is_killed_while_it_simulates_costs_nothing(slide: Case) 
     parameters = rigid_parameters(CONFIG)
     points = np.zeros((12, len(parameters)))
     points[:, 0] = np.linspace(-1, 1, len(points))
-    alone = Evaluator([slide], parameters, CONFIG, num_samples=0).predict(points, [0])
-    with Evaluator([slide], parameters, CONFIG, num_samples=0, workers=2) as evaluator:
+    alone = Evaluator([slide], parameters, CONFIG).predict(points, [0])
+    with Evaluator([slide], parameters, CONFIG, workers=2) as evaluator:
         evaluator.predict(points[:2], [0])
         assert evaluator._pool is not None
         first, second = [worker.pid for worker in evaluator._pool.workers]
@@ -210,7 +210,7 @@ def test_a_case_no_process_survives_ends_a_calibration_with_a_sentence(
     """Memory runs out each time, say."""
     monkeypatch.setattr(simulate, "_predict", _die)
     with (
-        Evaluator([slide], rigid_parameters(CONFIG), CONFIG, num_samples=0, workers=2) as evaluator,
+        Evaluator([slide], rigid_parameters(CONFIG), CONFIG, workers=2) as evaluator,
         pytest.raises(LostPieceError, match=r"SIGKILL.*2 times\. Nothing.*fewer --workers"),
     ):
         evaluator.predict(np.zeros((1, 7)), [0])

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.cases import Case
-from twin.calibrate.physics.fit import Fit, PhysicsFitConfig, fit, split_cases
+from twin.calibrate.physics.fit import Fit, fit, split_cases
 from twin.calibrate.physics.parameters import (
     FINGER_FRICTION,
     MASS_SCALE,
@@ -27,7 +28,7 @@ ALL = tuple(
     if item.name in (SURFACE_FRICTION, FINGER_FRICTION, MASS_SCALE, "bias_x_m")
 )
 PROBES = ("push", "slide", "squeeze") * 4
-QUICK = PhysicsFitConfig(evaluations=40)
+QUICK = CalibrateConfig(evaluations=40)
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # the first fit, made for all, is checked
 
@@ -109,7 +110,7 @@ def test_a_search_that_ran_out_of_time_says_so(fitted: Fit) -> None:
     assert fitted.cut_short == ""
     some = tuple(item for item in ALL if item.name == SURFACE_FRICTION)
     cases = synthetic.observe(("push", "slide") * 4, some, np.zeros(1), seed=1)
-    found = fit(cases, some, PhysicsFitConfig(evaluations=20, budget_s=0.0))
+    found = fit(cases, some, CalibrateConfig(evaluations=20, budget_s=0.0))
     assert found.cut_short == "the time limit of 0 s struck after 1 of 20 points"
 
 
@@ -141,7 +142,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         found = fit(
             synthetic.observe(("push", "slide") * 4, some, x, seed=100 + seed),
             some,
-            PhysicsFitConfig(evaluations=20, seed=seed),
+            CalibrateConfig(evaluations=20, seed=seed),
         )
         for item, u in zip(found.estimates, x, strict=True):
             inside += item.low <= item.parameter.value(u) <= item.high

@@ -40,8 +40,8 @@ def seen(**changes: object) -> Case:
     return Case(**{**vars(synthetic.make_case("squeeze", 0, num_holds=1)), **changes})
 
 
-def predicted(pose: np.ndarray, width_m: float = 0.04, success: float = np.nan) -> Prediction:
-    return Prediction(settled=pose[None], held_widths_m=np.array([width_m]), success=success)
+def predicted(pose: np.ndarray, width_m: float = 0.04) -> Prediction:
+    return Prediction(settled=pose[None], held_widths_m=np.array([width_m]))
 
 
 def weights(sizes_m: tuple[float, ...]) -> np.ndarray:
@@ -58,9 +58,9 @@ def test_poses_and_widths_follow_mixtures_of_the_t_distributions_of_scipy(
     widths = np.full(3 - axes, 0.0407)
     case = seen(settled=GOOD[None], hold_times_s=np.zeros(3 - axes), held_widths_m=widths)
     pose = np.array([0.502, -0.101, 0.23])
-    observed = observations_of([case], 0)
+    observed = observations_of([case])
     scales = scales_of(observed, np.full(3 + len(widths), own_sigma**2))
-    said = Prediction(settled=pose[None], held_widths_m=0 * widths + 0.04, success=np.nan)
+    said = Prediction(settled=pose[None], held_widths_m=0 * widths + 0.04)
     found = score(observed, features_of([case], [said]), scales=scales)
     way = GOOD / np.linalg.norm(GOOD * [1.0, 1.0, LEVER_M])
     likelihood = 0.0
@@ -104,7 +104,7 @@ def test_one_jam_at_another_place_does_not_make_the_others_less_sure() -> None:
     def drop(*extra_m: float) -> float:
         widths = np.array([0.0470, 0.0472, 0.0468, 0.0471, *extra_m])
         cases = [seen(hold_times_s=np.zeros(1), held_widths_m=np.array([w])) for w in widths]
-        observed = observations_of(cases, 0)
+        observed = observations_of(cases)
         rows = [
             score(observed, features_of(cases, [predicted(np.zeros(3), at)] * len(cases)))
             for at in (0.0470, 0.0500)
@@ -143,8 +143,8 @@ def scattered(
 
 
 def worth(cases: list[Case], pose: np.ndarray, prior: DiscrepancyPosterior | None = None) -> Score:
-    said = Prediction(settled=pose[None], held_widths_m=np.zeros(0), success=np.nan)
-    return score(observations_of(cases, 0), features_of(cases, [said] * len(cases)), prior=prior)
+    said = Prediction(settled=pose[None], held_widths_m=np.zeros(0))
+    return score(observations_of(cases), features_of(cases, [said] * len(cases)), prior=prior)
 
 
 def test_what_some_episodes_teach_of_errors_is_taken_to_the_next_by_the_rule_of_bayes() -> None:
@@ -182,12 +182,9 @@ def test_how_fingers_jam_on_an_object_is_counted_once() -> None:
     turned = GOOD + np.array([0.0, 0.0, 0.1])
 
     def loss(case: Case) -> float:
-        observed = observations_of([case], 0)
+        observed = observations_of([case])
         width = np.full(len(case.hold_times_s), 0.04)
-        told = [
-            Prediction(settled=pose[None], held_widths_m=width, success=np.nan)
-            for pose in (GOOD, turned)
-        ]
+        told = [Prediction(settled=pose[None], held_widths_m=width) for pose in (GOOD, turned)]
         good, off = (score(observed, features_of([case], [item])).log_likelihood for item in told)
         return good - off
 
@@ -207,7 +204,7 @@ def test_each_kind_of_episode_has_a_discrepancy_of_its_own() -> None:
 
 def test_turns_that_look_the_same_are_the_same() -> None:
     case = seen(settled=np.array([[0.5, -0.1, 0.75]]))
-    observed = observations_of([case], 0)
+    observed = observations_of([case])
     values = [
         score(
             observed,
@@ -220,7 +217,7 @@ def test_turns_that_look_the_same_are_the_same() -> None:
 
 def test_one_miss_does_not_outweigh_the_rest() -> None:
     cases = [seen(settled=np.array([[0.5, -0.1, 0.2]])) for _ in range(8)]
-    observed = observations_of(cases, 0)
+    observed = observations_of(cases)
     good = np.array([0.5, -0.1, 0.2])
     missed = np.array([0.9, -0.1, 0.2])
     near = [predicted(good + np.array([0.0005, 0, 0])) for _ in range(7)]
@@ -230,24 +227,11 @@ def test_one_miss_does_not_outweigh_the_rest() -> None:
     assert one_miss.log_likelihood > all_off.log_likelihood
 
 
-def test_a_coin_counts_by_the_share_of_noisy_starts() -> None:
-    case = seen(success=True)
-    observed = observations_of([case], 4)
-    values = [
-        score(
-            observed, features_of([case], [predicted(case.settled[0], success=share)])
-        ).log_likelihood
-        for share in (0.0, 0.5, 1.0)
-    ]
-    assert values[0] < values[1] < values[2]
-    assert values[2] - values[0] == pytest.approx(np.log(0.9 / 0.1))
-
-
 def test_features_survive_the_way_through_one_row() -> None:
-    cases = [seen(success=True), seen()]
-    observed = observations_of(cases, 4)
+    cases = [seen(), seen()]
+    observed = observations_of(cases)
     features = features_of(
-        cases, [predicted(np.array([0.1, 0.2, 0.3]), 0.05, 0.5), predicted(np.zeros(3))]
+        cases, [predicted(np.array([0.1, 0.2, 0.3]), 0.05), predicted(np.zeros(3))]
     )
     back = unflatten(features.flat(), observed)
     for name in Features.__dataclass_fields__:

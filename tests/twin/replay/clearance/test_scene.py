@@ -10,9 +10,10 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
+from twin.plan.release.distances import candidate_clearance
 from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of
-from twin.replay.clearance.distance_grid import GridLookup, candidate_clearance
+from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance

@@ -13,8 +13,6 @@ from twin.replay.failure import NotEvaluatedError
 from twin.replay.scene import ReplayScene
 from twin.replay.verdict import replay_plan
 
-LIMIT_M = 0.006
-
 
 def with_cubes(script: SimpleNamespace, gap_m: float) -> ReplayScene:
     """Two cubes side by side along x, this far apart."""
@@ -29,7 +27,7 @@ def with_cubes(script: SimpleNamespace, gap_m: float) -> ReplayScene:
 
 def test_objects_apart_stay_where_they_are(script: SimpleNamespace) -> None:
     scene = with_cubes(script, 0.001)
-    free = free_start(scene, {}, LIMIT_M)
+    free = free_start(scene, {})
     for name, T in scene.Ts_base_object.items():
         assert np.array_equal(free.Ts_base_object[name], T)
 
@@ -37,7 +35,7 @@ def test_objects_apart_stay_where_they_are(script: SimpleNamespace) -> None:
 @pytest.mark.parametrize("depth_m", [0.001, 0.003, 0.0055])
 def test_a_small_overlap_is_parted_by_half_each(script: SimpleNamespace, depth_m: float) -> None:
     scene = with_cubes(script, -depth_m)
-    free = free_start(scene, {}, LIMIT_M)
+    free = free_start(scene, {})
     first, second = (free.Ts_base_object[name][:3, 3] for name in ("cube", "other"))
     assert second[0] - first[0] == pytest.approx(0.04, abs=6e-4)
     middle = 0.45 + 0.02 - depth_m / 2
@@ -47,7 +45,7 @@ def test_a_small_overlap_is_parted_by_half_each(script: SimpleNamespace, depth_m
 
 def test_a_large_overlap_is_refused_with_both_names_and_the_depth(script: SimpleNamespace) -> None:
     with pytest.raises(NotEvaluatedError, match=r"^not evaluated: cube starts 10 mm inside other"):
-        free_start(with_cubes(script, -0.01), {}, LIMIT_M)
+        free_start(with_cubes(script, -0.01), {})
 
 
 def test_a_container_does_not_give_way(script: SimpleNamespace) -> None:
@@ -57,7 +55,7 @@ def test_a_container_does_not_give_way(script: SimpleNamespace) -> None:
     wall = box[:3, 3] + np.array([model.size_m[0] / 2, 0.0, 0.03])
     T = se3.transform_from(np.array([1.0, 0, 0, 0]), wall + np.array([0.017, 0.0, 0.0]))
     scene = replace(scene, Ts_base_object={"box": box, "cube": T})
-    free = free_start(scene, {}, LIMIT_M)
+    free = free_start(scene, {})
     assert np.array_equal(free.Ts_base_object["box"], box)
     moved = free.Ts_base_object["cube"][0, 3] - T[0, 3]
     assert moved == pytest.approx(0.003, abs=6e-4)

@@ -1,15 +1,12 @@
 """Laws of a joint path: which jump is named, what is too fast, which width holds when."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bridge.episode.streams import JointTrack
 from bridge.robots.default import ARM_JOINTS, ROBOT
-from twin.replay.config import ReplayConfig
 from twin.replay.execution import cut_track
-from twin.replay.path import JointPath, jumps
+from twin.replay.path import MAX_JOINT_STEP_RAD, JointPath, jumps
 from twin.robot.model import RobotModel, load_robot
 
 STEP_NS = 8_000_000
@@ -29,11 +26,10 @@ def path_with(steps_rad: dict[tuple[int, int], float], count: int = 20) -> np.nd
 
 
 def test_of_several_jumps_the_first_is_named(robot: RobotModel) -> None:
-    config = ReplayConfig()
-    far = 2 * config.max_joint_step_rad
+    far = 2 * MAX_JOINT_STEP_RAD
     joints = path_with({(5, 4): far, (9, 1): -far, (14, 0): far})
     times = np.arange(len(joints), dtype=np.int64) * STEP_NS
-    for failure in jumps(times, joints, robot, config):
+    for failure in jumps(times, joints, robot):
         assert failure.t_ns == 4 * STEP_NS, "the instant before it jumps"
         assert failure.bodies == (ARM_JOINTS[4],)
 
@@ -44,11 +40,10 @@ def test_a_joint_is_too_fast_from_a_little_beyond_its_limit_on(
     robot: RobotModel, joint: int, share: float, fails: bool
 ) -> None:
     """Rounding may exceed a limit by a hundredth, a tenth is no rounding."""
-    config = replace(ReplayConfig(), max_joint_step_rad=10.0)
     step = share * robot.velocity_limit_rad_s[joint] * STEP_NS * 1e-9
     joints = path_with({(3, joint): -step})
     times = np.arange(len(joints), dtype=np.int64) * STEP_NS
-    assert [found.cause for found in jumps(times, joints, robot, config)] == (
+    assert [found.cause for found in jumps(times, joints, robot)] == (
         ["joint_speed"] if fails else []
     )
 

@@ -282,9 +282,9 @@ def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
     T_end[:3, :3] = T_end[:3, :3] @ se3.rotation_from_vector(np.array([0.02, 0.0, 0.0]))
     Ts = np.stack([T_start, T_end])
     plan = plan_through(Ts, step_s=0.4)
-    path, failures, unreachable = path_of_plan(plan, robot, ReplayConfig())
+    path, failures, unreachable = path_of_plan(plan, robot)
     assert unreachable is None
-    failures = failures + check_path(path, robot, hulls_of(robot), ReplayConfig())
+    failures = failures + check_path(path, robot, hulls_of(robot))
     causes = {failure.cause for failure in failures}
     assert causes & {"joint_jump", "joint_speed"}
     for failure in failures:
@@ -295,9 +295,9 @@ def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
 def test_a_plan_of_poses_keeps_its_branch_all_along() -> None:
     robot = load_robot(ROBOT.urdf_text())
     wanted = HOME + np.linspace(0, 1, 40)[:, None] * np.array([0.8, 0.2, -0.2, 0.1, 0.3, 0.5])
-    path, failures, _ = path_of_plan(plan_through(robot.Ts_base_tcp(wanted)), robot, ReplayConfig())
+    path, failures, _ = path_of_plan(plan_through(robot.Ts_base_tcp(wanted)), robot)
     assert not failures
-    assert not check_path(path, robot, hulls_of(robot), ReplayConfig())
+    assert not check_path(path, robot, hulls_of(robot))
     np.testing.assert_allclose(
         robot.Ts_base_tcp(path.joints_rad), robot.Ts_base_tcp(wanted), atol=1e-7
     )
@@ -308,12 +308,11 @@ def test_a_branch_that_touches_is_not_taken_where_another_is_free() -> None:
     robot = load_robot(ROBOT.urdf_text())
     wanted = HOME + np.linspace(0, 1, 10)[:, None] * np.array([0.3, 0.1, -0.1, 0.1, 0.1, 0.1])
     plan = plan_through(robot.Ts_base_tcp(wanted))
-    up, _, _ = path_of_plan(plan, robot, ReplayConfig())
+    up, _, _ = path_of_plan(plan, robot)
     sign = np.sign(up.joints_rad[0, 2])
     down, failures, _ = path_of_plan(
         plan,
         robot,
-        ReplayConfig(),
         clearance=lambda q: np.where(np.sign(q[:, 2]) == sign, -0.01, 0.01),
     )
     assert not failures
@@ -336,7 +335,7 @@ def test_every_failure_along_a_path_names_its_first_instant() -> None:
             width_m=np.array([0.08]),
             first_close_ns=None,
         )
-        found = check_path(path, robot, hulls, ReplayConfig())
+        found = check_path(path, robot, hulls)
         return {failure.cause: (failure.t_ns, failure.bodies) for failure in found}
 
     still = np.tile(HOME, (len(times), 1))

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -210,7 +210,7 @@ def test_each_rigid_mover_has_edges_and_weight_of_its_own_within_the_priors() ->
 
 def test_a_draw_of_boxes_survives_its_record_and_reaches_the_varied_start() -> None:
     (draw,) = draw_beforehand(1, rigid_movers(TASK))
-    assert PosteriorDraw.from_record(json.loads(json.dumps(draw.to_record()))) == draw
+    assert PosteriorDraw.from_record(json.loads(json.dumps(asdict(draw)))) == draw
     box = replace(draw.boxes[0], edge_share=0.25, centre_of_mass=(0.5, -0.25, 0.0))
     draw = replace(draw, boxes=(box,), weight=1.0)
     half = np.array(TASK.objects["block"].size_m) / 2
@@ -221,7 +221,7 @@ def test_a_draw_of_boxes_survives_its_record_and_reaches_the_varied_start() -> N
     assert varied.unseen["block"].edge_m == pytest.approx(0.25 * half.min())
     np.testing.assert_allclose(varied.unseen["block"].centre_of_mass_m, half * [0.5, -0.25, 0.0])
     assert start.unseen == {}
-    old = {key: value for key, value in draw.to_record().items() if key != "boxes"}
+    old = {key: value for key, value in asdict(draw).items() if key != "boxes"}
     assert PosteriorDraw.from_record(old).boxes == (), "a file from before: as even as then"
 
 
@@ -276,7 +276,7 @@ def test_without_a_posterior_the_interval_is_wilsons() -> None:
 
 def of_one_task(draws: Sequence[PosteriorDraw]) -> dict[str, object]:
     return {
-        "draws": [draw.to_record() for draw in draws],
+        "draws": [asdict(draw) for draw in draws],
         "effective_draws": float(len(draws)),
         "sources": {"trial_0001": trial(success=True).to_record()},
     }

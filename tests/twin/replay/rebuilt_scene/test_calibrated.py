@@ -18,7 +18,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
-from twin.replay.config import ReplayConfig
+from twin.replay.config import MASS_LOG, ReplayConfig
 from twin.replay.job import ReplayJob
 from twin.replay.monte_carlo import draw_variation, sample_rng
 from twin.replay.rebuilt_scene import (
@@ -107,7 +107,7 @@ def test_samples_are_drawn_around_what_was_found_and_as_widely_as_it_leaves_open
     masses = np.log([draw.objects["cube"].mass_kg for draw in draws])
     assert masses.mean() == pytest.approx(np.log(0.05 * 1.5), abs=0.03)
     assert masses.std() == pytest.approx(np.log(1.8 / 1.2) / 2 / 1.96, rel=0.15)
-    assert config.variation.mass_spread(soft=True) == ReplayConfig().variation.mass_log
+    assert config.variation.mass_spread(soft=True) == MASS_LOG
     assert "masses of rigid objects" not in draws[0].to_record(config)["physics"]
 
 

@@ -27,7 +27,7 @@ def test_an_episode_without_cameras_starts_from_nothing_and_says_why(tmp_path: P
         )
     episode = Episode.open(run.episodes_dir / "trial_0001.mcap")
     task = load_task("cube_into_box")
-    start = localised_starts(run, episode, task, scene_hash=None, force=False).at(10)
+    start = localised_starts(run, episode, task, scene_hash=None).at(10)
     assert not start.Ts_base_object
     assert set(start.reasons) == {"cube", "box"}
     assert all(start.reasons.values())

@@ -23,11 +23,11 @@ def runner(monkeypatch: pytest.MonkeyPatch, cpus: list[float]) -> RayRunner:
         return {"CPU": found} if found else {}
 
     made = RayRunner("head.lab:6379", 1)
-    task = SimpleNamespace(options=lambda **_: task, remote=lambda _, items, __: str(items))
+    task = SimpleNamespace(remote=lambda _, item, __: item)
     made._ray = SimpleNamespace(
         remote=lambda **_: lambda _: task,
         wait=wait,
-        get=lambda reference: ([reference], 0.1),
+        get=lambda reference: reference,
         cluster_resources=resources,
         exceptions=SimpleNamespace(RayError=RuntimeError),
         over=False,

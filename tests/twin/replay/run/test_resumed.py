@@ -223,7 +223,6 @@ def test_a_ray_cluster_makes_the_same_files(jobs: list[ReplayJob], tmp_path: Pat
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    # What shared a task with the deadly piece came back all the same.
     assert done.stdout.startswith("Ray lost it: ")
     assert done.stdout.endswith(", 2 times\n")
     rows = {row["plan"]: row for row in pickle.loads((tmp_path / "rows").read_bytes())}

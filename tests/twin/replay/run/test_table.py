@@ -88,11 +88,6 @@ def test_tasks_have_a_table_each() -> None:
     assert text.count("planned in twin   accepted") == 2
 
 
-def test_an_attached_grasp_is_counted_apart_and_named() -> None:
-    attached = row("a", "planned", True, engine="pybullet-1+attach")
-    assert list(count_verdicts([*ROWS, attached]))[-1] == "planned dynamic, attached grasp"
-
-
 def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
     rows = [
         row("a", "planned", None, reason="undecided: cube (hidden)"),

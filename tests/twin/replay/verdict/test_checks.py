@@ -22,8 +22,6 @@ from twin.replay.result import ReplayResult
 from twin.replay.verdict import REFUSED_BEFORE, replay_plan
 from twin.robot.model import load_robot
 
-EARLY = {"refuse_early": True}
-
 
 @pytest.fixture(scope="module")
 def dense(script: SimpleNamespace) -> Plan:
@@ -80,9 +78,6 @@ def test_a_start_within_the_joints_limit_and_beyond_the_tools_is_refused(
     where = start_of(dense)
     where[0] += 0.045
     assert judged(script, dense, where).checks["start"].value is False
-    patient = ReplayConfig(start_m=0.1)
-    scene = replace(script.scene(), start_rad=where)
-    assert replay_plan(dense, scene, patient, **EARLY).verdict.accepted is True
 
 
 def test_a_plan_without_joints_goes_on_from_where_the_arm_is(script: SimpleNamespace) -> None:

@@ -1,0 +1,120 @@
+"""How near a carried body comes to grids and boxes, for many poses that are proposed at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from twin.replay._clearance import (
+    points_to_boxes,
+    points_to_grid,
+    surface_to_boxes,
+    surface_to_grid,
+)
+from twin.replay.clearance.distance_grid import GridLookup
+
+
+def candidate_clearance(
+    lookup: GridLookup,
+    points_m: Float[np.ndarray, "num_points 3"],
+    Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
+) -> Float[np.ndarray, " num_candidates"]:
+    """Smallest signed distance of a body's surface points, for each pose it might be released at.
+
+    Args:
+        lookup: The static scene in the base frame, or an object in its own.
+        points_m: Points of the body's surface, in its own frame.
+        Ts_grid_body: The poses that are proposed, in the frame of the grid.
+
+    Returns:
+        Distances [m], negative inside; a candidate is free when it is above ``eps_col_m``.
+    """
+    nearest = np.empty(len(Ts_grid_body))
+    grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
+    surface_to_grid(*grid, *_poses(Ts_grid_body), np.ascontiguousarray(points_m), nearest)
+    return nearest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boxes:
+    """Boxes that stand still, as the native loops want them."""
+
+    R: Float[np.ndarray, "num_boxes 3 3"]
+    """Rotations ``R_base_box``."""
+    centres_m: Float[np.ndarray, "num_boxes 3"]
+    """In the base frame."""
+    halves_m: Float[np.ndarray, "num_boxes 3"]
+
+    @staticmethod
+    def of(boxes: Sequence[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "3"]]]) -> "Boxes":
+        """Lay them out: pose ``T_base_box`` of the middle, and extents [m]."""
+        R, centres_m = _poses(np.array([T for T, _ in boxes]).reshape(-1, 4, 4))
+        extents = np.array([extents for _, extents in boxes], dtype=np.float64)
+        return Boxes(R=R, centres_m=centres_m, halves_m=extents.reshape(-1, 3) / 2)
+
+    def candidate_clearance(
+        self,
+        points_m: Float[np.ndarray, "num_points 3"],
+        Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
+    ) -> Float[np.ndarray, "num_candidates num_boxes"]:
+        """Smallest signed distance of a body's surface points to each box, for each pose.
+
+        Args:
+            points_m: Points of the body's surface, in its own frame.
+            Ts_base_body: The poses that are proposed.
+
+        Returns:
+            Distances [m], exact outside; inside minus the depth below the nearest face.
+        """
+        nearest = np.empty((len(Ts_base_body), len(self.R)))
+        body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
+        surface_to_boxes(self.R, self.centres_m, self.halves_m, *body, nearest)
+        return nearest
+
+    def lower(
+        self,
+        margins_m: Float[np.ndarray, "num_candidates num_points"],
+        keep_m: Float[np.ndarray, " num_boxes"],
+        points_m: Float[np.ndarray, "num_points 3"],
+        Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
+    ) -> None:
+        """Lower each point's margin to its distance to the boxes less what is to be kept.
+
+        Args:
+            margins_m: Overwritten; one value everywhere at first, boxes beyond it do not count.
+            keep_m: Distance to keep from each box.
+            points_m: Points of the body's surface, in its own frame.
+            Ts_base_body: The poses that are proposed.
+        """
+        most = float(margins_m.max(initial=-np.inf))
+        body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
+        points_to_boxes(self.R, self.centres_m, self.halves_m, keep_m, most, *body, margins_m)
+
+
+def lower_by_grid(
+    lookup: GridLookup,
+    margins_m: Float[np.ndarray, "num_candidates num_points"],
+    keep_m: float,
+    points_m: Float[np.ndarray, "num_points 3"],
+    Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
+) -> None:
+    """Lower each point's margin to its distance to a grid less what is to be kept.
+
+    Args:
+        lookup: Distances to an obstacle.
+        margins_m: Overwritten.
+        keep_m: Distance to keep.
+        points_m: Points of the body's surface, in its own frame.
+        Ts_grid_body: The poses that are proposed, in the frame of the grid.
+    """
+    grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
+    body = *_poses(Ts_grid_body), np.ascontiguousarray(points_m)
+    points_to_grid(*grid, keep_m, *body, margins_m)
+
+
+def _poses(
+    Ts: Float[np.ndarray, "num_poses 4 4"],
+) -> tuple[Float[np.ndarray, "num_poses 3 3"], Float[np.ndarray, "num_poses 3"]]:
+    """Rotations and origins, each in one piece of memory."""
+    return np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])

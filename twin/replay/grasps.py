@@ -1,0 +1,71 @@
+"""What became of each grasp of a plan: touched, and carried along when the hand left."""
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from bridge.geometry import se3
+from bridge.geometry.signals import runs_of_true
+from bridge.task.plan import Plan
+from twin.replay.path import JointPath
+from twin.replay.result import ReplayResult
+
+LEAVES_M = 0.002
+"""The hand carries once its tool is this far from where it was told to close."""
+
+
+def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict[str, object], ...]:
+    """What became of each grasp of a plan, for whoever plans again; as verdicts keep it.
+
+    Args:
+        plan: Which object each stage grasps, and when the gripper is to be closed.
+        path: The plan's, with the gripper as late as it is replayed.
+        result: Where hand and objects were.
+    """
+    stretches = []
+    for first, end in _closed(plan, path, result.stamps_ns):
+        name = _grasped(plan, int(result.stamps_ns[first]))
+        if name is not None and name in result.finger_contact:
+            stretches.append((name, first, end))
+    held = {name for name, first, end in stretches if _carries(result, name, first, end)}
+    seen = []
+    for name, first, end in stretches:
+        contact = result.finger_contact[name][first:end]
+        p_object_m = None
+        if contact.any():
+            when = first + int(contact.argmax())
+            T_object_base = se3.invert(result.Ts_base_object[name][when])
+            tool_m = se3.apply(T_object_base, result.Ts_base_tcp[when][None, :3, 3])[0]
+            p_object_m = tool_m.round(6).tolist()
+        seen.append(
+            {
+                "object": name,
+                "touched": bool(contact.any()),
+                "held": name in held,
+                "p_object_m": p_object_m,
+            }
+        )
+    return tuple(seen)
+
+
+def _carries(result: ReplayResult, name: str, first: int, end: int) -> bool:
+    """Whether a finger touches the object as the hand leaves; a grasp that misses carries none."""
+    tool_m = result.Ts_base_tcp[first:end, :3, 3]
+    left = np.linalg.norm(tool_m - tool_m[0], axis=1) > LEAVES_M
+    touched = result.finger_contact[name][first + int(left.argmax())]
+    return bool(left.any() and touched)
+
+
+def _closed(
+    plan: Plan, path: JointPath, stamps: Int[np.ndarray, " num_steps"]
+) -> list[tuple[int, int]]:
+    """First step and the one after the last of each stretch with the gripper told to be closed."""
+    told: Bool[np.ndarray, " num_waypoints"] = np.array([w.g == 1 for w in plan.tau])
+    index = np.searchsorted(path.width_times_ns, stamps, side="right") - 1
+    closed = (index >= 0) & told[np.clip(index, 0, len(told) - 1)]
+    return runs_of_true(closed)
+
+
+def _grasped(plan: Plan, t_ns: int) -> str | None:
+    """The object of the newest stage that grasps one and has begun."""
+    begun = [stage for stage in plan.stages if stage.grasp and stage.t_start_ns <= t_ns]
+    return max(begun, key=lambda stage: stage.t_start_ns).grasp if begun else None
