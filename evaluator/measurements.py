@@ -1,15 +1,10 @@
 """Every measurement: its id, unit, definition, which way is better, and what computes it.
 
 An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in the parts and gives
-what a ``Measurement`` is made with, so no other module spells an id. docs/metrics.md holds the
-table that ``markdown`` writes: ``python -m evaluator.measurements docs/metrics.md`` renews it.
+what a ``Measurement`` is made with, so no other module spells an id.
 """
 
-import re
-import sys
 from collections.abc import Callable
-from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 from evaluator import motion_measurements as motion_measurements
@@ -661,30 +656,3 @@ DEPTHS = {
     )
 }
 """By the field of ``DepthScore``."""
-
-
-HEADING = "## Every measurement\n"
-
-
-def markdown() -> str:
-    """Write the last chapter of docs/metrics.md."""
-    lines = [
-        HEADING,
-        "Made by `python -m evaluator.measurements docs/metrics.md`. Parts in braces are names of",
-        "tasks, conditions, policies and so on; *words* are filled in by each measurement.",
-        "",
-        "| id | unit | better | computed by | definition |",
-        "|---|---|---|---|---|",
-    ]
-    for quantity in sorted(REGISTRY, key=attrgetter("id")):
-        by = quantity.computed_by
-        name = "" if by is None else f"`{by.__module__.removeprefix('evaluator.')}.{by.__name__}`"
-        better = "" if quantity.better == "none" else quantity.better
-        words = re.sub(r"\{(\w+)[^}]*\}", r"*\1*", quantity.definition).replace("|", r"\|")
-        lines.append(f"| `{quantity.id}` | {quantity.unit} | {better} | {name} | {words} |")
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    page = Path(sys.argv[1])
-    page.write_text(page.read_text().partition(HEADING)[0] + markdown())

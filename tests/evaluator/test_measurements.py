@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from evaluator.compare import compare_csv, compare_run
-from evaluator.measurements import HEADING, REGISTRY, markdown, quantity_of
+from evaluator.measurements import REGISTRY, quantity_of
 from evaluator.report.sections import SECTIONS
 from evaluator.report.wording import HEADLINES
 from evaluator.result import Measurement
@@ -47,9 +47,3 @@ def test_a_quantity_finds_its_own_ids() -> None:
         found = quantity_of(filled)
         assert found is not None
         assert found.unit == quantity.unit
-
-
-def test_the_document_has_the_table_of_the_registry() -> None:
-    text = (DOCS / "metrics.md").read_text()
-    hint = "renew it: python -m evaluator.measurements docs/metrics.md"
-    assert HEADING + text.partition(HEADING)[2] == markdown(), hint
