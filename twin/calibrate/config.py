@@ -28,7 +28,7 @@ class CalibrateConfig:
     draws: int = 64
     """With --posterior: draws from the priors, each replayed through every trial."""
     pairs: Path | None = None
-    """JSON or CSV file of pose pairs (T_base_effector, T_camera_target), for --camera."""
+    """JSON file of pose pairs (T_base_effector, T_camera_target), for --camera."""
     camera: str = ""
     """Only this camera; with --pairs, the one the pairs belong to."""
     mount: Mount = "auto"

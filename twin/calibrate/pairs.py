@@ -1,10 +1,9 @@
-"""Pose pairs of a hand-eye calibration: from a JSON or CSV file, or from recorded episodes.
+"""Pose pairs of a hand-eye calibration: from a JSON file, or from recorded episodes.
 
 An episode holds the target's pose in the camera on ``/<cell>/cam/<id>/target/pose``
 (geometry_msgs/PoseStamped); the robot's side comes from its joints at the same instant.
 """
 
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,11 +22,6 @@ from bridge.geometry import se3
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, posture_track
 
-CSV_COLUMNS = tuple(
-    f"{what}_{name}"
-    for what in ("effector", "target")
-    for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-)
 SAME_PLACE_RAD = 0.004
 """Detections at joints nearer than this belong to one stop of the robot and are averaged."""
 
@@ -47,24 +41,20 @@ class PosePairs:
 
 
 def read_pairs(path: Path) -> PosePairs:
-    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows, or CSV.
-
-    The CSV has a header with ``effector_x_m ... effector_qz, target_x_m ... target_qz``: position
-    [m] and quaternion of ``T_base_effector`` and ``T_camera_target``.
+    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows [m].
 
     Raises:
         PathNotFoundError: When the file is not there.
-        UsageError: When it is neither, or holds something that is no pose.
+        UsageError: When it holds something that is no pose.
     """
     if not path.is_file():
         raise PathNotFoundError(path=path, what="file of pose pairs", hint="Check the path.")
     try:
-        rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _json_rows(path)
-        poses = np.array(rows, dtype=np.float64).reshape(-1, 2, 4, 4)
+        poses = np.array(_json_rows(path), dtype=np.float64).reshape(-1, 2, 4, 4)
     except (ValueError, KeyError, TypeError) as error:
         message = (
             f"{path} holds no pose pairs ({error!r}). Write JSON [[T_base_effector, "
-            f"T_camera_target], ...] with 4x4 matrices, or CSV with {', '.join(CSV_COLUMNS)}."
+            f"T_camera_target], ...] with 4x4 matrices."
         )
         raise UsageError(message) from error
     _refuse_no_poses(path, poses)
@@ -77,13 +67,6 @@ def _json_rows(path: Path) -> list[Any]:
         message = f"a {type(rows).__name__}, not a list"
         raise TypeError(message)
     return rows
-
-
-def _csv_rows(path: Path) -> list[np.ndarray]:
-    with path.open(newline="") as stream:
-        table = [[float(row[name]) for name in CSV_COLUMNS] for row in csv.DictReader(stream)]
-    values = np.array(table).reshape(-1, 2, 7)
-    return list(se3.transform_from(values[..., 3:], values[..., :3]))
 
 
 def _refuse_no_poses(path: Path, poses: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from bridge.geometry import se3
 from bridge.robots.robot import Finger, Mimic, Robot, mimics_of, robot_of
 from twin.errors import TwinError
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import FINGER_SPEED_M_S, PhysicsConfig
 from twin.physics.engine import pybullet
 
 # The robot description as PyBullet should load it.
@@ -334,7 +334,7 @@ class Arm:
 
     def _close_fingers(self) -> None:
         if self._press_m_s is None:
-            self._drive_fingers(self._target_m, self._config.finger_speed_m_s)
+            self._drive_fingers(self._target_m, FINGER_SPEED_M_S)
         else:
             self._drive_fingers(self._target_m, self._press_m_s, _PRESS_GAIN)
 
@@ -382,7 +382,7 @@ class Arm:
         Args:
             reaction_N: Mean over both fingers of what pushes them apart.
         """
-        top, here = self._config.finger_speed_m_s, self.width_m()
+        top, here = FINGER_SPEED_M_S, self.width_m()
         speed = top * (1.0 - reaction_N / self._config.grip_force_N)
         if self._target_m >= here:
             self._drive_fingers(self._target_m, top)

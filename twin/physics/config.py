@@ -27,6 +27,10 @@ def require_engine(engine: Engine) -> None:
         raise MissingDependencyError(package=engine, extra=engine, purpose=f"--engine {engine}")
 
 
+FINGER_SPEED_M_S = 0.1
+"""Largest speed of each finger."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
     """Nominal physics; what is not measured in a cell stays at these values."""
@@ -41,8 +45,6 @@ class PhysicsConfig:
     something is held (measured)."""
     grip_force_N: float = 20.0
     """Largest force of each finger; 60 N ejects a 50 g cube (measured)."""
-    finger_speed_m_s: float = 0.1
-    """Largest speed of each finger."""
     object_friction: float = 0.8
     """Sliding friction coefficient of objects; PyBullet multiplies both partners'."""
     finger_friction: float = 1.0
@@ -51,10 +53,6 @@ class PhysicsConfig:
     """Sliding friction coefficient of table and containers."""
     gravity_m_s2: float = 9.81
     """Downward acceleration."""
-    soft_substeps: int = 10
-    """Substeps of soft bodies within each physics step; 10 are 2400 a second."""
-    soft_stiffness_scale: float = 1.0
-    """Factor on Young's modulus of all soft bodies."""
 
     def __post_init__(self) -> None:
         """Refuse what is no physics; samples draw from wide priors, so the limits are wide too."""
@@ -66,12 +64,9 @@ class PhysicsConfig:
                 "solver_iterations": (1, 100_000),
                 "solver_residual": (0, 1),
                 "grip_force_N": (least, most),
-                "finger_speed_m_s": (least, 100),
                 "object_friction": (0, most),
                 "finger_friction": (0, most),
                 "surface_friction": (0, most),
                 "gravity_m_s2": (0, 1000),
-                "soft_substeps": (1, 10_000),
-                "soft_stiffness_scale": (least, most),
             },
         )

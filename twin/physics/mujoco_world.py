@@ -23,7 +23,7 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
-from twin.physics.config import RIGID_ONLY, PhysicsConfig
+from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
 from twin.physics.soft_world import SoftWorld
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 from twin.physics.world import Box
@@ -160,7 +160,7 @@ class MujocoArm:
         data.ctrl[:count] = (self._torques + data.qfrc_bias)[self._arm_dofs]
         # A ramp as fast as both fingers may be, no farther from them than their force reaches.
         config, here = self._config, self.width_m()
-        stride = 2.0 * config.finger_speed_m_s * float(self._model.opt.timestep)
+        stride = 2.0 * FINGER_SPEED_M_S * float(self._model.opt.timestep)
         reach = 2.0 * config.grip_force_N / _FINGER_N_M
         ramp = self._ramp_m + min(max(self._target_m - self._ramp_m, -stride), stride)
         self._ramp_m = min(max(ramp, here - reach), here + reach)

@@ -7,7 +7,7 @@ import pytest
 
 from bridge.robots.default import FINGER_JOINTS, ROBOT
 from twin.physics import arm
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import FINGER_SPEED_M_S, PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
 from twin.robot.model import with_absolute_meshes
@@ -79,8 +79,8 @@ def test_fingers_keep_their_speed_until_they_meet_something(urdf: str) -> None:
         world.reset_robot(HOME, OPEN_M)
         run(world, 10, OPEN_M)
         speeds = np.abs(run(world, 60, CLOSED_M)[:, :, 0])
-        assert speeds.max() < 1.05 * STRONG.finger_speed_m_s
-        assert speeds[:40].max() > 0.95 * STRONG.finger_speed_m_s
+        assert speeds.max() < 1.05 * FINGER_SPEED_M_S
+        assert speeds[:40].max() > 0.95 * FINGER_SPEED_M_S
 
 
 def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) -> None:
@@ -91,9 +91,9 @@ def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) 
             world.free_ids["cube"], [2.0, 0.0, 1.0], [0, 0, 0, 1], physicsClientId=world.client
         )
         speeds = np.abs(run(world, 12, CLOSED_M)[:, :, 0])
-        free_m_s = 1.05 * STRONG.finger_speed_m_s
+        free_m_s = 1.05 * FINGER_SPEED_M_S
         assert (speeds.max(axis=1) > free_m_s).sum() <= arm.EVERY_STEPS
-        usual_m = 2 * STRONG.finger_speed_m_s * 12 / STRONG.rate_hz
+        usual_m = 2 * FINGER_SPEED_M_S * 12 / STRONG.rate_hz
         farthest_m = 2 * arm.EVERY_STEPS * arm.PRESS_M_S / STRONG.rate_hz
         assert world.robot.width_m() > width_m - usual_m - farthest_m - 1e-3
 
@@ -102,5 +102,5 @@ def test_fingers_that_open_are_as_fast_as_ever(urdf: str) -> None:
     with World(urdf, {}, STRONG) as world:
         holding(world)
         speeds = np.abs(run(world, 30, OPEN_M)[:, :, 0])
-        assert speeds.max() < 1.05 * STRONG.finger_speed_m_s
+        assert speeds.max() < 1.05 * FINGER_SPEED_M_S
         assert world.robot.width_m() > 0.05

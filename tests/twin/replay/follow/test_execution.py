@@ -184,7 +184,7 @@ def test_an_execution_of_hours_is_refused_before_it_takes_hours(script: SimpleNa
     plan = script.plan(script.scene())
     check_length(600_000_000_000, plan.id)
     with pytest.raises(UnusablePlanError, match=r"was executed for 7200 s\. At most 600 s"):
-        check_length(7_200_000_000_000, plan)
+        check_length(7_200_000_000_000, plan.id)
 
 
 def test_a_grasp_of_something_soft_begins_where_the_fingers_stop_though_they_creep_on(

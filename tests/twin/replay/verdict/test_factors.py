@@ -3,6 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.task.causes import Cause
 from twin.replay.failure import Failure, factor_from
 
 
@@ -10,11 +11,14 @@ from twin.replay.failure import Failure, factor_from
 def test_a_factor_names_the_earliest_failure_in_whatever_order_they_were_found(
     times_ns: list[int],
 ) -> None:
-    failures = [Failure(t_ns=t, cause=f"at {t}", detail="", bodies=(str(t),)) for t in times_ns]
+    causes = dict(zip(times_ns, Cause, strict=False))
+    failures = [
+        Failure(t_ns=t, cause=cause, detail="", bodies=(str(t),)) for t, cause in causes.items()
+    ]
     factor = factor_from(failures, undecided="open, too")
     first = sorted(times_ns)[0]
     assert (factor.value, factor.first_t_ns) == (False, first)
-    assert (factor.cause, factor.bodies) == (f"at {first}", (str(first),))
+    assert (factor.cause, factor.bodies) == (causes[first], (str(first),))
 
 
 def test_without_a_failure_a_factor_is_true_or_open() -> None:
