@@ -27,12 +27,11 @@ from bridge.geometry import se3
 from bridge.terminal import Advance
 from bridge.whole_file import write_whole
 from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
-from twin.scene.fit.camera_correction import CameraCorrections, correction_gradient
 from twin.scene.fit.densify import densify, score
 from twin.scene.fit.exposure import solve_exposures
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
-from twin.scene.harmonics import NUM_FIRST, NUM_HARMONICS, degree_of
+from twin.scene.harmonics import NUM_FIRST
 from twin.scene.raster.rasteriser import (
     SAME_EXPOSURE,
     FitSession,
@@ -110,9 +109,8 @@ class RunningSum:
 
 FIT_STATE = "fit.npz"
 """In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 5
+STATE_VERSION = 6
 SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
-CAMERA_ARRAYS = ("values", "first", "second", "counts")
 SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
 
 
@@ -125,7 +123,6 @@ class FitState:
     size_m: float
     """Median size of the first Gaussians; positions move in units of it."""
     exposures: Float[np.ndarray, "num_views 3 4"]
-    cameras: CameraCorrections
     surface: SurfacePrior
     """Where the Gaussians began."""
     last: RunningSum = field(default_factory=RunningSum)
@@ -158,13 +155,12 @@ def first_state(session: FitSession, num_views: int) -> FitState:
 
     Args:
         session: Holds the cloud that is to be fitted.
-        num_views: Training images, each with an exposure and a camera correction.
+        num_views: Training images, each with an exposure.
     """
     return FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
         exposures=np.tile(SAME_EXPOSURE, (num_views, 1, 1)),
-        cameras=CameraCorrections.none(num_views),
         surface=SurfacePrior.of(session.cloud),
     )
 
@@ -187,7 +183,6 @@ def save_state(checkpoint: Checkpoint, state: FitState) -> None:
         "exposures": state.exposures,
     }
     content |= {name: np.array(getattr(state, name)) for name in SCALARS}
-    content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
     content |= {f"surface.{name}": getattr(state.surface, name) for name in SURFACE_ARRAYS}
     moments = state.session.moments
     for name, rows in arrays(state.session.cloud):
@@ -236,7 +231,6 @@ def _state_from(
         session=session,
         size_m=float(content["size_m"]),
         exposures=content["exposures"],
-        cameras=CameraCorrections(**part("cameras.")),
         surface=SurfacePrior(**part("surface.")),
         last=RunningSum(sums=part("sum."), count=int(content["num_summed"])),
         seconds=float(content["seconds"]),
@@ -337,7 +331,7 @@ class Events:
         return [
             ImageObservation(
                 target=view.half if coarse else view.full,
-                T_base_camera=state.cameras.pose(index, view.T_base_color),
+                T_base_camera=view.T_base_color,
                 exposure=state.exposures[index],
             )
             for index, view in enumerate(self._views)
@@ -349,16 +343,14 @@ class Events:
                 state.session.cloud,
                 self._observations(state, coarse),
                 self._rasteriser,
-                self._config.exposure,
                 allowance,
             )
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
         cloud = state.session.cloud
-        degree = max(self._config.harmonics, degree_of(cloud.num_harmonics))
         solved = solve_appearance(
-            with_harmonics(cloud, NUM_HARMONICS[degree]),
+            cloud,
             self._observations(state, coarse),
             self._rasteriser,
             steps=self._config.appearance_steps,
@@ -366,11 +358,8 @@ class Events:
         )
         keep_colors_in_range(solved.cloud)
         state.colour_steps += solved.steps
-        if solved.steps and solved.cloud.num_harmonics > cloud.num_harmonics:
-            state.session.rearrange(solved.cloud, np.arange(len(cloud)))
-            return
         cloud.colors[:] = solved.cloud.colors
-        cloud.harmonics[:] = solved.cloud.harmonics[:, : cloud.num_harmonics]
+        cloud.harmonics[:] = solved.cloud.harmonics
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -426,11 +415,6 @@ MEAN_FROM = 0.92
 """From this share of the budget on, the Gaussians are summed at each of these looks; the fit ends
 with their mean, which is without the noise of single images. All events are behind by then, so
 the Gaussians stay the same."""
-POSES_FROM = 0.15
-"""Cameras are moved only once the scene is good enough to say where to."""
-POSES_DEPTH = 0.05
-"""Where cameras are moved, depth weighs only this much of what it does otherwise, and nothing is
-held near the fused surface: the depth of a view that stands wrong is wrong with it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -452,8 +436,6 @@ class FitResult:
     exposures: Float[np.ndarray, "num_views 3 4"]
     """How the colours (red, green, blue, 1) of the scene came out in each training image; on
     average they did not change."""
-    Ts_base_color: Float[np.ndarray, "num_views 4 4"]
-    """Where the training views were in the end; as given unless poses were refined."""
     num_split: int
     num_pruned: int
     colour_steps: int
@@ -518,7 +500,6 @@ def fit(
         cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         exposures=state.exposures,
-        Ts_base_color=np.stack([learner.pose(state, index) for index in range(len(views))]),
         num_split=state.num_split,
         num_pruned=state.num_pruned,
         colour_steps=state.colour_steps,
@@ -566,17 +547,13 @@ class _Learner:
             cloud,
             self.rasteriser.config,
             loss=config.loss,
-            depth_weight=config.depth_weight * (POSES_DEPTH if config.refine_poses else 1.0),
+            depth_weight=config.depth_weight,
         )
 
     def hold(self, state: FitState) -> None:
         """Keep Gaussians near the surface they began on, where that is to be trusted."""
-        if self._config.slab and not self._config.refine_poses:
+        if self._config.slab:
             state.surface.hold(state.session.cloud, self._config.slab)
-
-    def pose(self, state: FitState, index: int) -> np.ndarray:
-        """Where a view is now thought to be."""
-        return state.cameras.pose(index, self._views[index].T_base_color)
 
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
@@ -584,22 +561,17 @@ class _Learner:
         index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
         coarse = at.fraction < self._config.coarse_fraction
         state.coarse_steps += coarse
-        view, pose = self._views[index], self.pose(state, index)
+        view = self._views[index]
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}
         rates["means_m"] *= state.size_m
-        if state.session.cloud.num_harmonics > NUM_FIRST:
-            rates["harmonics"] = 0.0  # Adam knows no ridge: it would fit noise to the few views
         report = state.session.step(
-            view.half if coarse else view.full, pose, rates, state.exposures[index]
+            view.half if coarse else view.full, view.T_base_color, rates, state.exposures[index]
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:
             self.hold(state)
             if at.fraction >= MEAN_FROM:
                 state.last.add(state.session.cloud)
-        if self._config.refine_poses and at.fraction >= POSES_FROM:
-            pulled = correction_gradient(report.T_camera_base, pose)
-            state.cameras.update(index, pulled, decay)
         if report.mse is not None:
             state.errors = [*state.errors[-len(self._views) :], report.mse]

@@ -52,9 +52,6 @@ class WeightsKind:
     licence: str
     speaks: bool = False
     """Whether it takes text and so needs a tokenizer."""
-    backbones: tuple[str, ...] = ()
-    """Values of ``model_type`` that ``backbone_config`` may have; empty: it has no backbone of
-    another kind. A configuration may also name a backbone to fetch: that is refused."""
 
     def wanted(self) -> str:
         """The files a folder needs, in words."""
@@ -85,8 +82,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
     if found_type not in kind.model_types:
         found = f"config.json describes a model of type {found_type!r}, not {kind.model_types[0]!r}"
         raise WeightsError(folder=folder, found=found, kind=kind)
-    if kind.backbones:
-        _check_backbone(config, folder, kind)
     for path in weight_files(folder, kind):
         _check_safetensors(path, folder, kind)
     tokenizers = (("tokenizer.json",), ("vocab.json", "merges.txt"))
@@ -95,18 +90,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
         raise WeightsError(folder=folder, found="there is no tokenizer.json", kind=kind)
     _check_sums(folder, kind)
     return config
-
-
-def _check_backbone(config: dict[str, Any], folder: Path, kind: WeightsKind) -> None:
-    about = config.get("backbone_config")
-    found_type = about.get("model_type") if isinstance(about, dict) else None
-    if found_type not in kind.backbones or config.get("backbone"):
-        found = (
-            f"config.json describes a backbone of type {found_type!r}, not {kind.backbones[0]!r}"
-            if not config.get("backbone")
-            else f"config.json names a backbone to fetch, {config['backbone']!r}"
-        )
-        raise WeightsError(folder=folder, found=found, kind=kind)
 
 
 def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:

@@ -7,7 +7,6 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,10 @@ from twin.scene.dataset.training_set import (
     TrainingSet,
     limits_of,
     read_training_set,
-    with_fitted_poses,
 )
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
-from twin.scene.foundation.complete import complete_shapes
-from twin.scene.foundation.monocular_depth import DepthGuesser
 from twin.scene.foundation.stage import check_models
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
 from twin.scene.frames.swept_episode import find_or_sweep_sources
@@ -126,11 +122,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         kept.path.unlink(missing_ok=True)
     fitted = _fit(training, config, kept, output)
     clock.end("initialise_and_fit")
-    training = with_fitted_poses(training, fitted.Ts_base_color)
-    completed, guesses = _close_holes(training, fitted, config, models, output)
+    completed = _close_holes(training, fitted, config, output)
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    decomposed = _decompose(run, sources, training, fitted.cloud, completed, config, output)
+    decomposed = _decompose(sources, training, fitted.cloud, completed, config, output)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("decompose")
@@ -154,7 +149,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
-    record |= extras | guesses | {"backdrop": backdrop.write(run.scene_dir)}
+    record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)
     kept.path.unlink(missing_ok=True)
     return record
@@ -179,7 +174,6 @@ def _fit(
 
 
 def _decompose(
-    run: RunFolder,
     sources: Sources,
     training: TrainingSet,
     cloud: GaussianCloud,
@@ -188,10 +182,7 @@ def _decompose(
     output: Output,
 ) -> Decomposition:
     """Objects and background of what was fitted; what closes holes belongs to the background."""
-    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    found = decompose(
-        sources, cloud, training.choices, training.views, complete, output, config.initialise
-    )
+    found = decompose(sources, cloud, training.choices, training.views, output, config.initialise)
     if found.remark:
         output.say(found.remark)
     return replace(found, background=concatenate([found.background, completed]))
@@ -201,19 +192,13 @@ def _close_holes(
     training: TrainingSet,
     fitted: FitResult,
     config: RebuildConfig,
-    models: Mapping[str, str],
     output: Output,
-) -> tuple[GaussianCloud, dict[str, Any]]:
-    """Gaussians where no depth was measured, and the record of the network that guessed, if any.
-
-    The network lives no longer than this.
-    """
+) -> GaussianCloud:
+    """Gaussians where colour was seen and no depth measured."""
     raster = RasterConfig(threads=config.fit.threads)
-    guesser = DepthGuesser.load(config.models, models.get("depth_model", ""))
-    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster, guesser)
-    output.say(f"{len(closed.cloud)} Gaussians where colour was seen and no depth measured")
-    record = {} if guesser is None else {"depth_model": guesser.to_record(closed)}
-    return closed.cloud, record
+    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
+    output.say(f"{len(closed)} Gaussians where colour was seen and no depth measured")
+    return closed
 
 
 def _hold_out(
@@ -243,7 +228,6 @@ def _hold_out(
             for index, mask in training.ego_masks.items()
         },
         backdrop=backdrop,
-        align=config.frames.align_holdout,
     )
     total = sum(len(choice.holdout_ns) for choice in choices)
     with output.progress("render held-out views", total) as advance:
@@ -315,12 +299,7 @@ def _key(
     settings.pop("force")
     settings["fit"].pop("threads")
     settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
-    settings["fit"]["gain"] = config.fit.exposure != "none"  # likewise
-    if config.fit.exposure != "affine":
-        settings["fit"].pop("exposure")
     settings["models"].pop("device")
-    if not config.models.depth_model:
-        settings["models"].pop("depth_model")  # keys of older scenes
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = scanned_tasks(sources).task  # shapes and colours decide the objects
     return provenance.hash_settings(

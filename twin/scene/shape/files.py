@@ -103,7 +103,7 @@ def mass_prior(label: str, volume_m3: float) -> MassPrior:
 
 MESH, SDF, SOFT, COLLISION = "mesh.ply", "sdf.npz", "soft.npz", "collision"
 TASK_SHAPE = "task file"
-"""Source of a shape that no view and no generator gave."""
+"""Source of a shape that no view gave."""
 
 
 def remove_shape(folder: Path) -> None:

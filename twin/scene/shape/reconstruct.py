@@ -155,8 +155,6 @@ class ObjectShape:
     cavity: Cavity | None
     num_views: int
     truncation_m: float
-    source: str = ""
-    """Who made it, when it was not carved out of views."""
     view_shift_m: float = 0.0
     """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
