@@ -225,8 +225,8 @@ def write_objects(
 ) -> dict[str, Any]:
     """Write ``objects/<id>/`` below a scene folder: Gaussians, mesh, ``object.json``.
 
-    A reconstructed object also gets ``sdf.npz``, ``collision/*.ply`` and, when it is soft,
-    ``soft.npz``, all in the object frame.
+    A reconstructed object also gets ``sdf.npz`` and, when it is soft, ``soft.npz``, both in the
+    object frame.
 
     Args:
         folder: The scene folder.
@@ -271,7 +271,7 @@ def _write_geometry(
     """Write the reconstructed shape, or the known one with the reason why."""
     remove_shape(place)
     if not isinstance(shape, str):
-        names, geometry = write_shape(place, shape, model.id, soft=model.soft is not None)
+        names, geometry = write_shape(place, shape, soft=model.soft is not None)
         source = f"reconstructed from {shape.num_views} views"
         return names, {"shape_source": source, "geometry": geometry}
     write_whole(place / MESH, mesh_ply(*shape_mesh(model)))
