@@ -219,7 +219,7 @@ class ModelConfig:
     feature_channels: int = 16
     """Principal components that are kept of each feature."""
     feature_stride: int | None = None
-    """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
+    """Image pixels per feature; default: the model's own, 16. Less costs more."""
     clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
     model_frames: int = 12
@@ -232,6 +232,11 @@ class ModelConfig:
         _refuse_below(1, feature_channels=self.feature_channels, model_frames=self.model_frames)
         if self.feature_stride is not None:
             _refuse_below(1, feature_stride=self.feature_stride)
+
+    @property
+    def any_named(self) -> bool:
+        """Whether a model is to be asked at all."""
+        return bool(self.segmenter or self.features or self.clip)
 
 
 @Parameter(name="*")
@@ -264,8 +269,6 @@ class RenderConfig:
     """Seconds after the episode's first sample, by the stamps of its source as on the dashboard;
     when messages arrived does not count. Without it an --episode is drawn from its start to its
     end, and one image is drawn at 0 s."""
-    rate_hz: float | None = None
-    """Frames per second of a whole episode; default: one for each image its camera recorded."""
     size: str = ""
     """WIDTHxHEIGHT of the images in pixels; default: as recorded."""
     compare: bool = False
@@ -289,15 +292,12 @@ class RenderConfig:
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
-    """File to write; default: RUN/results/render.png. With .ply: the Gaussians themselves, so that
-    other viewers show at this distance what the image would. A whole episode: an .mp4 file, or a
-    folder for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
+    """File to write; default: RUN/results/render.png. A whole episode: an .mp4 file, or a folder
+    for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(
-            self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0), "rate_hz": (0.01, 240.0)}
-        )
+        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
         for name, place in (("eye", self.eye), ("target", self.target)):
             if place is not None and not all(math.isfinite(value) for value in place):
                 message = f"--{name} {place} is no place: three numbers in metres."
@@ -306,7 +306,7 @@ class RenderConfig:
     @property
     def is_sequence(self) -> bool:
         """Whether a whole episode is drawn, and not one image."""
-        if self.out is not None and self.out.suffix.lower() in (".png", ".ply"):
+        if self.out is not None and self.out.suffix.lower() == ".png":
             return False
         one = self.at_s is not None or self.joints is not None
         return not one and bool(self.episode)

@@ -11,21 +11,17 @@ depth comes out too near. So each Gaussian is held within a ``slab`` around the 
 surface that it began on.
 """
 
-import io
 import math
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from bridge.whole_file import write_whole
 from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
 from twin.scene.fit.densify import densify, score
 from twin.scene.fit.exposure import solve_exposures
@@ -107,13 +103,6 @@ class RunningSum:
             rows[:] = self.sums[name] / np.float32(self.count)
 
 
-FIT_STATE = "fit.npz"
-"""In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 6
-SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
-SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
-
-
 @dataclass(kw_only=True)
 class FitState:
     """A fit between two steps; the only thing that changes while fitting."""
@@ -139,17 +128,6 @@ class FitState:
     """Mean squared errors of the last images."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Checkpoint:
-    """Where an interrupted fit goes on from."""
-
-    path: Path
-    key: str
-    """Names the inputs and settings; a file of others is not used."""
-    period_s: float = 10.0
-    """At most this much is lost."""
-
-
 def first_state(session: FitSession, num_views: int) -> FitState:
     """Before the first image.
 
@@ -162,80 +140,6 @@ def first_state(session: FitSession, num_views: int) -> FitState:
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
         exposures=np.tile(SAME_EXPOSURE, (num_views, 1, 1)),
         surface=SurfacePrior.of(session.cloud),
-    )
-
-
-def save_state(checkpoint: Checkpoint, state: FitState) -> None:
-    """Write the state whole; plain arrays, nothing that runs when read.
-
-    Args:
-        checkpoint: Where to, and the name of the inputs and settings.
-        state: After whole steps.
-    """
-    content: dict[str, np.ndarray] = {
-        "key": np.array(checkpoint.key),
-        "version": np.array(STATE_VERSION),
-        "seconds": np.array(state.seconds),
-        "size_m": np.array(state.size_m),
-        "steps": np.array(state.session.steps),
-        "errors": np.array(state.errors, dtype=np.float64),
-        "num_summed": np.array(state.last.count),
-        "exposures": state.exposures,
-    }
-    content |= {name: np.array(getattr(state, name)) for name in SCALARS}
-    content |= {f"surface.{name}": getattr(state.surface, name) for name in SURFACE_ARRAYS}
-    moments = state.session.moments
-    for name, rows in arrays(state.session.cloud):
-        content[f"cloud.{name}"] = rows
-        content[f"first.{name}"], content[f"second.{name}"] = moments[name]
-    content |= {f"sum.{name}": rows for name, rows in state.last.sums.items()}
-    buffer = io.BytesIO()
-    np.savez(buffer, **content)  # type: ignore[arg-type]  # numpy's stub takes the names for options
-    write_whole(checkpoint.path, buffer.getvalue())
-
-
-def load_state(
-    checkpoint: Checkpoint, make_session: Callable[[GaussianCloud], FitSession]
-) -> FitState | None:
-    """Read the state of an interrupted fit of the same inputs and settings; None if there is none.
-
-    A damaged file, or one of another version, is none.
-
-    Args:
-        checkpoint: Where from, and the name of the inputs and settings.
-        make_session: Begins a session with the cloud that was kept.
-    """
-    try:
-        whole = io.BytesIO(checkpoint.path.read_bytes())
-        with np.load(whole, allow_pickle=False) as stored:
-            content = {name: stored[name] for name in stored.files}
-        if str(content["key"]) != checkpoint.key or int(content["version"]) != STATE_VERSION:
-            return None
-        return _state_from(content, make_session)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-
-
-def _state_from(
-    content: dict[str, np.ndarray], make_session: Callable[[GaussianCloud], FitSession]
-) -> FitState:
-    def part(prefix: str) -> dict[str, np.ndarray]:
-        begin = len(prefix)
-        return {name[begin:]: rows for name, rows in content.items() if name.startswith(prefix)}
-
-    session = make_session(GaussianCloud(**part("cloud.")))
-    second = part("second.")
-    moments = {name: (rows, second[name]) for name, rows in part("first.").items()}
-    session.resume(moments, int(content["steps"]))
-    return FitState(
-        session=session,
-        size_m=float(content["size_m"]),
-        exposures=content["exposures"],
-        surface=SurfacePrior(**part("surface.")),
-        last=RunningSum(sums=part("sum."), count=int(content["num_summed"])),
-        seconds=float(content["seconds"]),
-        errors=content["errors"].tolist(),
-        **{name: int(content[name]) for name in SCALARS},
     )
 
 
@@ -427,9 +331,9 @@ class FitResult:
     """None: as many as the time allowed."""
     coarse_iterations: int
     seconds: float
-    """Wall time, initialisation and that of an interrupted fit before included."""
+    """Wall time, initialisation included."""
     cpu_seconds: float
-    """Of this process, this time."""
+    """Of this process."""
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
@@ -454,7 +358,6 @@ def fit(
     advance: Advance,
     *,
     max_splats: int | None = None,
-    checkpoint: Checkpoint | None = None,
     clock: Callable[[], float] = time.monotonic,
     spent_s: float = 0.0,
 ) -> FitResult:
@@ -470,25 +373,19 @@ def fit(
         config: Budget, loss and seed.
         advance: Told the percentage done, the recent PSNR and the time left.
         max_splats: Budget of Gaussians; none: as many as there are at the start.
-        checkpoint: Where to keep the state; a state of the same key is gone on with.
         clock: Seconds that the budget is counted in.
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)
     events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
-    state = None if checkpoint is None else load_state(checkpoint, learner.session)
-    if state is None or len(state.exposures) != len(views):
-        harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
-        state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
-        state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
-    cpu_start, last_saved = time.process_time(), state.seconds
+    harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
+    state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
+    state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
+    cpu_start = time.process_time()
     for at in _steps(config, state, clock):
         events.keep(state, at)
         learner.step(state, at)
         advance(round(100 * at.fraction), _note(state, at, len(views)))
-        if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
-            state.seconds = last_saved = at.seconds
-            save_state(checkpoint, state)
     state.last.put_mean_into(state.session.cloud)
     learner.hold(state)
     return FitResult(

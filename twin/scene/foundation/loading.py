@@ -273,29 +273,23 @@ def network_input(
     return (torch.cat(rows) / 255.0 - mean) / deviation
 
 
-DTYPES = ("float32", "bfloat16", "float16")
 MAX_PROMPT_CHARACTERS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where and how precisely a network runs."""
+    """Where a network runs."""
 
     device: str = "auto"
     """auto: the first CUDA device, or the CPU where there is none."""
-    dtype: str = "float32"
-    """float32, bfloat16 or float16; results are float32 in any case."""
 
-    def resolve(self) -> tuple[Any, Any]:
-        """Return torch's device and number type.
+    def resolve(self) -> Any:
+        """Return torch's device.
 
         Raises:
-            UsageError: For a device or type that is not there.
+            UsageError: For a device that is not there.
         """
         torch = import_torch()
-        if self.dtype not in DTYPES:
-            message = f"number type {self.dtype!r} is unknown; there are {', '.join(DTYPES)}."
-            raise UsageError(message)
         wanted = self.device
         if wanted == "auto":
             wanted = "cuda" if torch.cuda.is_available() else "cpu"
@@ -307,7 +301,7 @@ class Placement:
         if device.type == "cuda" and not torch.cuda.is_available():
             message = f"device {wanted!r} was asked for, but torch finds no CUDA device here."
             raise UsageError(message)
-        return device, getattr(torch, self.dtype)
+        return device
 
 
 def import_transformers() -> Any:
@@ -338,7 +332,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
         folder: Checked by ``check_folder`` first.
         kind: What the folder must hold.
         class_name: Name of the class of ``transformers``.
-        placement: Device and number type.
+        placement: On which device.
 
     Raises:
         WeightsError: When the folder is not whole, or leaves parameters of the network without
@@ -346,7 +340,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
         MissingDependencyError: When ``transformers`` is not installed or does not know the class.
     """
     check_folder(folder, kind)
-    device, dtype = placement.resolve()
+    device = placement.resolve()
     transformers = import_transformers()
     model_class = getattr(transformers, class_name, None)
     if model_class is None:
@@ -359,7 +353,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
             local_files_only=True,
             use_safetensors=True,
             trust_remote_code=False,
-            dtype=dtype,
+            dtype=import_torch().float32,
             output_loading_info=True,
         )
     except _load_errors() as error:

@@ -2,7 +2,7 @@
 
 SAM 3 (Carion et al. 2025): words in, masks out, by text prompts only, because boxes would need
 torchvision's region pooling. DINOv3 (Simeoni et al. 2025): features of every part of an image, from
-a ViT or a ConvNeXt. CLIP (Radford et al. 2021): words and pieces of images in one space.
+a ViT. CLIP (Radford et al. 2021): words and pieces of images in one space.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,6 @@ from twin.scene.foundation.loading import (
     Placement,
     Tokenizer,
     WeightsKind,
-    check_folder,
     import_torch,
     load_model,
     network_input,
@@ -148,10 +147,9 @@ class Sam3Segmenter:
         return masks
 
 
-VIT, CONVNEXT = "dinov3_vit", "dinov3_convnext"
 DINOV3_KIND = WeightsKind(
     name="DINOv3",
-    model_types=(VIT, CONVNEXT),
+    model_types=("dinov3_vit",),
     origin="facebook/dinov3-vits16-pretrain-lvd1689m or a larger one",
     licence="DINOv3 License, access on request",
 )
@@ -169,14 +167,9 @@ class DinoFeatures:
         self._model = model
         self._normalisation = read_normalisation(folder, DINOV3_KIND, IMAGENET)
         config = model.config
-        if config.model_type == CONVNEXT:
-            self.cell_px = 4 * 2 ** (len(config.hidden_sizes) - 1)
-            self.num_channels = int(config.hidden_sizes[-1])
-            self._num_first = 1  # the pooled token
-        else:
-            self.cell_px = int(config.patch_size)
-            self.num_channels = int(config.hidden_size)
-            self._num_first = 1 + int(config.num_register_tokens)
+        self.cell_px = int(config.patch_size)
+        self.num_channels = int(config.hidden_size)
+        self._num_first = 1 + int(config.num_register_tokens)
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "DinoFeatures":
@@ -190,10 +183,8 @@ class DinoFeatures:
             WeightsError: When the folder is missing, incomplete or of another kind.
             MissingDependencyError: When the extra ``foundation`` is not installed.
         """
-        config = check_folder(folder, DINOV3_KIND)
-        is_vit = config["model_type"] == VIT
-        name = "DINOv3ViTModel" if is_vit else "DINOv3ConvNextModel"
-        return DinoFeatures(load_model(folder, DINOV3_KIND, name, placement or Placement()), folder)
+        model = load_model(folder, DINOV3_KIND, "DINOv3ViTModel", placement or Placement())
+        return DinoFeatures(model, folder)
 
     def features(
         self,
@@ -209,7 +200,7 @@ class DinoFeatures:
 
         Args:
             images_u8: sRGB images of one size.
-            stride: Image pixels per cell; None: the network's own (16 of a ViT, 32 of a ConvNeXt).
+            stride: Image pixels per cell; None: the network's own.
 
         Raises:
             UsageError: When sizes differ, or the maps would be empty or too large.
@@ -275,8 +266,6 @@ class ClipEmbedder:
         self._normalisation = read_normalisation(folder, CLIP_KIND, CLIP_COLOURS)
         self._side = int(model.config.vision_config.image_size)
         self.num_channels = int(model.config.projection_dim)
-        self.temperature = float(1.0 / model.logit_scale.detach().exp().clamp(1.0, 100.0))
-        """What to divide likenesses by before a softmax, as learnt."""
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "ClipEmbedder":

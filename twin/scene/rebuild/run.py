@@ -17,6 +17,7 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
 from bridge.terminal import Output
+from twin.leaves import has_leaf, load_leaf
 from twin.scene.backdrop import Backdrop, backdrop_of
 from twin.scene.dataset.training_set import (
     TrainingSet,
@@ -25,8 +26,7 @@ from twin.scene.dataset.training_set import (
 )
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
-from twin.scene.foundation.stage import check_models
+from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
 from twin.scene.frames.swept_episode import find_or_sweep_sources
 from twin.scene.gaussians import (
@@ -40,7 +40,6 @@ from twin.scene.gaussians import (
 from twin.scene.objects.decompose import Decomposition, decompose, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
-from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
 from twin.scene.robot.extraction import DrivenRobot, LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
@@ -99,14 +98,16 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         MovedCameraError: When a camera moved that is said to stand still.
         SplatExtensionMissingError: When the native code is not built.
         UsageError: When a model that was named cannot be used.
-        MissingDependencyError: When the extra ``foundation`` is needed and not installed.
+        MissingDependencyError: When a model was named and the leaf or its extra is not installed.
     """
     load_native()
     sources = find_or_sweep_sources(run, config.frames, output)
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)
-    models = check_models(config.models, scanned_tasks(sources).task)
+    models = {}
+    if config.models.any_named:
+        models = load_leaf("check_models")(config.models, scanned_tasks(sources).task)
     key = _key(sources, config, calibration, models)
     done = None if config.force else _already_done(run, key)
     if done is not None:
@@ -117,10 +118,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     training = read_training_set(chosen.choices, config, output)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
-    kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
-    if config.force:
-        kept.path.unlink(missing_ok=True)
-    fitted = _fit(training, config, kept, output)
+    fitted = _fit(training, config, output)
     clock.end("initialise_and_fit")
     completed = _close_holes(training, fitted, config, output)
     clock.end("complete_holes")
@@ -151,13 +149,10 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     )
     record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)
-    kept.path.unlink(missing_ok=True)
     return record
 
 
-def _fit(
-    training: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output
-) -> FitResult:
+def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitResult:
     began_s = time.monotonic()
     first = fuse(training.points, config.initialise, training.views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
@@ -168,7 +163,6 @@ def _fit(
             config.fit,
             advance,
             max_splats=config.initialise.max_splats,
-            checkpoint=kept,
             spent_s=time.monotonic() - began_s,
         )
 
@@ -247,7 +241,9 @@ def _write_parts(
     """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
     output.say("write objects, robot links and the distances to what is static")
     written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
-    return written | write_scene_semantics(
+    if not config.models.any_named and not has_leaf("name_things"):
+        return written
+    return written | load_leaf("name_things")(
         run.scene_dir,
         decomposed,
         training.views,

@@ -1,6 +1,4 @@
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,7 +8,7 @@ import textured_room
 from twin.scene.fit import densify, optimise
 from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import Checkpoint, fit
+from twin.scene.fit.optimise import fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, psnr_db
@@ -133,50 +131,6 @@ def test_errors_are_lifted_from_images_of_both_sizes_the_full_ones_last(
     assert widths == sorted(widths)
 
 
-class StopError(Exception):
-    """The power went out."""
-
-
-def stop_after(count: int) -> Callable[[int, str], None]:
-    def advance(done: int, note: str) -> None:
-        if note.startswith(f"image {count},"):
-            raise StopError
-
-    return advance
-
-
-@pytest.mark.parametrize(
-    ("config", "stop"),
-    [
-        (FitConfig(iterations=14, threads=1), 9),
-        (FitConfig(iterations=150, threads=1), 147),  # among the images that the mean is over
-    ],
-)
-def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
-    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path, config: FitConfig, stop: int
-) -> None:
-    start, views = room
-    most = len(start) + 50
-    whole = fit(start, views, config, lambda *_: None, max_splats=most)
-    kept = Checkpoint(path=tmp_path / "fit.npz", key="this fit", period_s=0.0)
-    with pytest.raises(StopError):
-        fit(start, views, config, stop_after(stop), max_splats=most, checkpoint=kept)
-    steps: list[str] = []
-    resumed = fit(
-        start,
-        views,
-        config,
-        lambda done, note: steps.append(note),
-        max_splats=most,
-        checkpoint=kept,
-    )
-    assert len(steps) == config.iterations - (stop - 1)
-    for name, rows in arrays(whole.cloud):
-        np.testing.assert_array_equal(rows, getattr(resumed.cloud, name))
-    np.testing.assert_array_equal(whole.exposures, resumed.exposures)
-    assert whole.train_psnr_db == resumed.train_psnr_db
-
-
 def test_a_fit_ends_with_the_mean_of_its_last_gaussians(
     room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,31 +148,6 @@ def test_a_fit_ends_with_the_mean_of_its_last_gaussians(
     for name, rows in arrays(fitted.cloud):
         mean = np.mean([getattr(cloud, name) for cloud in seen], axis=0, dtype=np.float64)
         np.testing.assert_allclose(rows, mean, rtol=1e-5, atol=1e-6)
-
-
-def test_a_state_of_other_settings_or_a_damaged_one_is_not_used(
-    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
-) -> None:
-    start, views = room
-    path = tmp_path / "fit.npz"
-    config = replace(ADAM_ALONE, iterations=3)
-    done: list[int] = []
-
-    def run(key: str, num_views: int = len(views)) -> int:
-        done.clear()
-        checkpoint = Checkpoint(path=path, key=key, period_s=0.0)
-        chosen = views[:num_views]
-        fit(start, chosen, config, lambda *_: done.append(1), checkpoint=checkpoint)
-        return len(done)
-
-    assert run("one") == 3
-    assert run("one") == 0
-    assert run("another") == 3
-    path.write_bytes(path.read_bytes()[:5000])
-    assert run("another") == 3
-    path.write_bytes(b"no archive")
-    assert run("another") == 3
-    assert run("another", len(views) - 1) == 3  # written by a version that chose other frames
 
 
 def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(

@@ -99,11 +99,3 @@ def save_dino_vit(folder: Path) -> None:
         image_size=64,
     )
     transformers.DINOv3ViTModel(config).eval().save_pretrained(folder)
-
-
-def save_dino_convnext(folder: Path) -> None:
-    torch.manual_seed(3)
-    config = transformers.DINOv3ConvNextConfig(
-        hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], image_size=64
-    )
-    transformers.DINOv3ConvNextModel(config).eval().save_pretrained(folder)
