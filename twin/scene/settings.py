@@ -298,6 +298,12 @@ class RenderConfig:
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
         refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        if self.out is not None and self.out.suffix.lower() == ".ply":
+            message = (
+                f"--out {self.out}: render writes images. The scene's Gaussians are "
+                "RUN/scene/background.ply and RUN/scene/objects/*/gaussians.ply."
+            )
+            raise UsageError(message)
         for name, place in (("eye", self.eye), ("target", self.target)):
             if place is not None and not all(math.isfinite(value) for value in place):
                 message = f"--{name} {place} is no place: three numbers in metres."

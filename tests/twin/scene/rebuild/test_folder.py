@@ -278,6 +278,7 @@ def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(
         (lambda: InitialiseConfig(footprint_factor=0.0), "--footprint-factor"),
         (lambda: InitialiseConfig(flying_fraction=float("nan")), "--flying-fraction"),
         (lambda: RenderConfig(at_s=float("nan")), "--at-s"),
+        (lambda: RenderConfig(out=Path("a.ply")), "background.ply"),
         (lambda: RenderConfig(width_m=-0.1), "--width-m"),
         (lambda: RenderConfig(eye=(0.0, 0.0, float("nan"))), "--eye"),
     ],
