@@ -105,7 +105,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)
-    models = {}
+    models: dict[str, str] = {}
     if config.models.any_named:
         models = load_leaf("check_models")(config.models, scanned_tasks(sources).task)
     key = _key(sources, config, calibration, models)
@@ -243,7 +243,7 @@ def _write_parts(
     written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
     if not config.models.any_named and not has_leaf("name_things"):
         return written
-    return written | load_leaf("name_things")(
+    named: dict[str, Any] = load_leaf("name_things")(
         run.scene_dir,
         decomposed,
         training.views,
@@ -254,6 +254,7 @@ def _write_parts(
         choices=training.choices,
         task=scanned_tasks(sources).task,
     )
+    return written | named
 
 
 def _evenly_fused(training: TrainingSet, config: RebuildConfig) -> GaussianCloud | None:
