@@ -231,12 +231,6 @@ GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
                 "A trials CSV, for evaluate.",
                 "trials.csv runs/x",
             ),
-            (
-                "splats",
-                "twin.cli:import_splats",
-                "A splat file edited elsewhere, back into the scene.",
-                "edited.ply runs/x",
-            ),
         ),
     ),
     "export": (

@@ -23,7 +23,6 @@ from twin.scene.objects.assignment import assign_splats, object_poses
 
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)
-CAVITY_CM3 = {"open box": 15 * 15 * 5.0, "basket": 26 * 20 * 8.0}
 TASKS = ("cube_into_box", "sloth_into_basket", "five_ducks_into_basket")
 NUM_SCANS = 3
 FIRST_SEED = 1_000_500
@@ -63,7 +62,6 @@ def known_meshes() -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
 def measure(name: str, vertices: np.ndarray, faces: np.ndarray, volume: float) -> list[Target]:
     import cast_views
 
-    from twin.scene.shape.collision import collision_parts, hull_of_points
     from twin.scene.shape.reconstruct import reconstruct
 
     reach = float(np.ptp(vertices, axis=0).max())
@@ -73,33 +71,16 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, volume: float) -
     start = time.process_time()
     shape = reconstruct(views, 0.0)
     seconds = time.process_time() - start
-    start = time.process_time()
-    parts = collision_parts(shape)
-    cutting = time.process_time() - start
     mean, far = cast_views.mean_error_m((shape.vertices_m, shape.faces), (vertices, faces))
-    hull = hull_of_points(np.concatenate([view.points_m() for view in views]))
     ratio = shape.volume_m3 / volume
     rows = [
         Target(what=f"{name}: watertight", measured=float(shape.is_watertight), limit=1.0,
                at_most=False),
         Target(what=f"{name}: mean error", measured=mean * 1e3, limit=2.0, unit="mm",
                reference=f"95 % below {far * 1e3:.2f} mm"),
-        Target(what=f"{name}: volume off by", measured=abs(ratio - 1) * 100, limit=8.0, unit="%",
-               reference=f"hull of the points {(hull.volume_m3 / volume - 1) * 100:+.0f} %"),
-        Target(what=f"{name}: time", measured=seconds, limit=2.0, unit="s",
-               reference=f"{len(parts.parts)} parts in {cutting:.2f} s more, "
-               f"{parts.volume_ratio:.2f} x its volume"),
+        Target(what=f"{name}: volume off by", measured=abs(ratio - 1) * 100, limit=8.0, unit="%"),
+        Target(what=f"{name}: time", measured=seconds, limit=2.0, unit="s"),
     ]  # fmt: skip
-    if name in CAVITY_CM3:
-        held = 0.0 if shape.cavity is None else shape.cavity.volume_m3 * 1e6
-        blocked = 1.0 if parts.cavity_blocked is None else parts.cavity_blocked
-        known = CAVITY_CM3[name]
-        rows += [
-            Target(what=f"{name}: cavity open", measured=held, limit=0.85 * known, unit="cm3",
-                   at_most=False, reference=f"known {known:.0f} cm3"),
-            Target(what=f"{name}: cavity blocked by parts", measured=100 * blocked, limit=0.0,
-                   unit="%"),
-        ]  # fmt: skip
     return rows
 
 
@@ -175,12 +156,6 @@ def scan_rows(name: str, found: Sequence[Any]) -> list[Target]:
         Target(what=f"scanned {name}: volume off by", measured=float(np.median(volumes)),
                limit=8.0, unit="%", reference=f"{signed} % of the truth, worst {max(volumes):.0f}"),
     ]  # fmt: skip
-    cavities = [s.cavity_ratio for s in found if s is not None and s.cavity_ratio is not None]
-    if cavities:
-        rows.append(
-            Target(what=f"scanned {name}: cavity open", measured=100 * min(cavities), limit=85.0,
-                   unit="%", at_most=False, reference="of the known volume, worst")
-        )  # fmt: skip
     return rows
 
 

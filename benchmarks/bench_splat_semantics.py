@@ -32,7 +32,8 @@ from twin.scene.semantics.associate import AssociateConfig
 from twin.scene.semantics.describe import scene_from_masks
 from twin.scene.semantics.lift import lift_features, render_labels
 from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticScene
-from twin.scene.semantics.segment import SegmentConfig, points_of, segment_points
+from twin.scene.semantics.segment import SegmentConfig, points_of
+from twin.scene.semantics.stable_things import segment_stably
 
 NUM_TRAIN = 20
 SEEDS = (0, 1, 2)
@@ -123,7 +124,7 @@ def held_out(world: table_scene.World, scene: SemanticScene, rasteriser: Rasteri
 def default_segmenter(world: table_scene.World) -> list[Target]:
     """Things found among the fused Gaussians, and how well."""
     start = time.process_time()
-    found = segment_points(points_of(world.cloud), SegmentConfig())
+    found = segment_stably(points_of(world.cloud), SegmentConfig())
     seconds = time.process_time() - start
     truth = world.true_instances()
     scores = [best_iou(found.labels, truth == number) for number in world.names]

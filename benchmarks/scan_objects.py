@@ -117,8 +117,6 @@ class ShapeScore:
     """Of the true surface to the reconstructed one, after laying one onto the other: where the
     object is, is another question."""
     volume_ratio: float
-    cavity_ratio: float | None
-    """Volume of the cavity over that of the known one; None where there should be none."""
 
 
 def score_shape(scan: Scanned, key: str) -> ShapeScore | None:
@@ -132,16 +130,10 @@ def score_shape(scan: Scanned, key: str) -> ShapeScore | None:
     truth = true_mesh(scan.start, key)
     laid = laid_onto((shape.vertices_m, shape.faces), truth)
     mean, _ = cast_views.mean_error_m(laid, truth)
-    model = scan.start.task.objects[key]
-    cavity = None
-    if not model.origin_at_centre:
-        held = 0.0 if shape.cavity is None else shape.cavity.volume_m3
-        cavity = held / float(np.prod(model.inner_m))
     return ShapeScore(
         watertight=shape.is_watertight,
         mean_error_m=mean,
         volume_ratio=shape.volume_m3 / abs(volume_m3(*truth)),
-        cavity_ratio=cavity,
     )
 
 

@@ -4,6 +4,14 @@ from collections.abc import Sequence
 
 from bridge.errors import UsageError
 
+FIXED = (
+    *("start-rad", "start-m", "start-overlap-m", "max-contact-depth-m", "pre-grasp-depth-m"),
+    *("pre-grasp-soft-depth-m", "max-slip-m", "moved-m", "path-step-s", "max-joint-step-rad"),
+    *("squeeze-m", "grip-delay-s", "physics.finger-speed-m-s", "physics.soft-substeps"),
+    "physics.soft-stiffness-scale",
+)
+"""Settings of a replay that are constants now."""
+
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
@@ -32,6 +40,43 @@ GONE: dict[str, str] = {
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
+    "import splats": (
+        "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."
+    ),
+    **dict.fromkeys(
+        ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
+        "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
+    ),
+    "rebuild --depth-model": "Depth that nobody measured is found by comparing views.",
+    **dict.fromkeys(
+        ("rebuild --generator", "rebuild --generator-timeout-s"),
+        "Shapes are carved from what the cameras saw.",
+    ),
+    "render --rate-hz": "One frame is drawn for each recorded image.",
+    **dict.fromkeys(
+        ("replay --grasp", "gate --grasp"), "A grasp holds by friction, as the robot's does."
+    ),
+    **dict.fromkeys(
+        ("replay --engines-must-agree", "gate --engines-must-agree"),
+        "--engine both replays in both and says where they differ.",
+    ),
+    "replay --relocalise": "Remove the run's derived/*.localised.*.mcap; the next replay makes them.",
+    "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
+    "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
+    **dict.fromkeys(
+        (
+            *(f"{command} --replay.{name}" for command in ("replay", "gate") for name in FIXED),
+            "gate --max-audit-distances",
+            "gate --frames",
+            "gate --max-frame-age-s",
+            "gate --max-silence-s",
+            "gate --max-joint-age-s",
+            "gate --other-scene-m",
+            "gate --moved-m",
+            "gate --moved-rad",
+        ),
+        "It is a constant now; docs/replay.md and docs/gate.md give its value.",
+    ),
 }
 """By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""
 

@@ -97,7 +97,7 @@ def render(
     config: RenderConfig = RENDER,
     output: Output = OUTPUT,
 ) -> int:
-    """Draw the rebuilt scene: one image in any state, or a whole trial or replay as a video.
+    """Draw the rebuilt scene: one image in any state, or a whole trial as a video.
 
     Example: robot-gst render runs/monday --camera wrist --at-s 3 --object cube=0.5,-0.1,0.02
     Example: robot-gst render runs/monday --episode trial_0001 --camera side --out trial.mp4
@@ -112,43 +112,13 @@ def render(
     from twin.scene.render import render as render_scene
 
     if config.is_sequence:
-        from twin.replay.rebuilt_scene import correction_of
         from twin.scene.sequence import describe_sequence, render_sequence
-        from twin.scene.store.calibration import read_calibration
 
-        run_folder = RunFolder.open(run)
-        correction = correction_of(read_calibration(run_folder))
-        sequence = render_sequence(run_folder, config, correction.as_seen)
+        sequence = render_sequence(RunFolder.open(run), config)
         output.result(sequence, describe_sequence(sequence))
         return 0
     drawn = render_scene(RunFolder.open(run), config)
     output.result(drawn, describe_drawn(drawn))
-    return 0
-
-
-def import_splats(
-    file: Path,
-    run: Path,
-    /,
-    *,
-    object: str = "",
-    output: Output = OUTPUT,
-) -> int:
-    """Take a splat file edited elsewhere (SuperSplat) back into the rebuilt scene.
-
-    Example: robot-gst import splats edited.ply runs/monday
-
-    Args:
-        file: PLY file with Gaussians, in the frame it had when it left the scene folder.
-        run: Run folder with a rebuilt scene.
-        object: Object whose Gaussians these are; empty: the background, which makes a new scene.
-        output: How to talk.
-    """
-    from bridge.episode.run_folder import RunFolder
-    from twin.scene.store.folder import describe_edit, take_back
-
-    about = take_back(RunFolder.open(run), file, object)
-    output.result(about, describe_edit(about))
     return 0
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from bridge.episode.streams import RgbdFrame
-from twin.scene.fit.camera_correction import align_view
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
@@ -92,19 +91,6 @@ def median_depth_error_m(cloud: GaussianCloud, frames: list[RgbdFrame]) -> float
     views = [training_view(FrameSurface(frame, limits)) for frame in frames]
     drawn = {"scene": lambda camera, T: rasteriser.view(cloud, camera, T).depth_m}
     return depth_scores(drawn, views)["scene"].median_abs_m
-
-
-def score_aligned(cloud: GaussianCloud, frames: list[RgbdFrame]) -> Scores:
-    """After pose (6) and gain (3) were fitted to each held-out image: not strictly held out."""
-    rasteriser = Rasteriser(RasterConfig())
-    limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=0.03)
-    drawn = []
-    for frame in frames:
-        view = training_view(FrameSurface(frame, limits))
-        aligned = align_view(cloud, view.half, view.full, frame.T_base_color, rasteriser)
-        image = np.clip(np.moveaxis(aligned.image, 0, -1), 0, 1)
-        drawn.append(np.rint(image * 255).astype(np.uint8))
-    return compare(drawn, frames)
 
 
 def mean_image_psnr_db(train: list[RgbdFrame], held_out: list[RgbdFrame]) -> float:

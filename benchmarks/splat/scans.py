@@ -47,12 +47,11 @@ def shelf_scan(source: Path, folder: Path) -> RunFolder:
 
 
 def rebuilt(run: RunFolder, budget_s: float) -> Mapping[str, Any]:
-    """Rebuild with held-out views drawn also where they fit best; the content of scene.json."""
+    """Rebuild within a time; the content of scene.json."""
     from twin.scene.rebuild.run import rebuild
-    from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
+    from twin.scene.settings import FitConfig, RebuildConfig
 
-    config = RebuildConfig(frames=FrameConfig(align_holdout=True), fit=FitConfig(budget_s=budget_s))
-    return rebuild(run, config, QUIET)
+    return rebuild(run, RebuildConfig(fit=FitConfig(budget_s=budget_s)), QUIET)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +63,7 @@ class HeldOut:
 
 
 def held_out(run: RunFolder, record: Mapping[str, Any]) -> dict[str, HeldOut]:
-    """By variant (raw, gain, pose_gain, static), as the evaluator scores them."""
+    """By variant (raw, gain, static), as the evaluator scores them."""
     from evaluator.compare.images.scores import images_of, score_views
 
     still = {item["id"] for item in record["cameras"] if item["stationary"]}

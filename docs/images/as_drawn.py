@@ -18,11 +18,9 @@ from PIL import Image
 from side_by_side import write_rows
 
 from bridge.episode.run_folder import RunFolder
-from twin.replay.rebuilt_scene import correction_of
 from twin.scene.render import render
 from twin.scene.sequence import describe_sequence, render_sequence
 from twin.scene.settings import RenderConfig
-from twin.scene.store.calibration import read_calibration
 
 INSTANTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Shares of the time that both cameras recorded."""
@@ -33,10 +31,9 @@ REST_MS = 1500
 
 def trial_frames(run: RunFolder, episode: str, camera: str) -> dict[int, np.ndarray]:
     """Recorded, twin and difference beside each other, by milliseconds since the first frame."""
-    correct = correction_of(read_calibration(run)).as_seen
     with TemporaryDirectory() as scratch:
         config = RenderConfig(episode=episode, camera=camera, compare=True, out=Path(scratch) / "x")
-        print(describe_sequence(render_sequence(run, config, correct)))
+        print(describe_sequence(render_sequence(run, config)))
         paths = sorted((Path(scratch) / "x").glob("*.png"))
         return {int(path.stem): np.asarray(Image.open(path)) for path in paths}
 

@@ -426,8 +426,6 @@ def _lattice(folder: Path, model: ObjectModel) -> tuple[Mapping[str, np.ndarray]
         return None, f"{TASK_SHAPE} (an extent of the scene's lattice is {off:.0%} off)"
     arrays = {
         "nodes_m": found.nodes_m,
-        "springs": found.springs,
-        "rest_lengths_m": found.rest_lengths_m,
         "tets": found.tets,
         "mass_fraction": found.mass_fraction,
         "spacing_m": np.array(found.spacing_m),

@@ -34,11 +34,6 @@ def degree_of(num_harmonics: int) -> int:
     return NUM_HARMONICS.index(num_harmonics)
 
 
-def degrees_of(num_harmonics: int) -> np.ndarray:
-    """The degree of each of so many harmonics."""
-    return np.repeat(range(1, HIGHEST + 1), np.diff(NUM_HARMONICS))[:num_harmonics]
-
-
 def harmonic_terms(x: Any, y: Any, z: Any, num_harmonics: int) -> list[Any]:
     """Values of the harmonics along unit directions, arrays of NumPy or of torch.
 

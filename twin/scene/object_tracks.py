@@ -1,4 +1,4 @@
-"""Where the objects of an episode were at any instant: as localised, carried, or replayed.
+"""Where the objects of an episode were at any instant: as localised, and carried in between.
 
 A trial is localised while nothing is executed. In between nobody looks, but the joints and the
 fingers say what happened: an object between the fingers when they stop closing goes with the tool
@@ -8,7 +8,7 @@ where it is put down. An object that is found far from where it was let go fell,
 and one that was never held was moved by something else: both change place when that is known.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +18,6 @@ from bridge.episode import streams
 from bridge.episode.executions import executed_events
 from bridge.episode.reader import Episode
 from bridge.geometry import se3
-from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.task_file import ObjectModel, Task
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack
@@ -93,8 +92,6 @@ class ObjectTracks:
 
     spans: Mapping[str, Sequence[_Span]] = field(default_factory=dict)
     """By object, in the order of time; the first also grasps before it."""
-    paths: Mapping[str, PoseTrajectory] = field(default_factory=dict)
-    """Objects whose poses are known at every instant, as in a replay."""
     absent: frozenset[str] = frozenset()
     """Objects that nobody found: they are not drawn."""
     notes: tuple[str, ...] = ()
@@ -106,7 +103,7 @@ class ObjectTracks:
         Args:
             scanned: Objects of the rebuilt scene.
         """
-        known = {*self.spans, *self.paths}
+        known = {*self.spans}
         if not known:
             return []
         drawn = [*scanned]
@@ -128,8 +125,6 @@ class ObjectTracks:
                 stays where it was taken.
         """
         found = {}
-        for name, track in self.paths.items():
-            found[name] = track.at(np.array([stamp_ns])).transforms()[0]
         for name, spans in self.spans.items():
             begun = [span for span in spans if span.start_ns <= stamp_ns]
             span = begun[-1] if begun else spans[0]
@@ -141,26 +136,6 @@ class ObjectTracks:
                 rests = [item for item in begun or spans if isinstance(item, _Rest)]
                 found[name] = rests[-1].T_base_object
         return found
-
-
-def replayed_tracks(
-    episode: Episode,
-    as_seen: Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]] | None = None,
-) -> ObjectTracks:
-    """The poses that a derived episode has of its objects.
-
-    Args:
-        episode: The replay.
-        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
-    """
-    paths = {}
-    for name, topic in streams.object_pose_topics(episode).items():
-        track = streams.pose_track(episode, topic)
-        if as_seen is not None:
-            q, p = se3.split(np.stack([as_seen(T) for T in track.transforms()]))
-            track = PoseTrajectory(track.stamps_ns, p, q)
-        paths[name] = track
-    return ObjectTracks(paths=paths)
 
 
 def localised_tracks(

@@ -20,9 +20,8 @@ from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
-from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.other_viewers import for_other_viewers
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import RenderConfig
@@ -211,7 +210,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
-    """Write one image of the scene, or its Gaussians, and return what was drawn.
+    """Write one image of the scene, and return what was drawn.
 
     Args:
         run: Whose scene is drawn.
@@ -235,11 +234,8 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     view = rasteriser.view(composed.cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".ply":
-        write_ply(path, for_other_viewers(composed.cloud, camera, T_base_camera))
-    else:
-        whole = composed.parts.behind(view, camera, T_base_camera)
-        path.write_bytes(encode_png(whole.image_u8()))
+    whole = composed.parts.behind(view, camera, T_base_camera)
+    path.write_bytes(encode_png(whole.image_u8()))
     written = [str(path)]
     if config.depth:
         depth_path = path.with_name(f"{path.stem}_depth.png")

@@ -19,7 +19,6 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
 from bridge.errors import GstError, UsageError
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from twin.robot.model import load_robot
@@ -34,12 +33,11 @@ from twin.scene.image_agreement import (
 )
 from twin.scene.localise.episode import write_localised
 from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.object_tracks import ObjectTracks, localised_tracks, replayed_tracks
+from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.render import (
     camera_of,
-    carried_camera,
     chosen_view,
     depth_image,
     episode_of,
@@ -55,11 +53,8 @@ from twin.scene.store.folder import Scene, read_scene
 
 CRF = 18
 """Quality of the video: hardly to be told from the frames."""
-MOST_FRAMES = 100_000
 OTHER_FILES = (".avi", ".gif", ".h264", ".jpeg", ".jpg", ".mkv", ".mov", ".webm")
 """Files that somebody may ask for and that are not written."""
-
-AsSeen = Callable[[Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,12 +70,9 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInScene:
-    """What an episode says of robot, objects and camera while its scene is drawn."""
+    """What an episode says of robot and objects while its scene is drawn."""
 
     recorded: Episode
-    """Has the cameras; of a replay, the recording it was made from."""
-    shown: Episode
-    """Has joints and objects; the same, or the replay."""
     tracks: ObjectTracks
     postures: PostureTrack | None
     robot: str
@@ -89,53 +81,29 @@ class EpisodeInScene:
     """Instants left out because nobody knows where the camera was."""
 
 
-def open_episode(
-    run: RunFolder, scene: Scene, wanted: str, as_seen: AsSeen | None = None
-) -> EpisodeInScene:
-    """Find an episode by its id, or a replay by its file name, with all that moves in it.
+def open_episode(run: RunFolder, scene: Scene, wanted: str) -> EpisodeInScene:
+    """Find an episode by its id, with all that moves in it.
 
     A recorded trial is localised before and after its executions if it was not yet.
 
     Args:
         run: Whose episodes are looked through.
         scene: The poses are meant for it.
-        wanted: Id of a recorded episode, or name of a replay in ``derived``.
-        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
+        wanted: Id of a recorded episode.
 
     Raises:
         UsageError: There is no such episode; lists those that exist.
     """
-    replay = _replay_named(run, wanted)
-    recorded = episode_of(run, scene, wanted if replay is None else _source_of(replay))
-    shown = recorded if replay is None else replay
-    postures, robot = None, f"joints as {shown.path.stem} has them"
+    recorded = episode_of(run, scene, wanted)
+    postures, robot = None, f"joints as {recorded.path.stem} has them"
     if not scene.record.get("robot", {}).get("links"):
         robot = f"not drawn: {why_no_robot(scene)}"
     try:
-        postures = posture_track(shown)
+        postures = posture_track(recorded)
     except GstError as error:
         robot = f"not drawn: {error}"
-    if replay is not None:
-        tracks = replayed_tracks(replay, as_seen)
-    else:
-        tracks = recorded_tracks(run, scene, recorded, postures)
-    return EpisodeInScene(
-        recorded=recorded, shown=shown, tracks=tracks, postures=postures, robot=robot
-    )
-
-
-def _replay_named(run: RunFolder, wanted: str) -> Episode | None:
-    name = wanted.removesuffix(".mcap")
-    for path in run.derived():
-        if path.stem == name:
-            episode = Episode.open(path)
-            if episode.derived is not None and episode.derived.kind == "replay":
-                return episode
-    return None
-
-
-def _source_of(replay: Episode) -> str:
-    return "" if replay.derived is None else replay.derived.source_episode
+    tracks = recorded_tracks(run, scene, recorded, postures)
+    return EpisodeInScene(recorded=recorded, tracks=tracks, postures=postures, robot=robot)
 
 
 def recorded_tracks(
@@ -168,23 +136,20 @@ def frames_of(
         scene: In whose frame the camera must be known.
         episode: What is drawn.
         camera_id: From where; ``eye`` and ``target`` of the settings go before.
-        config: Rate and camera.
+        config: Camera.
 
     Raises:
         UsageError: When nothing says where the camera was.
     """
-    stamps = _stamps(episode, camera_id, config)
+    stamps = _stamps(episode, camera_id)
     T_chosen = chosen_view(config)
     frame_id = streams.camera_info(episode.recorded, camera_id).frame_id
     tree: TransformTree | None = None
-    T_tcp_camera = None
     unknown = np.zeros(len(stamps), dtype=bool)
     robot = None if episode.postures is None else load_robot(episode.postures.urdf)
     if T_chosen is None:
         tree = poses_in_scene(run, scene, episode.recorded, camera_id, stamps)
-        T_tcp_camera = _in_planned_hand(episode, frame_id, tree)
-        if T_tcp_camera is None:
-            unknown = unknown_mask(tree, [frame_id], stamps)
+        unknown = unknown_mask(tree, [frame_id], stamps)
     for stamp_ns, is_unknown in zip(stamps.tolist(), unknown.tolist(), strict=True):
         if is_unknown:
             episode.unposed.append(stamp_ns)
@@ -196,8 +161,6 @@ def frames_of(
         if robot is not None and posture is not None:
             T_tcp = robot.T_base_tcp(posture.joints_rad)
         T = T_chosen
-        if T is None and T_tcp_camera is not None and T_tcp is not None:
-            T = T_tcp @ T_tcp_camera
         if T is None and tree is not None:
             T = tree.T_root_frame(frame_id, stamp_ns)
         if T is not None:
@@ -205,39 +168,16 @@ def frames_of(
             yield Frame(stamp_ns=stamp_ns, T_base_camera=T, Ts_base_object=places, posture=posture)
 
 
-def _in_planned_hand(
-    episode: EpisodeInScene, frame_id: str, tree: TransformTree
-) -> Float[np.ndarray, "4 4"] | None:
-    """Where a camera sits in the hand, which in a planned replay goes another way than recorded."""
-    derived = episode.shown.derived
-    if derived is None or derived.trajectory != "planned" or episode.postures is None:
-        return None
-    joints = episode.postures.at(int(episode.postures.arm.stamps_ns[0])).joints_rad
-    T_base_camera = carried_camera(episode.recorded, frame_id, joints, tree)
-    if T_base_camera is None:
-        return None
-    T_base_tcp = load_robot(episode.postures.urdf).T_base_tcp(joints)
-    return np.asarray(se3.invert(T_base_tcp) @ T_base_camera)
-
-
-def _stamps(episode: EpisodeInScene, camera_id: str, config: RenderConfig) -> np.ndarray:
+def _stamps(episode: EpisodeInScene, camera_id: str) -> np.ndarray:
     recorded = np.array(_recorded_stamps(episode.recorded, camera_id), dtype=np.int64)
-    first_ns, last_ns = episode.shown.start_ns, episode.shown.end_ns
+    first_ns, last_ns = episode.recorded.start_ns, episode.recorded.end_ns
     if episode.postures is not None:
         first_ns, last_ns = (int(episode.postures.arm.stamps_ns[k]) for k in (0, -1))
-    if config.rate_hz is None or config.compare:
-        stamps = recorded[(recorded >= first_ns) & (recorded <= last_ns)]
-        if config.rate_hz is not None:
-            stamps = stamps[:: max(1, round(_rate_hz(stamps) / config.rate_hz))]
-    else:
-        stamps = np.arange(first_ns, last_ns, round(1e9 / config.rate_hz), dtype=np.int64)
-    if not 0 < len(stamps) <= MOST_FRAMES:
-        message = (
-            f"{len(stamps)} frames of camera {camera_id} in episode {episode.shown.info.id}: "
-            f"choose --rate-hz so that there are 1 to {MOST_FRAMES}."
-        )
+    stamps = recorded[(recorded >= first_ns) & (recorded <= last_ns)]
+    if not len(stamps):
+        message = f"camera {camera_id} recorded no image in episode {episode.recorded.info.id}."
         raise UsageError(message)
-    return stamps
+    return np.asarray(stamps)
 
 
 def _recorded_stamps(episode: Episode, camera_id: str) -> list[int]:
@@ -255,15 +195,12 @@ def _rate_hz(stamps_ns: np.ndarray) -> float:
     return float(1e9 / np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
 
 
-def render_sequence(
-    run: RunFolder, config: RenderConfig, as_seen: AsSeen | None = None
-) -> dict[str, Any]:
+def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """Draw a whole episode to a video or to one PNG a frame, and return what was drawn.
 
     Args:
         run: Whose scene is drawn.
-        config: Episode, camera, rate, size, and where the files go.
-        as_seen: Takes a replayed pose to where cameras see it; None: they see it there.
+        config: Episode, camera, size, and where the files go.
 
     Raises:
         UsageError: When the episode or the camera is unknown, when nothing says where the camera
@@ -274,7 +211,7 @@ def render_sequence(
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
     parts = read_movable_scene(run, scene)
-    episode = open_episode(run, scene, config.episode, as_seen)
+    episode = open_episode(run, scene, config.episode)
     there = {k: item for k, item in parts.objects.items() if k not in episode.tracks.absent}
     parts = replace(parts, objects=there)
     camera_id = camera_of(episode.recorded, config.camera)
@@ -285,12 +222,12 @@ def render_sequence(
         urdf="" if episode.postures is None else episode.postures.urdf,
         camera=sized_camera(info.camera, config.size),
     )
-    out = config.out or run.results_dir / f"{episode.shown.path.stem}.{camera_id}.mp4"
+    out = config.out or run.results_dir / f"{episode.recorded.path.stem}.{camera_id}.mp4"
     comparison = _Comparison.start(run, episode, parts) if config.compare else None
     recorded = _recorded_images(episode.recorded, camera_id) if config.compare else iter(())
     begun_ns: int | None = None
     stamps: list[int] = []
-    with _writer(out, _rate_of(episode, camera_id, config)) as write:
+    with _writer(out, _rate_hz(_stamps(episode, camera_id))) as write:
         for frame in frames_of(run, scene, episode, camera_id, config):
             drawn = artist.draw(frame)
             begun_ns = frame.stamp_ns if begun_ns is None else begun_ns
@@ -308,7 +245,7 @@ def render_sequence(
     return {
         "files": [str(out)],
         "scene_hash": scene.scene_hash,
-        "episode": episode.shown.path.stem,
+        "episode": episode.recorded.path.stem,
         "camera": camera_id,
         "robot": episode.robot,
         "frames": len(stamps),
@@ -401,12 +338,6 @@ class _Comparison:
         self.agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
         difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
         return np.concatenate([recorded_u8, drawn.image_u8, difference.astype(np.uint8)], axis=1)
-
-
-def _rate_of(episode: EpisodeInScene, camera_id: str, config: RenderConfig) -> float:
-    if config.rate_hz is not None:
-        return config.rate_hz
-    return _rate_hz(np.array(_recorded_stamps(episode.recorded, camera_id), dtype=np.int64))
 
 
 Write = Callable[[int, Mapping[str, np.ndarray]], None]

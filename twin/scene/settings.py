@@ -78,11 +78,6 @@ class FrameConfig:
     """Where one number makes the depth of a moving camera agree clearly better (a factor of its
     depth, its focal length, or how late its poses are), use that number instead of the recorded
     one. Without this it is said, and refused where the difference is large."""
-    align_poses: bool = False
-    """Lay the depth of each training frame onto all others before the fit, for rough poses."""
-    align_holdout: bool = False
-    """Draw held-out views a second time, with pose and brightness fitted to each of them; numbers
-    made from these are named aligned."""
 
     def __post_init__(self) -> None:
         """Refuse to hold out every frame, or to learn from none."""
@@ -170,17 +165,13 @@ class FitConfig:
     appearance_steps: int = 4
     """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
     than six follow the noise."""
-    harmonics: Literal[0, 1, 2, 3] = 1
-    """Degree of the spherical harmonics of colour; 0: one colour from everywhere. Degrees 2 and 3
-    come with the colours that are solved in closed form, for Gaussians that at least 9 and 16 views
-    show."""
-    exposure: Literal["gain", "affine", "none"] = "gain"
-    """What is solved for each frame. gain: a brightness per channel (exposure, white balance);
-    affine: a 3 x 3 matrix and an offset; on average neither changes anything."""
+    harmonics: Literal[0, 1] = 1
+    """Degree of the spherical harmonics of colour; 0: one colour from everywhere."""
+    exposure: Literal["gain", "none"] = "gain"
+    """What is solved for each frame. gain: a brightness per channel (exposure, white balance), on
+    average none."""
     densify: bool = True
     """Split Gaussians where the error is large, drop those that show nothing."""
-    refine_poses: bool = False
-    """Move the cameras too, the first one excepted."""
     seed: int = 0
     """Order of the frames, and nothing else: the rest leaves nothing to chance."""
     threads: int = 0
@@ -194,12 +185,6 @@ class FitConfig:
             message = (
                 f"--appearance-steps {self.appearance_steps} lies outside 0 to "
                 f"{MAX_APPEARANCE_STEPS}: more steps follow the noise."
-            )
-            raise UsageError(message)
-        if self.harmonics > 1 and not self.appearance_steps:
-            message = (
-                f"--harmonics {self.harmonics} needs colours that are solved in closed form: give "
-                "--appearance-steps 1 or more."
             )
             raise UsageError(message)
         if not 0 <= self.slab < math.inf:
@@ -234,19 +219,9 @@ class ModelConfig:
     feature_channels: int = 16
     """Principal components that are kept of each feature."""
     feature_stride: int | None = None
-    """Image pixels per feature; default: the model's own, 16 or 32. Less costs more."""
+    """Image pixels per feature; default: the model's own, 16. Less costs more."""
     clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
-    depth_model: str = ""
-    """Guess distances with depth-anything:FOLDER where colour was seen and no depth measured. Each
-    image's guess is first laid onto the depth measured in it, and not used where it does not fit;
-    without this the views are compared, and where they say nothing the surface beside decides."""
-    generator: str = ""
-    """Program with its arguments that completes the shape of an object from one view, for example
-    SAM 3D Objects in an environment of its own; what it must read and write is in
-    docs/foundation_models.md. Depth decides how large, where, and whether it is used."""
-    generator_timeout_s: float = 900.0
-    """The program is stopped after this time for one object."""
     model_frames: int = 12
     """Training frames the models look at, spread evenly."""
     device: str = "auto"
@@ -255,13 +230,13 @@ class ModelConfig:
     def __post_init__(self) -> None:
         """Refuse to look at nothing."""
         _refuse_below(1, feature_channels=self.feature_channels, model_frames=self.model_frames)
-        if not self.generator_timeout_s > 0:
-            message = (
-                f"--generator-timeout-s {self.generator_timeout_s:g} leaves no time; give more."
-            )
-            raise UsageError(message)
         if self.feature_stride is not None:
             _refuse_below(1, feature_stride=self.feature_stride)
+
+    @property
+    def any_named(self) -> bool:
+        """Whether a model is to be asked at all."""
+        return bool(self.segmenter or self.features or self.clip)
 
 
 @Parameter(name="*")
@@ -294,8 +269,6 @@ class RenderConfig:
     """Seconds after the episode's first sample, by the stamps of its source as on the dashboard;
     when messages arrived does not count. Without it an --episode is drawn from its start to its
     end, and one image is drawn at 0 s."""
-    rate_hz: float | None = None
-    """Frames per second of a whole episode; default: one for each image its camera recorded."""
     size: str = ""
     """WIDTHxHEIGHT of the images in pixels; default: as recorded."""
     compare: bool = False
@@ -319,15 +292,18 @@ class RenderConfig:
     backend: Literal["auto", "cpu", "cuda"] = "cpu"
     """What draws: our own code, or gsplat on a CUDA device; auto takes a GPU if there is one."""
     out: Path | None = None
-    """File to write; default: RUN/results/render.png. With .ply: the Gaussians themselves, so that
-    other viewers show at this distance what the image would. A whole episode: an .mp4 file, or a
-    folder for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
+    """File to write; default: RUN/results/render.png. A whole episode: an .mp4 file, or a folder
+    for one PNG a frame; default: RUN/results/EPISODE.CAMERA.mp4."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that are none."""
-        refuse_outside(
-            self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0), "rate_hz": (0.01, 240.0)}
-        )
+        refuse_outside(self, {"at_s": (0.0, MOST_S), "width_m": (0.0, 1.0)})
+        if self.out is not None and self.out.suffix.lower() == ".ply":
+            message = (
+                f"--out {self.out}: render writes images. The scene's Gaussians are "
+                "RUN/scene/background.ply and RUN/scene/objects/*/gaussians.ply."
+            )
+            raise UsageError(message)
         for name, place in (("eye", self.eye), ("target", self.target)):
             if place is not None and not all(math.isfinite(value) for value in place):
                 message = f"--{name} {place} is no place: three numbers in metres."
@@ -336,7 +312,7 @@ class RenderConfig:
     @property
     def is_sequence(self) -> bool:
         """Whether a whole episode is drawn, and not one image."""
-        if self.out is not None and self.out.suffix.lower() in (".png", ".ply"):
+        if self.out is not None and self.out.suffix.lower() == ".png":
             return False
         one = self.at_s is not None or self.joints is not None
         return not one and bool(self.episode)

@@ -433,8 +433,7 @@ def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanRepor
     found += [f"{name}: {report.remark()}" for name, report in poses.items() if report.remark()]
     if any(_is_unexplained(camera, poses) for camera in usable):
         found.append(
-            "poses that are off by millimetres: --align-poses, or --refine-poses where the images "
-            "say more; by centimetres: --poses odometry"
+            "poses that are off by centimetres: --poses odometry follows the images instead"
         )
     stationary = [camera.name for camera in usable if camera.choice.stationary]
     if any(name in poses and not poses[name].fits for name in stationary):

@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.dataset.geometry_search import check_geometry
 from twin.scene.dataset.masks import (
@@ -17,7 +15,6 @@ from twin.scene.dataset.masks import (
     find_ego_mask,
     find_moving,
 )
-from twin.scene.dataset.refine_poses import refine_poses, with_corrections
 from twin.scene.dataset.scan_check import CameraCheck, ScanReport, check_scan
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView, training_view
@@ -35,7 +32,6 @@ class TrainingSet:
     """What the training frames gave; nothing in it has seen a held-out frame."""
 
     choices: list[FrameChoice]
-    """With the poses the views have now."""
     points: list[PointSet]
     """Static surface points of each training frame."""
     views: list[TrainingView]
@@ -73,7 +69,7 @@ def read_training_set(
 
     Args:
         choices: Which frames of which cameras to read.
-        config: Depth limits and what is checked or refined.
+        config: Depth limits and what is checked.
         output: Told what is remarkable about the scan.
 
     Raises:
@@ -100,11 +96,6 @@ def read_training_set(
     ego_masks = _set_ego_pixels_aside(choices, read, robot)
     shares = {read.cameras[index].name: item.share for index, item in ego_masks.items()}
     points, views, choice_of_view = read.points, read.views, read.choice_of_view
-    moved = list(choices)
-    if config.frames.align_poses:
-        refined = refine_poses(points, views, output)
-        points, views = refined.points, refined.views
-        moved = with_corrections(choices, choice_of_view, views, refined.corrections)
     paths = [choice.episode.path for choice in choices]
     scans = [paths.index(paths[index]) for index in choice_of_view]
     reference_views = choose_reference_views(views, scans)
@@ -122,7 +113,7 @@ def read_training_set(
     for remark in report.remarks():
         output.say(remark)
     return TrainingSet(
-        choices=moved,
+        choices=list(choices),
         points=points,
         views=views,
         choice_of_view=choice_of_view,
@@ -176,28 +167,6 @@ def _set_ego_pixels_aside(
             read.points[place] = mask.drop_from(read.points[place], read.views[place])
             read.views[place] = mask.mask_in(read.views[place])
     return found
-
-
-def with_fitted_poses(
-    training: TrainingSet, Ts_base_color: Float[np.ndarray, "num_views 4 4"]
-) -> TrainingSet:
-    """Carry the poses the fit ended with into views and choices, for all that comes after.
-
-    Args:
-        training: With the poses the fit began with.
-        Ts_base_color: Poses of the colour cameras after the fit, in the order of the views.
-    """
-    found: list[dict[int, np.ndarray]] = [dict(choice.corrections) for choice in training.choices]
-    views = list(training.views)
-    for index, (owner, T) in enumerate(zip(training.choice_of_view, Ts_base_color, strict=True)):
-        view = views[index]
-        if np.allclose(T, view.T_base_color, atol=1e-9):
-            continue
-        before = found[owner].get(view.stamp_ns, np.eye(4))
-        found[owner][view.stamp_ns] = T @ se3.invert(view.T_base_color) @ before
-        views[index] = replace(view, T_base_color=T)
-    choices = [replace(c, corrections=T) for c, T in zip(training.choices, found, strict=True)]
-    return replace(training, views=views, choices=choices)
 
 
 def _stride(num_frames: int, num_pixels: int) -> int:

@@ -1,10 +1,8 @@
-"""Colours and features in closed form: with the geometry fixed, an image is linear in them.
+"""Colours in closed form: with the geometry fixed, an image is linear in them.
 
 A view is A c with A = alpha T, the weight of each Gaussian in each pixel (paper Eq. 2 with the
 product transmittance). All views together make a least-squares problem that a few steps of
-conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image). The feature
-term of the paper's Eq. 3, lambda_f sum |A f - F|^2, meets the other terms only through the geometry
-in A, so it is solved the same way afterwards and does not depend on lambda_f.
+conjugate gradients solve; A is never stored, only drawn (A c) and lifted (A^T image).
 """
 
 import math
@@ -13,12 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Float, Float32
 
-from bridge.geometry.camera import Camera
 from twin.scene.frames.rgbd import Target
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.harmonics import HIGHEST, NUM_FIRST, degrees_of, harmonic_basis
+from twin.scene.harmonics import harmonic_basis
 from twin.scene.raster.rasteriser import Rasteriser
 
 
@@ -45,11 +42,7 @@ UNLIMITED = Allowance()
 RIDGE_COLOR = 0.05
 """Pull of a colour towards its start, in squared weights of a pixel."""
 RIDGE_HARMONICS = 0.5
-"""Stronger: a Gaussian seen from few directions says little about the others. This is degree 1's;
-the pull grows with the square of l (l + 1), the Laplacian of degree l: among all colours over the
-sphere that explain the images equally well the one that bends least."""
-SEEN_WEIGHT = 0.5
-"""A view shows a Gaussian when its weights in the pixels add up to this."""
+"""Stronger: a Gaussian seen from few directions says little about the others."""
 LEAST_STEPS = 2
 """With fewer steps a solution is not worth its time: Adam uses it better."""
 
@@ -61,7 +54,7 @@ class ImageObservation:
     target: Target
     T_base_camera: Float[np.ndarray, "4 4"]
     exposure: Float[np.ndarray, "3 4"]
-    """Times the scene's (red, green, blue, 1) gives the recorded colour."""
+    """Times the scene's (red, green, blue, 1) gives the recorded colour: a factor per channel."""
 
     def exposed(
         self, drawn: Float32[np.ndarray, "3 height width"]
@@ -90,11 +83,9 @@ def solve_appearance(
 ) -> Appearance:
     """Minimise sum |E A (c + sum_k Y_k h_k) - I|^2 + ridge |x - x_start|^2 over colours x = (c, h).
 
-    Conjugate gradients with a diagonal preconditioner, the three channels side by side unless an
-    exposure E mixes them. The diagonal is A^T A 1, which bounds A^T A from above. Pixels outside a
-    static mask do not enter, Gaussians that no pixel shows keep their colours. Harmonics of degree
-    2 and 3 are only given to Gaussians that at least (l + 1)^2 views show, as many as there are
-    harmonics up to that degree with the constant one; the others keep those they have.
+    Conjugate gradients with a diagonal preconditioner, the three channels side by side. The
+    diagonal is A^T A 1, which bounds A^T A from above. Pixels outside a static mask do not enter,
+    Gaussians that no pixel shows keep their colours.
 
     Args:
         cloud: Where to start; its harmonics are solved too if it has any.
@@ -112,7 +103,7 @@ def solve_appearance(
         return Appearance(cloud=cloud, steps=0)
     right, diagonal = equations
     change, done = conjugate_gradients(
-        model.normal, right, diagonal, steps=int(min(steps, affordable)), coupled=model.coupled
+        model.normal, right, diagonal, steps=int(min(steps, affordable))
     )
     solved = start + change
     painted = replace(cloud, colors=as_float32(solved[:, 0]), harmonics=as_float32(solved[:, 1:]))
@@ -125,9 +116,8 @@ def conjugate_gradients(
     diagonal: Float32[np.ndarray, "num_splats num_terms channels"],
     *,
     steps: int,
-    coupled: bool = False,
 ) -> tuple[Float32[np.ndarray, "num_splats num_terms channels"], int]:
-    """Solve ``apply(x) = right`` from zero, each channel a system of its own unless ``coupled``.
+    """Solve ``apply(x) = right`` from zero, each channel a system of its own.
 
     Hestenes and Stiefel 1952 with a diagonal preconditioner. Ends early when ``apply`` gives None.
     Returns x and the steps taken.
@@ -137,13 +127,12 @@ def conjugate_gradients(
         right: The right-hand side.
         diagonal: Of the matrix, above zero.
         steps: At most so many.
-        coupled: Whether ``apply`` mixes channels.
     """
     x = np.zeros_like(right)
     residual = right.copy()
     scaled = residual / diagonal
     direction = scaled.copy()
-    size = _dots(residual, scaled, coupled)
+    size = _dots(residual, scaled)
     enough = 1e-12 * size
     for step in range(steps):
         if np.all(size <= enough):
@@ -151,19 +140,18 @@ def conjugate_gradients(
         applied = apply(direction)
         if applied is None:
             return x, step
-        length = size / np.maximum(_dots(direction, applied, coupled), 1e-30)
+        length = size / np.maximum(_dots(direction, applied), 1e-30)
         x += length.astype(np.float32) * direction
         residual -= length.astype(np.float32) * applied
         scaled = residual / diagonal
-        before, size = size, _dots(residual, scaled, coupled)
+        before, size = size, _dots(residual, scaled)
         direction = scaled + (size / np.maximum(before, 1e-30)).astype(np.float32) * direction
     return x, steps
 
 
-def _dots(a: np.ndarray, b: np.ndarray, coupled: bool) -> np.ndarray:
-    """Inner product per channel, or of all together; summed in double precision."""
-    dots = np.einsum("nkc,nkc->c", a, b, dtype=np.float64)
-    return dots.sum(keepdims=True) if coupled else np.asarray(dots)
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner product per channel, summed in double precision."""
+    return np.asarray(np.einsum("nkc,nkc->c", a, b, dtype=np.float64))
 
 
 class _ImageModel:
@@ -180,15 +168,8 @@ class _ImageModel:
         self._allowance = allowance
         self._observations = observations
         self._rasteriser = rasteriser
-        degrees = degrees_of(cloud.num_harmonics)
-        bending = np.square(degrees * (degrees + 1) / 2)
-        ridge = np.concatenate([[RIDGE_COLOR], RIDGE_HARMONICS * bending])
+        ridge = np.array([RIDGE_COLOR] + [RIDGE_HARMONICS] * cloud.num_harmonics)
         self._ridge = ridge.astype(np.float32)[None, :, None]
-        self._given: Bool[np.ndarray, "num_splats num_terms"] | None = None
-        """Which harmonics a Gaussian is given; None: all there are."""
-        self.coupled = any(
-            np.any(item.exposure[:, :3] != np.diag(np.diag(item.exposure))) for item in observations
-        )
 
     def affordable_passes(self, start: np.ndarray) -> float:
         """How often all images fit into the allowance, judged by the first."""
@@ -208,7 +189,6 @@ class _ImageModel:
         """
         right, diagonal = np.zeros_like(start), np.zeros_like(start)
         diagonal += self._ridge
-        num_views = np.zeros(len(start), dtype=np.int64)
         for item in self._observations:
             if self._allowance.is_over():
                 return None
@@ -220,13 +200,9 @@ class _ImageModel:
             pulled = np.tensordot(M.T.astype(np.float32), missing, axes=1)
             maps = np.concatenate([pulled, (planes[4] * mask)[None]])
             lifted = self._rasteriser.lift(maps)
-            num_views += lifted[:, 3] > SEEN_WEIGHT
             right += basis[:, :, None] * lifted[:, None, :3]
             squared = np.square(M).sum(axis=0).astype(np.float32) * lifted[:, 3:]
             diagonal += np.square(basis)[:, :, None] * squared[:, None, :]
-        if self._cloud.num_harmonics > NUM_FIRST:
-            self._given = _given_terms(num_views, self._cloud.num_harmonics)
-            right *= self._given[:, :, None]
         return right, diagonal
 
     def normal(self, x: np.ndarray) -> np.ndarray | None:
@@ -252,89 +228,8 @@ class _ImageModel:
             ray = self._cloud.means_m - item.T_base_camera[:3, 3].astype(np.float32)
             ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray))[:, None] + np.float32(1e-12)
             basis[:, 1:] = harmonic_basis(ray, basis.shape[1] - 1)
-        return basis if self._given is None else basis * self._given
+        return basis
 
     def _draw(self, x: np.ndarray, item: ImageObservation) -> np.ndarray:
         cloud = replace(self._cloud, colors=as_float32(x[:, 0]), harmonics=as_float32(x[:, 1:]))
         return self._rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
-
-
-def _given_terms(
-    num_views: Int64[np.ndarray, " num_splats"], num_harmonics: int
-) -> Bool[np.ndarray, "num_splats num_terms"]:
-    """Whether enough views show a Gaussian for each term; the colour and degree 1 always."""
-    needed = np.square(np.concatenate([[0], degrees_of(num_harmonics)]) + 1)
-    needed[: 1 + NUM_FIRST] = 0
-    return np.asarray(num_views[:, None] >= needed)
-
-
-def degree_shares(cloud: GaussianCloud) -> dict[int, float]:
-    """Share of the Gaussians that have harmonics of each degree above 1; empty where none may."""
-    degrees = degrees_of(cloud.num_harmonics)
-    has = np.asarray(cloud.harmonics.any(axis=2))
-    return {
-        degree: float(np.mean(has[:, degrees == degree].any(axis=1)))
-        for degree in range(2, HIGHEST + 1)
-        if degree in degrees
-    }
-
-
-RIDGE = 0.05
-"""Pull of a feature towards its start, in squared weights of a pixel."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureObservation:
-    """One map of image features, at whatever size the network gave it."""
-
-    camera: Camera
-    """Of the map: ``camera.scaled(1 / stride)``."""
-    T_base_camera: Float[np.ndarray, "4 4"]
-    values: Float32[np.ndarray, "num_features height width"]
-    valid_mask: Bool[np.ndarray, "height width"]
-
-
-def solve_features(
-    cloud: GaussianCloud,
-    observations: Sequence[FeatureObservation],
-    rasteriser: Rasteriser,
-    *,
-    steps: int,
-    start: Float32[np.ndarray, "num_splats num_features"] | None = None,
-) -> Float32[np.ndarray, "num_splats num_features"]:
-    """Features of the Gaussians that explain all maps best; the start where nothing is seen.
-
-    Args:
-        cloud: Geometry and opacity, fixed.
-        observations: Maps of the same features.
-        rasteriser: Draws and lifts.
-        steps: Conjugate gradient steps, at most.
-        start: Where to begin, and what features are pulled to; zero if not given.
-    """
-    num_features = observations[0].values.shape[0]
-    begin = np.zeros((len(cloud), num_features), dtype=np.float32) if start is None else start
-    right = np.zeros((len(cloud), 1, num_features), dtype=np.float32)
-    diagonal = np.full((len(cloud), 1, 1), RIDGE, dtype=np.float32)
-    for item in observations:
-        alpha = rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)[4:]
-        missing = item.values - rasteriser.draw_features(np.ascontiguousarray(begin))
-        right[:, 0] += rasteriser.lift(np.where(item.valid_mask, missing, np.float32(0.0)))
-        diagonal[:, 0] += rasteriser.lift(alpha * item.valid_mask)
-
-    def normal(x: np.ndarray) -> np.ndarray:
-        total = np.float32(RIDGE) * x
-        for item in observations:
-            drawn = _draw(cloud, x[:, 0], item, rasteriser)
-            total[:, 0] += rasteriser.lift(drawn * item.valid_mask)
-        return np.asarray(total)
-
-    whole = np.broadcast_to(diagonal, right.shape)
-    change, _ = conjugate_gradients(normal, right, np.ascontiguousarray(whole), steps=steps)
-    return np.asarray(begin + change[:, 0])
-
-
-def _draw(
-    cloud: GaussianCloud, features: np.ndarray, item: FeatureObservation, rasteriser: Rasteriser
-) -> np.ndarray:
-    rasteriser.draw_planes(cloud, item.camera, item.T_base_camera)
-    return rasteriser.draw_features(np.ascontiguousarray(features))

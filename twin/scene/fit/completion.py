@@ -4,14 +4,12 @@ Depth is missing on black and shiny things, beyond the camera's reach and in its
 starts from depth leaves black holes there. Each pixel of a training view in which the fitted scene
 shows nothing asks along its ray: which distance looks alike in the other views (a plane sweep,
 Collins 1996), contradicts none of their measurements, and goes on where the surface beside it ends?
-Where no other view helps, the surface beside it decides. Where something else guesses the distance,
-a network for example, the guess takes the place of that surface and is one more distance to try;
-one that contradicts the measurement of any view is dropped. No depth loss ever applies to these
+Where no other view helps, the surface beside it decides. No depth loss ever applies to these
 Gaussians. They are marked as completed, so that renders can say what was seen.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -47,35 +45,8 @@ RETRIES, FARTHER = 8, 1.1
 """What stands before another view's measurement is moved away this often, by this factor."""
 SMOOTH = 0.03
 """Weight of leaving the surface beside a hole, by the logarithm of the distance, beside colour."""
-GUESS_COST, LEAST_SCATTER = 0.01, 0.01
-"""Weight of leaving a guess by its own scatter, beside colour; and the least scatter of one."""
 SPACING_PX = 1.6
 """Size of a new Gaussian in pixels of the half-size image."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthGuess:
-    """Distances of one view's pixels that nobody measured."""
-
-    depth_m: Float32[np.ndarray, "height width"]
-    """Of the half-size image; 0 where there is none."""
-    scatter: float
-    """Standard deviation of its logarithm about what was measured in the view."""
-
-
-Guesser = Callable[[TrainingView], DepthGuess | None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClosedHoles:
-    """What was added for what nobody measured."""
-
-    cloud: GaussianCloud
-    """Marked as completed."""
-    guessed: Bool[np.ndarray, " num_splats"]
-    """Whose distance was guessed, and not found by comparing views."""
-    num_guessed_px: int
-    """Pixels of holes whose distance was."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +57,6 @@ class _Hole:
     mask: Bool[np.ndarray, "height width"]
     beside_m: Float32[np.ndarray, "height width"]
     """Depth of the nearest pixel in which something is drawn."""
-    guess: DepthGuess | None = None
 
     @property
     def target(self) -> Target:
@@ -98,8 +68,7 @@ def complete_holes(
     views: Sequence[TrainingView],
     config: InitialiseConfig,
     raster: RasterConfig | None = None,
-    guesser: Guesser | None = None,
-) -> ClosedHoles:
+) -> GaussianCloud:
     """Gaussians that close the holes of the training views, marked; none without holes.
 
     Args:
@@ -107,10 +76,8 @@ def complete_holes(
         views: What it was fitted to.
         config: ``completion`` and ``max_splats`` say how many there may be.
         raster: How to draw.
-        guesser: Asked about the distances in a view with holes; None: only views are compared.
     """
     added = cloud.take(np.zeros(0, dtype=np.int64))
-    guessed, num_guessed_px = [np.zeros(0, dtype=bool)], 0
     most = round(config.completion * config.max_splats)
     rasteriser = Rasteriser(raster or RasterConfig())
     holes = [_hole(view, cloud, rasteriser) for view in views]
@@ -120,17 +87,8 @@ def complete_holes(
             break
         hole = _hole(views[index], concatenate([cloud, added]), rasteriser)
         if hole.mask.any():
-            if guesser is not None:
-                hole = replace(hole, guess=guesser(hole.view))
-            closed = _closed(hole, views, config, most - len(added))
-            added = concatenate([added, closed.cloud])
-            guessed.append(closed.guessed)
-            num_guessed_px += closed.num_guessed_px
-    return ClosedHoles(
-        cloud=added.as_completed(),
-        guessed=np.concatenate(guessed),
-        num_guessed_px=num_guessed_px,
-    )
+            added = concatenate([added, _closed(hole, views, config, most - len(added))])
+    return added.as_completed()
 
 
 def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _Hole:
@@ -150,9 +108,9 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
 
 def _closed(
     hole: _Hole, views: Sequence[TrainingView], config: InitialiseConfig, most: int
-) -> ClosedHoles:
+) -> GaussianCloud:
     """Gaussians for the pixels of one view, coarser where they would be too many."""
-    depth_m, guessed = _depth_of(hole, views)
+    depth_m = _depth_of(hole, views)
     step = 1
     while (depth_m[::step, ::step] > 0).sum() > most:
         step += 1
@@ -161,22 +119,17 @@ def _closed(
     camera, T = hole.target.camera, hole.view.T_base_color
     p_camera = camera.unproject(depth_m.astype(np.float64))[chosen]
     colors = np.moveaxis(hole.target.image(), 0, -1)[chosen]
-    allowed, from_guess = np.ones(len(p_camera), dtype=bool), guessed[chosen]
+    allowed = np.ones(len(p_camera), dtype=bool)
     for _ in range(RETRIES):
         _, allowed = _disagreement(se3.apply(T, p_camera), colors, views)
         if allowed.all():
             break
         p_camera[~allowed] *= FARTHER
-        from_guess = from_guess & allowed
     p_camera, colors = p_camera[allowed], colors[allowed]
     towards = -p_camera / np.maximum(np.linalg.norm(p_camera, axis=1, keepdims=True), 1e-9)
     sizes = SPACING_PX * step * p_camera[:, 2] / camera.fx
     normals = towards @ T[:3, :3].T
-    return ClosedHoles(
-        cloud=flat_gaussians(se3.apply(T, p_camera), normals, colors, sizes, config),
-        guessed=from_guess[allowed],
-        num_guessed_px=int(guessed.sum()),
-    )
+    return flat_gaussians(se3.apply(T, p_camera), normals, colors, sizes, config)
 
 
 def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[TrainingView]:
@@ -189,88 +142,30 @@ def _references(view: TrainingView, views: Sequence[TrainingView]) -> list[Train
     return [views[i] for i in usable[np.argsort(baseline_m[usable])][:MOST_REFERENCES].tolist()]
 
 
-class _Hypotheses:
-    """Distances that the pixels of one hole may have, and what speaks against each of them.
-
-    Two sources, judged by the same agreement of colours: distances tried one after another, which
-    cost more the farther they lie from what is expected, and a guess where there is one.
-    """
-
-    def __init__(self, hole: _Hole, views: Sequence[TrainingView]) -> None:
-        """Look along the rays; a guess that contradicts the measurement of any view is dropped."""
-        self._mask = hole.mask
-        self._references = _references(hole.view, views)
-        rows, columns = np.nonzero(hole.mask)
-        self._rays = hole.target.camera.rays()[rows, columns] @ hole.view.T_base_color[:3, :3].T
-        self._origin = hole.view.T_base_color[:3, 3]
-        self._colors = np.moveaxis(hole.target.image(), 0, -1)[rows, columns]
-        beside_m = hole.beside_m[rows, columns].astype(np.float64)
-        self._expected_m, self._weight = beside_m, np.full(len(rows), SMOOTH)
-        self._range_m = (0.7 * beside_m.min(), BEYOND * float(hole.beside_m.max()))
-        self._is_guess = np.zeros(len(rows), dtype=bool)
-        if hole.guess is not None:
-            self._expect(hole.guess, hole.guess.depth_m[rows, columns].astype(np.float64), views)
-
-    def _expect(
-        self,
-        guess: DepthGuess,
-        guess_m: Float[np.ndarray, " num_points"],
-        views: Sequence[TrainingView],
-    ) -> None:
-        """Let a guess take the place of the surface beside the hole, where it is possible."""
-        _, is_possible = self._disagreement(guess_m, views)
-        is_guess = is_possible & (guess_m > 0)
-        if not is_guess.any():
-            return
-        near_m, far_m = self._range_m
-        known_m = guess_m[is_guess]
-        self._range_m = (min(near_m, 0.9 * known_m.min()), max(far_m, 1.1 * known_m.max()))
-        self._expected_m = np.where(is_guess, guess_m, self._expected_m)
-        self._weight[is_guess] = GUESS_COST / max(guess.scatter, LEAST_SCATTER)
-        self._is_guess = is_guess
-
-    def best(
-        self,
-    ) -> tuple[Float[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
-        """Distance of least cost, and where that is the guess; 0 where none is possible."""
-        swept_m, cost = self._swept()
-        if not self._is_guess.any():
-            return swept_m, self._is_guess
-        difference, _ = self._disagreement(self._expected_m, self._references)
-        guess_wins = self._is_guess & (_averaged(difference, self._mask) <= cost)
-        return np.where(guess_wins, self._expected_m, swept_m), guess_wins
-
-    def _swept(self) -> tuple[Float[np.ndarray, " num_points"], Float[np.ndarray, " num_points"]]:
-        """The best of the distances tried by comparing views, and its cost."""
-        depths = np.geomspace(*self._range_m, NUM_DEPTHS)
-        cost = np.empty((NUM_DEPTHS, len(self._rays)))
-        for index, depth in enumerate(depths):
-            difference, is_possible = self._disagreement(depth, self._references)
-            leaving = self._weight * np.abs(np.log(depth / self._expected_m))
-            cost[index] = _averaged(difference, self._mask) + leaving
-            cost[index, ~is_possible] = np.inf
-        return _least(cost, depths), cost.min(axis=0)
-
-    def _disagreement(
-        self, depth_m: Float[np.ndarray, " num_points"] | float, views: Sequence[TrainingView]
-    ) -> tuple[Float[np.ndarray, " num_points"], Bool[np.ndarray, " num_points"]]:
-        p_base = self._origin + np.reshape(depth_m, (-1, 1)) * self._rays
-        return _disagreement(p_base, self._colors, views)
-
-
-def _depth_of(
-    hole: _Hole, views: Sequence[TrainingView]
-) -> tuple[Float32[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Depth of the hole's pixels, smoothed, and where it is the guessed one.
-
-    0 elsewhere, and where every distance contradicts a view.
-    """
+def _depth_of(hole: _Hole, views: Sequence[TrainingView]) -> Float32[np.ndarray, "height width"]:
+    """Depth of the hole's pixels, smoothed; 0 elsewhere, and where every distance contradicts."""
     found = np.zeros(hole.mask.shape, dtype=np.float32)
-    guessed = np.zeros(hole.mask.shape, dtype=bool)
-    found[hole.mask], guessed[hole.mask] = _Hypotheses(hole, views).best()
+    found[hole.mask] = _swept(hole, views)
     around = np.where(found > 0, found, hole.beside_m)
     smooth = ndimage.median_filter(around, size=BLOCK_PX)
-    return np.where(found > 0, smooth, np.float32(0.0)), guessed
+    return np.where(found > 0, smooth, np.float32(0.0))
+
+
+def _swept(hole: _Hole, views: Sequence[TrainingView]) -> Float[np.ndarray, " num_points"]:
+    """Distance of least cost of the hole's pixels; 0 where none is possible."""
+    references = _references(hole.view, views)
+    rows, columns = np.nonzero(hole.mask)
+    rays = hole.target.camera.rays()[rows, columns] @ hole.view.T_base_color[:3, :3].T
+    colors = np.moveaxis(hole.target.image(), 0, -1)[rows, columns]
+    beside_m = hole.beside_m[rows, columns].astype(np.float64)
+    depths = np.geomspace(0.7 * beside_m.min(), BEYOND * float(hole.beside_m.max()), NUM_DEPTHS)
+    cost = np.empty((NUM_DEPTHS, len(rays)))
+    for index, depth in enumerate(depths):
+        p_base = hole.view.T_base_color[:3, 3] + depth * rays
+        difference, is_possible = _disagreement(p_base, colors, references)
+        cost[index] = _averaged(difference, hole.mask) + SMOOTH * np.abs(np.log(depth / beside_m))
+        cost[index, ~is_possible] = np.inf
+    return _least(cost, depths)
 
 
 def _least(

@@ -11,28 +11,23 @@ depth comes out too near. So each Gaussian is held within a ``slab`` around the 
 surface that it began on.
 """
 
-import io
 import math
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from bridge.whole_file import write_whole
 from twin.scene.fit.appearance import Allowance, ImageObservation, solve_appearance
-from twin.scene.fit.camera_correction import CameraCorrections, correction_gradient
 from twin.scene.fit.densify import densify, score
 from twin.scene.fit.exposure import solve_exposures
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
-from twin.scene.harmonics import NUM_FIRST, NUM_HARMONICS, degree_of
+from twin.scene.harmonics import NUM_FIRST
 from twin.scene.raster.rasteriser import (
     SAME_EXPOSURE,
     FitSession,
@@ -108,14 +103,6 @@ class RunningSum:
             rows[:] = self.sums[name] / np.float32(self.count)
 
 
-FIT_STATE = "fit.npz"
-"""In the scene folder while a fit runs, or after one that was interrupted."""
-STATE_VERSION = 5
-SCALARS = ("coarse_steps", "events_done", "num_split", "num_pruned", "colour_steps")
-CAMERA_ARRAYS = ("values", "first", "second", "counts")
-SURFACE_ARRAYS = ("normals", "heights_m", "sizes_m")
-
-
 @dataclass(kw_only=True)
 class FitState:
     """A fit between two steps; the only thing that changes while fitting."""
@@ -125,7 +112,6 @@ class FitState:
     size_m: float
     """Median size of the first Gaussians; positions move in units of it."""
     exposures: Float[np.ndarray, "num_views 3 4"]
-    cameras: CameraCorrections
     surface: SurfacePrior
     """Where the Gaussians began."""
     last: RunningSum = field(default_factory=RunningSum)
@@ -142,106 +128,18 @@ class FitState:
     """Mean squared errors of the last images."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Checkpoint:
-    """Where an interrupted fit goes on from."""
-
-    path: Path
-    key: str
-    """Names the inputs and settings; a file of others is not used."""
-    period_s: float = 10.0
-    """At most this much is lost."""
-
-
 def first_state(session: FitSession, num_views: int) -> FitState:
     """Before the first image.
 
     Args:
         session: Holds the cloud that is to be fitted.
-        num_views: Training images, each with an exposure and a camera correction.
+        num_views: Training images, each with an exposure.
     """
     return FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
         exposures=np.tile(SAME_EXPOSURE, (num_views, 1, 1)),
-        cameras=CameraCorrections.none(num_views),
         surface=SurfacePrior.of(session.cloud),
-    )
-
-
-def save_state(checkpoint: Checkpoint, state: FitState) -> None:
-    """Write the state whole; plain arrays, nothing that runs when read.
-
-    Args:
-        checkpoint: Where to, and the name of the inputs and settings.
-        state: After whole steps.
-    """
-    content: dict[str, np.ndarray] = {
-        "key": np.array(checkpoint.key),
-        "version": np.array(STATE_VERSION),
-        "seconds": np.array(state.seconds),
-        "size_m": np.array(state.size_m),
-        "steps": np.array(state.session.steps),
-        "errors": np.array(state.errors, dtype=np.float64),
-        "num_summed": np.array(state.last.count),
-        "exposures": state.exposures,
-    }
-    content |= {name: np.array(getattr(state, name)) for name in SCALARS}
-    content |= {f"cameras.{name}": getattr(state.cameras, name) for name in CAMERA_ARRAYS}
-    content |= {f"surface.{name}": getattr(state.surface, name) for name in SURFACE_ARRAYS}
-    moments = state.session.moments
-    for name, rows in arrays(state.session.cloud):
-        content[f"cloud.{name}"] = rows
-        content[f"first.{name}"], content[f"second.{name}"] = moments[name]
-    content |= {f"sum.{name}": rows for name, rows in state.last.sums.items()}
-    buffer = io.BytesIO()
-    np.savez(buffer, **content)  # type: ignore[arg-type]  # numpy's stub takes the names for options
-    write_whole(checkpoint.path, buffer.getvalue())
-
-
-def load_state(
-    checkpoint: Checkpoint, make_session: Callable[[GaussianCloud], FitSession]
-) -> FitState | None:
-    """Read the state of an interrupted fit of the same inputs and settings; None if there is none.
-
-    A damaged file, or one of another version, is none.
-
-    Args:
-        checkpoint: Where from, and the name of the inputs and settings.
-        make_session: Begins a session with the cloud that was kept.
-    """
-    try:
-        whole = io.BytesIO(checkpoint.path.read_bytes())
-        with np.load(whole, allow_pickle=False) as stored:
-            content = {name: stored[name] for name in stored.files}
-        if str(content["key"]) != checkpoint.key or int(content["version"]) != STATE_VERSION:
-            return None
-        return _state_from(content, make_session)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-
-
-def _state_from(
-    content: dict[str, np.ndarray], make_session: Callable[[GaussianCloud], FitSession]
-) -> FitState:
-    def part(prefix: str) -> dict[str, np.ndarray]:
-        begin = len(prefix)
-        return {name[begin:]: rows for name, rows in content.items() if name.startswith(prefix)}
-
-    session = make_session(GaussianCloud(**part("cloud.")))
-    second = part("second.")
-    moments = {name: (rows, second[name]) for name, rows in part("first.").items()}
-    session.resume(moments, int(content["steps"]))
-    return FitState(
-        session=session,
-        size_m=float(content["size_m"]),
-        exposures=content["exposures"],
-        cameras=CameraCorrections(**part("cameras.")),
-        surface=SurfacePrior(**part("surface.")),
-        last=RunningSum(sums=part("sum."), count=int(content["num_summed"])),
-        seconds=float(content["seconds"]),
-        errors=content["errors"].tolist(),
-        **{name: int(content[name]) for name in SCALARS},
     )
 
 
@@ -337,7 +235,7 @@ class Events:
         return [
             ImageObservation(
                 target=view.half if coarse else view.full,
-                T_base_camera=state.cameras.pose(index, view.T_base_color),
+                T_base_camera=view.T_base_color,
                 exposure=state.exposures[index],
             )
             for index, view in enumerate(self._views)
@@ -349,16 +247,14 @@ class Events:
                 state.session.cloud,
                 self._observations(state, coarse),
                 self._rasteriser,
-                self._config.exposure,
                 allowance,
             )
 
     def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         self._solve_exposures(state, coarse, allowance)
         cloud = state.session.cloud
-        degree = max(self._config.harmonics, degree_of(cloud.num_harmonics))
         solved = solve_appearance(
-            with_harmonics(cloud, NUM_HARMONICS[degree]),
+            cloud,
             self._observations(state, coarse),
             self._rasteriser,
             steps=self._config.appearance_steps,
@@ -366,11 +262,8 @@ class Events:
         )
         keep_colors_in_range(solved.cloud)
         state.colour_steps += solved.steps
-        if solved.steps and solved.cloud.num_harmonics > cloud.num_harmonics:
-            state.session.rearrange(solved.cloud, np.arange(len(cloud)))
-            return
         cloud.colors[:] = solved.cloud.colors
-        cloud.harmonics[:] = solved.cloud.harmonics[:, : cloud.num_harmonics]
+        cloud.harmonics[:] = solved.cloud.harmonics
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -426,11 +319,6 @@ MEAN_FROM = 0.92
 """From this share of the budget on, the Gaussians are summed at each of these looks; the fit ends
 with their mean, which is without the noise of single images. All events are behind by then, so
 the Gaussians stay the same."""
-POSES_FROM = 0.15
-"""Cameras are moved only once the scene is good enough to say where to."""
-POSES_DEPTH = 0.05
-"""Where cameras are moved, depth weighs only this much of what it does otherwise, and nothing is
-held near the fused surface: the depth of a view that stands wrong is wrong with it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -443,17 +331,15 @@ class FitResult:
     """None: as many as the time allowed."""
     coarse_iterations: int
     seconds: float
-    """Wall time, initialisation and that of an interrupted fit before included."""
+    """Wall time, initialisation included."""
     cpu_seconds: float
-    """Of this process, this time."""
+    """Of this process."""
     train_psnr_db: float | None
     """Over the static pixels of the last images seen, at the size they were fitted at; None when
     there were none."""
     exposures: Float[np.ndarray, "num_views 3 4"]
     """How the colours (red, green, blue, 1) of the scene came out in each training image; on
     average they did not change."""
-    Ts_base_color: Float[np.ndarray, "num_views 4 4"]
-    """Where the training views were in the end; as given unless poses were refined."""
     num_split: int
     num_pruned: int
     colour_steps: int
@@ -472,7 +358,6 @@ def fit(
     advance: Advance,
     *,
     max_splats: int | None = None,
-    checkpoint: Checkpoint | None = None,
     clock: Callable[[], float] = time.monotonic,
     spent_s: float = 0.0,
 ) -> FitResult:
@@ -488,25 +373,19 @@ def fit(
         config: Budget, loss and seed.
         advance: Told the percentage done, the recent PSNR and the time left.
         max_splats: Budget of Gaussians; none: as many as there are at the start.
-        checkpoint: Where to keep the state; a state of the same key is gone on with.
         clock: Seconds that the budget is counted in.
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)
     events = Events(views, config, max_splats or len(cloud), learner.rasteriser)
-    state = None if checkpoint is None else load_state(checkpoint, learner.session)
-    if state is None or len(state.exposures) != len(views):
-        harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
-        state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
-        state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
-    cpu_start, last_saved = time.process_time(), state.seconds
+    harmonics = NUM_FIRST if config.harmonics else cloud.num_harmonics
+    state = first_state(learner.session(with_harmonics(cloud, harmonics)), len(views))
+    state.seconds = min(spent_s, SPENT_AT_MOST * config.limit_s)
+    cpu_start = time.process_time()
     for at in _steps(config, state, clock):
         events.keep(state, at)
         learner.step(state, at)
         advance(round(100 * at.fraction), _note(state, at, len(views)))
-        if checkpoint is not None and at.seconds - last_saved >= checkpoint.period_s:
-            state.seconds = last_saved = at.seconds
-            save_state(checkpoint, state)
     state.last.put_mean_into(state.session.cloud)
     learner.hold(state)
     return FitResult(
@@ -518,7 +397,6 @@ def fit(
         cpu_seconds=time.process_time() - cpu_start,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         exposures=state.exposures,
-        Ts_base_color=np.stack([learner.pose(state, index) for index in range(len(views))]),
         num_split=state.num_split,
         num_pruned=state.num_pruned,
         colour_steps=state.colour_steps,
@@ -566,17 +444,13 @@ class _Learner:
             cloud,
             self.rasteriser.config,
             loss=config.loss,
-            depth_weight=config.depth_weight * (POSES_DEPTH if config.refine_poses else 1.0),
+            depth_weight=config.depth_weight,
         )
 
     def hold(self, state: FitState) -> None:
         """Keep Gaussians near the surface they began on, where that is to be trusted."""
-        if self._config.slab and not self._config.refine_poses:
+        if self._config.slab:
             state.surface.hold(state.session.cloud, self._config.slab)
-
-    def pose(self, state: FitState, index: int) -> np.ndarray:
-        """Where a view is now thought to be."""
-        return state.cameras.pose(index, self._views[index].T_base_color)
 
     def step(self, state: FitState, at: Progress) -> None:
         """Draw one image and follow its gradient."""
@@ -584,22 +458,17 @@ class _Learner:
         index = int(order_of_views(self._config.seed, epoch, len(self._views))[place])
         coarse = at.fraction < self._config.coarse_fraction
         state.coarse_steps += coarse
-        view, pose = self._views[index], self.pose(state, index)
+        view = self._views[index]
         decay = DECAY**at.fraction
         rates = {name: rate * decay for name, rate in RATES.items()}
         rates["means_m"] *= state.size_m
-        if state.session.cloud.num_harmonics > NUM_FIRST:
-            rates["harmonics"] = 0.0  # Adam knows no ridge: it would fit noise to the few views
         report = state.session.step(
-            view.half if coarse else view.full, pose, rates, state.exposures[index]
+            view.half if coarse else view.full, view.T_base_color, rates, state.exposures[index]
         )
         keep_colors_in_range(state.session.cloud)
         if state.session.steps % HOLD_EVERY == 0:
             self.hold(state)
             if at.fraction >= MEAN_FROM:
                 state.last.add(state.session.cloud)
-        if self._config.refine_poses and at.fraction >= POSES_FROM:
-            pulled = correction_gradient(report.T_camera_base, pose)
-            state.cameras.update(index, pulled, decay)
         if report.mse is not None:
             state.errors = [*state.errors[-len(self._views) :], report.mse]

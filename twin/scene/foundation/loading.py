@@ -52,9 +52,6 @@ class WeightsKind:
     licence: str
     speaks: bool = False
     """Whether it takes text and so needs a tokenizer."""
-    backbones: tuple[str, ...] = ()
-    """Values of ``model_type`` that ``backbone_config`` may have; empty: it has no backbone of
-    another kind. A configuration may also name a backbone to fetch: that is refused."""
 
     def wanted(self) -> str:
         """The files a folder needs, in words."""
@@ -85,8 +82,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
     if found_type not in kind.model_types:
         found = f"config.json describes a model of type {found_type!r}, not {kind.model_types[0]!r}"
         raise WeightsError(folder=folder, found=found, kind=kind)
-    if kind.backbones:
-        _check_backbone(config, folder, kind)
     for path in weight_files(folder, kind):
         _check_safetensors(path, folder, kind)
     tokenizers = (("tokenizer.json",), ("vocab.json", "merges.txt"))
@@ -95,18 +90,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
         raise WeightsError(folder=folder, found="there is no tokenizer.json", kind=kind)
     _check_sums(folder, kind)
     return config
-
-
-def _check_backbone(config: dict[str, Any], folder: Path, kind: WeightsKind) -> None:
-    about = config.get("backbone_config")
-    found_type = about.get("model_type") if isinstance(about, dict) else None
-    if found_type not in kind.backbones or config.get("backbone"):
-        found = (
-            f"config.json describes a backbone of type {found_type!r}, not {kind.backbones[0]!r}"
-            if not config.get("backbone")
-            else f"config.json names a backbone to fetch, {config['backbone']!r}"
-        )
-        raise WeightsError(folder=folder, found=found, kind=kind)
 
 
 def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
@@ -290,29 +273,23 @@ def network_input(
     return (torch.cat(rows) / 255.0 - mean) / deviation
 
 
-DTYPES = ("float32", "bfloat16", "float16")
 MAX_PROMPT_CHARACTERS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """Where and how precisely a network runs."""
+    """Where a network runs."""
 
     device: str = "auto"
     """auto: the first CUDA device, or the CPU where there is none."""
-    dtype: str = "float32"
-    """float32, bfloat16 or float16; results are float32 in any case."""
 
-    def resolve(self) -> tuple[Any, Any]:
-        """Return torch's device and number type.
+    def resolve(self) -> Any:
+        """Return torch's device.
 
         Raises:
-            UsageError: For a device or type that is not there.
+            UsageError: For a device that is not there.
         """
         torch = import_torch()
-        if self.dtype not in DTYPES:
-            message = f"number type {self.dtype!r} is unknown; there are {', '.join(DTYPES)}."
-            raise UsageError(message)
         wanted = self.device
         if wanted == "auto":
             wanted = "cuda" if torch.cuda.is_available() else "cpu"
@@ -324,7 +301,7 @@ class Placement:
         if device.type == "cuda" and not torch.cuda.is_available():
             message = f"device {wanted!r} was asked for, but torch finds no CUDA device here."
             raise UsageError(message)
-        return device, getattr(torch, self.dtype)
+        return device
 
 
 def import_transformers() -> Any:
@@ -355,7 +332,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
         folder: Checked by ``check_folder`` first.
         kind: What the folder must hold.
         class_name: Name of the class of ``transformers``.
-        placement: Device and number type.
+        placement: On which device.
 
     Raises:
         WeightsError: When the folder is not whole, or leaves parameters of the network without
@@ -363,7 +340,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
         MissingDependencyError: When ``transformers`` is not installed or does not know the class.
     """
     check_folder(folder, kind)
-    device, dtype = placement.resolve()
+    device = placement.resolve()
     transformers = import_transformers()
     model_class = getattr(transformers, class_name, None)
     if model_class is None:
@@ -376,7 +353,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
             local_files_only=True,
             use_safetensors=True,
             trust_remote_code=False,
-            dtype=dtype,
+            dtype=import_torch().float32,
             output_loading_info=True,
         )
     except _load_errors() as error:

@@ -2,8 +2,7 @@
 
 SAM 3 (Carion et al. 2025): words in, masks out, by text prompts only, because boxes would need
 torchvision's region pooling. DINOv3 (Simeoni et al. 2025): features of every part of an image, from
-a ViT or a ConvNeXt. CLIP (Radford et al. 2021): words and pieces of images in one space. Depth
-Anything (Yang et al. 2024): a depth for every pixel of one image.
+a ViT. CLIP (Radford et al. 2021): words and pieces of images in one space.
 """
 
 from collections.abc import Sequence
@@ -22,7 +21,6 @@ from twin.scene.foundation.loading import (
     Placement,
     Tokenizer,
     WeightsKind,
-    check_folder,
     import_torch,
     load_model,
     network_input,
@@ -149,10 +147,9 @@ class Sam3Segmenter:
         return masks
 
 
-VIT, CONVNEXT = "dinov3_vit", "dinov3_convnext"
 DINOV3_KIND = WeightsKind(
     name="DINOv3",
-    model_types=(VIT, CONVNEXT),
+    model_types=("dinov3_vit",),
     origin="facebook/dinov3-vits16-pretrain-lvd1689m or a larger one",
     licence="DINOv3 License, access on request",
 )
@@ -170,14 +167,9 @@ class DinoFeatures:
         self._model = model
         self._normalisation = read_normalisation(folder, DINOV3_KIND, IMAGENET)
         config = model.config
-        if config.model_type == CONVNEXT:
-            self.cell_px = 4 * 2 ** (len(config.hidden_sizes) - 1)
-            self.num_channels = int(config.hidden_sizes[-1])
-            self._num_first = 1  # the pooled token
-        else:
-            self.cell_px = int(config.patch_size)
-            self.num_channels = int(config.hidden_size)
-            self._num_first = 1 + int(config.num_register_tokens)
+        self.cell_px = int(config.patch_size)
+        self.num_channels = int(config.hidden_size)
+        self._num_first = 1 + int(config.num_register_tokens)
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "DinoFeatures":
@@ -191,10 +183,8 @@ class DinoFeatures:
             WeightsError: When the folder is missing, incomplete or of another kind.
             MissingDependencyError: When the extra ``foundation`` is not installed.
         """
-        config = check_folder(folder, DINOV3_KIND)
-        is_vit = config["model_type"] == VIT
-        name = "DINOv3ViTModel" if is_vit else "DINOv3ConvNextModel"
-        return DinoFeatures(load_model(folder, DINOV3_KIND, name, placement or Placement()), folder)
+        model = load_model(folder, DINOV3_KIND, "DINOv3ViTModel", placement or Placement())
+        return DinoFeatures(model, folder)
 
     def features(
         self,
@@ -210,7 +200,7 @@ class DinoFeatures:
 
         Args:
             images_u8: sRGB images of one size.
-            stride: Image pixels per cell; None: the network's own (16 of a ViT, 32 of a ConvNeXt).
+            stride: Image pixels per cell; None: the network's own.
 
         Raises:
             UsageError: When sizes differ, or the maps would be empty or too large.
@@ -276,8 +266,6 @@ class ClipEmbedder:
         self._normalisation = read_normalisation(folder, CLIP_KIND, CLIP_COLOURS)
         self._side = int(model.config.vision_config.image_size)
         self.num_channels = int(model.config.projection_dim)
-        self.temperature = float(1.0 / model.logit_scale.detach().exp().clamp(1.0, 100.0))
-        """What to divide likenesses by before a softmax, as learnt."""
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "ClipEmbedder":
@@ -384,86 +372,8 @@ def _unit(found: Any) -> np.ndarray:
     return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True), dtype=np.float32)
 
 
-DEPTH_ANYTHING_KIND = WeightsKind(
-    name="Depth Anything",
-    model_types=("depth_anything",),
-    origin="depth-anything/Depth-Anything-V2-Small-hf or another one, relative or metric",
-    licence="Apache 2.0 of the small ones, CC BY-NC 4.0 of the larger",
-    backbones=("dinov2",),
-)
-
-
-class DepthAnything:
-    """Guesses how far away everything in one image is."""
-
-    source = "Depth Anything"
-
-    def __init__(self, model: Any, folder: Path) -> None:
-        """Take a loaded network; ``load`` is the way in."""
-        self._model = model
-        self._normalisation = read_normalisation(folder, DEPTH_ANYTHING_KIND, IMAGENET)
-        self._cell_px = int(model.config.patch_size)
-        self._side_px = int(model.config.backbone_config.image_size)
-        self.is_metric = model.config.depth_estimation_type == "metric"
-
-    @staticmethod
-    def load(folder: Path, placement: Placement | None = None) -> "DepthAnything":
-        """Load weights from a local folder.
-
-        Args:
-            folder: With configuration and weights.
-            placement: Device and precision; None: the first GPU, else the CPU, in float32.
-
-        Raises:
-            WeightsError: When the folder is missing, incomplete or of another kind.
-            MissingDependencyError: When the extra ``foundation`` is not installed.
-        """
-        name = "DepthAnythingForDepthEstimation"
-        model = load_model(folder, DEPTH_ANYTHING_KIND, name, placement or Placement())
-        return DepthAnything(model, folder)
-
-    def predict(
-        self, image_u8: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]
-    ) -> Float32[np.ndarray, "height width"]:
-        """Depth in metres of a metric model; of a relative one, inverse depth up to an affine map.
-
-        Neither is to be trusted before it is aligned with something measured. The image keeps its
-        proportions, up to the network's cells.
-
-        Args:
-            image_u8: sRGB.
-            size: Height and width of the result, which covers the whole image.
-        """
-        torch = import_torch()
-        height, width = self.network_size(image_u8.shape[0], image_u8.shape[1])
-        pixels = network_input([image_u8], (height, width), self._normalisation, mode="bicubic")
-        parameter = next(self._model.parameters())
-        with torch.inference_mode():
-            found = self._model(pixel_values=pixels.to(parameter.device, parameter.dtype))
-            values = torch.nn.functional.interpolate(
-                found.predicted_depth[:, None].float(), size, mode="bilinear", align_corners=False
-            )
-        return np.asarray(values[0, 0].cpu().numpy(), dtype=np.float32)
-
-    def network_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width at which the network sees an image, whole cells both.
-
-        One side is that of the images it was trained on: the one that changes the size less, as
-        its makers do it.
-
-        Args:
-            height: Of the image.
-            width: Of the image.
-        """
-        factors = [self._side_px / side for side in (height, width)]
-        factor = min(factors, key=lambda each: abs(1.0 - each))
-        rows, columns = (max(1, round(factor * side / self._cell_px)) for side in (height, width))
-        return rows * self._cell_px, columns * self._cell_px
-
-
 SEGMENTERS = ("sam3",)
 FEATURES = ("dinov3",)
-DEPTH_MODELS = ("depth-anything",)
 
 
 def split_spec(spec: str, option: str, known: tuple[str, ...]) -> tuple[str, Path]:

@@ -13,7 +13,6 @@ from bridge.errors import UsageError
 from bridge.task.task_file import Task
 from bridge.terminal import Advance
 from twin.scene.foundation import models
-from twin.scene.foundation.complete import generator_command
 from twin.scene.foundation.loading import (
     Placement,
     WeightsKind,
@@ -22,7 +21,6 @@ from twin.scene.foundation.loading import (
     weights_hash,
 )
 from twin.scene.foundation.models import (
-    DEPTH_MODELS,
     FEATURES,
     SEGMENTERS,
     ClipEmbedder,
@@ -84,11 +82,6 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
         named.append(("features", folder, models.DINOV3_KIND))
     if config.clip:
         named.append(("clip", Path(config.clip).expanduser(), models.CLIP_KIND))
-    if config.depth_model:
-        _, folder = split_spec(config.depth_model, "--depth-model", DEPTH_MODELS)
-        named.append(("depth_model", folder, models.DEPTH_ANYTHING_KIND))
-    if config.generator:
-        generator_command(config.generator)
     hashes = {}
     for option, folder, kind in named:
         check_folder(folder, kind)

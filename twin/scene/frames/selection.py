@@ -232,7 +232,7 @@ class FrameChoice:
     spare_ns: frozenset[int] = frozenset()
     """Neither chosen nor held out: the background does not need them, the robot may."""
     corrections: Mapping[int, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """``T_new_old`` in the root frame for frames whose pose was improved, by stamp."""
+    """``T_new_old`` in the root frame for frames whose poses came early or late, by stamp."""
     focal_scale: float = 1.0
     """True focal length divided by the recorded one, of both images."""
 

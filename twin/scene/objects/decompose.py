@@ -9,8 +9,8 @@ guess that keeps renders free of black holes, counted separately in ``scene.json
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import ObjectModel, Task, TaskFile
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
-from twin.scene.foundation.complete import Completed, Shapes
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import FrameChoice, Sources
 from twin.scene.gaussians import (
@@ -226,8 +225,8 @@ def write_objects(
 ) -> dict[str, Any]:
     """Write ``objects/<id>/`` below a scene folder: Gaussians, mesh, ``object.json``.
 
-    A reconstructed object also gets ``sdf.npz``, ``collision/*.ply`` and, when it is soft,
-    ``soft.npz``, all in the object frame.
+    A reconstructed object also gets ``sdf.npz`` and, when it is soft, ``soft.npz``, both in the
+    object frame.
 
     Args:
         folder: The scene folder.
@@ -272,8 +271,8 @@ def _write_geometry(
     """Write the reconstructed shape, or the known one with the reason why."""
     remove_shape(place)
     if not isinstance(shape, str):
-        names, geometry = write_shape(place, shape, model.id, soft=model.soft is not None)
-        source = shape.source or f"reconstructed from {shape.num_views} views"
+        names, geometry = write_shape(place, shape, soft=model.soft is not None)
+        source = f"reconstructed from {shape.num_views} views"
         return names, {"shape_source": source, "geometry": geometry}
     write_whole(place / MESH, mesh_ply(*shape_mesh(model)))
     return [MESH], {"shape_source": TASK_SHAPE, "shape_remark": shape}
@@ -299,9 +298,6 @@ def _object_record(
     }
 
 
-Complete = Callable[[Sequence[TrainingView], Mapping[str, ObjectModel], Poses, Shapes], Completed]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Decomposition:
     """A scene in parts, or whole with the reason why."""
@@ -314,8 +310,6 @@ class Decomposition:
     task: Task | None = None
     shapes: Mapping[str, ObjectShape | str] | None = None
     """Reconstructed from the views, in the frame of each object, or why not."""
-    generated: Mapping[str, Any] = field(default_factory=dict)
-    """What came of asking a shape generator, by object."""
 
     def write(self, run: RunFolder, views: Sequence[TrainingView] = ()) -> dict[str, Any]:
         """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
@@ -333,7 +327,6 @@ class Decomposition:
             "objects_remark": self.remark,
             "filled_splats": len(self.parts.filling),
             "sdf": static,
-            **({"generated": dict(self.generated)} if self.generated else {}),
         }
 
     def surfaces_m(self) -> dict[str, Float[np.ndarray, "_ 3"]]:
@@ -394,7 +387,6 @@ def decompose(
     cloud: GaussianCloud,
     choices: Sequence[FrameChoice],
     views: Sequence[TrainingView] = (),
-    complete: Complete | None = None,
     output: Output | None = None,
     initialise: InitialiseConfig | None = None,
 ) -> Decomposition:
@@ -405,7 +397,6 @@ def decompose(
         cloud: The whole fitted scene.
         choices: Which frames are held out: the objects are not looked for in them.
         views: What the scene was fitted to; objects are reconstructed from them.
-        complete: Asks a shape generator about them; None: nobody is asked.
         output: How to talk; None: say nothing.
         initialise: The shape of new Gaussians; the defaults when None.
 
@@ -436,11 +427,8 @@ def decompose(
     }
     with output.progress("reconstruct objects", len(poses)) as advance:
         shapes = shapes_of(views, task.objects, poses, advance=advance)
-    asked = Completed(shapes=shapes, record={})
-    if complete is not None:
-        asked = complete(views, task.objects, poses, shapes)
-    parts = split_objects(cloud, localised, task, shapes=asked.shapes)
-    parts = closed_parts(parts, poses, asked.shapes, views, initialise or InitialiseConfig())
+    parts = split_objects(cloud, localised, task, shapes=shapes)
+    parts = closed_parts(parts, poses, shapes, views, initialise or InitialiseConfig())
     missing = {key: item.reason for key, item in localised.items() if not item.found}
     remarks = [f"{key} not found: {reason}" for key, reason in missing.items()]
     remark = "; ".join([*tasks.missing, *remarks])
@@ -450,8 +438,7 @@ def decompose(
         parts=parts,
         localised=localised,
         task=task,
-        shapes=asked.shapes,
-        generated=asked.record,
+        shapes=shapes,
     )
 
 

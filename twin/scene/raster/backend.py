@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt16
+from jaxtyping import Float, Float32
 
 from bridge.errors import GstError, MissingDependencyError, UsageError
 from bridge.geometry import se3
@@ -20,7 +20,6 @@ from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.harmonics import harmonic_terms
 from twin.scene.raster.rasteriser import (
-    CloudGradient,
     RasterConfig,
     Rasteriser,
     View,
@@ -64,12 +63,10 @@ def _torch() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class _Drawn:
-    """The last image and what it was made of, for gradients and further channels."""
+    """What the last image was made of, for further channels."""
 
     leaves: dict[str, Any]
     T_camera_base: Any
-    planes: Any
-    visible: np.ndarray
     camera: Camera
 
 
@@ -121,61 +118,16 @@ class CudaRasteriser:
             T_base_camera: Where the camera is.
         """
         torch = self._torch
-        leaves = {
-            name: torch.tensor(rows, device=self._device, requires_grad=True)
-            for name, rows in arrays(cloud)
-        }
+        leaves = {name: torch.tensor(rows, device=self._device) for name, rows in arrays(cloud)}
         T = se3.invert(T_base_camera).astype(np.float32)
-        T_camera_base = torch.tensor(T, device=self._device, requires_grad=True)
+        T_camera_base = torch.tensor(T, device=self._device)
         centre = -T_camera_base[:3, :3].T @ T_camera_base[:3, 3]
         channels = [self._colors(leaves, centre), self._depth_planes(leaves, T_camera_base, camera)]
-        drawn, alpha, about = self._rasterise(
-            leaves, torch.cat(channels, dim=1), T_camera_base, camera
-        )
+        drawn, alpha, _ = self._rasterise(leaves, torch.cat(channels, dim=1), T_camera_base, camera)
         depth = self._depth_of_planes(drawn[0, ..., 3:], camera)
         image = torch.cat([drawn[0, ..., :3], depth, alpha[0]], dim=-1)
-        planes = image.permute(2, 0, 1)
-        radii = about["radii"].reshape(len(cloud), -1)
-        self._drawn = _Drawn(
-            leaves=leaves,
-            T_camera_base=T_camera_base,
-            planes=planes,
-            visible=(radii > 0).all(dim=1).cpu().numpy(),
-            camera=camera,
-        )
-        return self._numpy(planes)
-
-    def pull_back(
-        self,
-        planes: Float32[np.ndarray, "5 height width"],
-        plane_gradients: Float32[np.ndarray, "5 height width"],
-    ) -> CloudGradient:
-        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud.
-
-        Args:
-            planes: What ``draw_planes`` returned; its size is checked.
-            plane_gradients: Of a scalar with respect to them.
-        """
-        drawn = self._last()
-        if planes.shape != tuple(drawn.planes.shape):
-            message = f"planes of shape {planes.shape} are not those drawn last."
-            raise UsageError(message)
-        inputs = [*drawn.leaves.values(), drawn.T_camera_base]
-        upstream = self._torch.tensor(plane_gradients, device=self._device)
-        gradients = self._torch.autograd.grad(
-            drawn.planes, inputs, upstream, retain_graph=True, allow_unused=True
-        )
-        filled = [
-            self._torch.zeros_like(leaf) if gradient is None else gradient
-            for leaf, gradient in zip(inputs, gradients, strict=True)
-        ]
-        named = dict(zip(drawn.leaves, (self._numpy(item) for item in filled[:-1]), strict=True))
-        named.setdefault("harmonics", np.zeros((len(named["means_m"]), 0, 3), dtype=np.float32))
-        return CloudGradient(**named, T_camera_base=self._numpy(filled[-1][:3]))
-
-    def visible_mask(self) -> Bool[np.ndarray, " num_splats"]:
-        """Say which Gaussians could touch the last image."""
-        return self._last().visible
+        self._drawn = _Drawn(leaves=leaves, T_camera_base=T_camera_base, camera=camera)
+        return self._numpy(image.permute(2, 0, 1))
 
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
@@ -205,49 +157,13 @@ class CudaRasteriser:
         blocks = [np.zeros((0, *size), dtype=np.float32)]
         for start in range(0, features.shape[1], CHANNEL_BLOCK):
             block = features[:, start : start + CHANNEL_BLOCK]
-            with self._torch.no_grad():
-                image = self._draw_channels(self._torch.tensor(block, device=self._device))
+            image = self._draw_channels(self._torch.tensor(block, device=self._device))
             blocks.append(self._numpy(image))
         return np.concatenate(blocks)
 
-    def lift(
-        self, maps: Float32[np.ndarray, "num_channels height width"]
-    ) -> Float32[np.ndarray, "num_splats num_channels"]:
-        """Gather maps with the weights of the last ``draw_planes``: A^T M, not normalised."""
-        torch, count = self._torch, len(self._last().visible)
-        blocks = [np.zeros((count, 0), dtype=np.float32)]
-        for start in range(0, len(maps), CHANNEL_BLOCK):
-            block = torch.tensor(maps[start : start + CHANNEL_BLOCK], device=self._device)
-            channels = torch.zeros((count, len(block)), device=self._device, requires_grad=True)
-            # The image is linear in its channels, so their gradient under M is A^T M.
-            (gathered,) = torch.autograd.grad(self._draw_channels(channels), channels, block)
-            blocks.append(self._numpy(gathered))
-        return np.concatenate(blocks, axis=1)
-
-    def label_map(
-        self, labels: UInt16[np.ndarray, " num_splats"]
-    ) -> tuple[UInt16[np.ndarray, "height width"], Float32[np.ndarray, "height width"]]:
-        """Which label has most weight at each pixel of the last image, and how much.
-
-        Of equal weights the smaller label wins; 0 where nothing was drawn.
-        """
-        camera = self._last().camera
-        ids = np.zeros((camera.height, camera.width), dtype=np.uint16)
-        weight = np.zeros((camera.height, camera.width), dtype=np.float32)
-        known = np.unique(labels)
-        for start in range(0, len(known), CHANNEL_BLOCK):
-            block = known[start : start + CHANNEL_BLOCK]
-            weights = self.draw_features((labels[:, None] == block).astype(np.float32))
-            best = weights.argmax(axis=0)
-            most = np.take_along_axis(weights, best[None], axis=0)[0]
-            wins = most > weight
-            ids[wins], weight[wins] = block[best[wins]], most[wins]
-        return ids, weight
-
     def _draw_channels(self, channels: Any) -> Any:
         drawn = self._last()
-        held = {name: leaf.detach() for name, leaf in drawn.leaves.items()}
-        image, _, _ = self._rasterise(held, channels, drawn.T_camera_base.detach(), drawn.camera)
+        image, _, _ = self._rasterise(drawn.leaves, channels, drawn.T_camera_base, drawn.camera)
         return image[0].permute(2, 0, 1)
 
     def _rasterise(
@@ -313,7 +229,7 @@ class CudaRasteriser:
         return self._torch.stack(rows, dim=1).reshape(-1, 3, 3)
 
     def _colors(self, leaves: dict[str, Any], centre: Any) -> Any:
-        """Colours as seen from the camera; their gradient reaches the means through direction."""
+        """Colours as seen from the camera."""
         if "harmonics" not in leaves:
             return leaves["colors"]
         ray = leaves["means_m"] - centre
@@ -329,7 +245,7 @@ class CudaRasteriser:
         return self._drawn
 
     def _numpy(self, values: Any) -> np.ndarray:
-        return np.ascontiguousarray(values.detach().cpu().numpy(), dtype=np.float32)
+        return np.ascontiguousarray(values.cpu().numpy(), dtype=np.float32)
 
 
 def open_rasteriser(config: RasterConfig | None = None) -> Rasteriser | CudaRasteriser:

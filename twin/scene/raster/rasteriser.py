@@ -105,8 +105,6 @@ STAGES = ("draw", "compare", "pull", "learn")
 SAME_EXPOSURE = np.eye(3, 4)
 """Colours as they were drawn."""
 
-Moments = Mapping[str, tuple[np.ndarray, np.ndarray]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StepReport:
@@ -150,22 +148,6 @@ class FitSession:
         self._cloud = _own_copy(cloud)
         self._first = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
         self._second = {name: np.zeros_like(rows) for name, rows in arrays(cloud)}
-
-    @property
-    def moments(self) -> Moments:
-        """Adam's running means of the gradient and of its square, by array; they change too."""
-        return {name: (self._first[name], self._second[name]) for name in self._first}
-
-    def resume(self, moments: Moments, steps: int) -> None:
-        """Take up a fit where another session of the same cloud left it.
-
-        Args:
-            moments: Copied.
-            steps: How many steps that session had made.
-        """
-        self._first = {name: as_float32(first).copy() for name, (first, _) in moments.items()}
-        self._second = {name: as_float32(second).copy() for name, (_, second) in moments.items()}
-        self.steps = steps
 
     @property
     def cloud(self) -> GaussianCloud:
@@ -259,14 +241,8 @@ def _carried(
     known = parents >= 0
     for name, rows in carried.items():
         if name in moments:
-            kept = moments[name][parents[known]]
-            rows[known] = kept if name != "harmonics" else _widened(kept, rows.shape[1])
+            rows[known] = moments[name][parents[known]]
     return carried
-
-
-def _widened(harmonics: np.ndarray, count: int) -> np.ndarray:
-    """The same with zeros for more harmonics."""
-    return np.pad(harmonics, ((0, 0), (0, count - harmonics.shape[1]), (0, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)

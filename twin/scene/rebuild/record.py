@@ -9,12 +9,9 @@ from typing import Any
 
 from bridge.episode import provenance, streams
 from twin.scene.dataset.training_set import TrainingSet
-from twin.scene.fit.appearance import degree_shares
 from twin.scene.fit.optimise import FitResult
-from twin.scene.foundation.monocular_depth import describe_guesses
 from twin.scene.frames.camera_poses import SAYS
 from twin.scene.frames.selection import FrameChoice, Sources, root_frame
-from twin.scene.gaussians import GaussianCloud
 from twin.scene.rebuild.views import MOST_DB
 from twin.scene.settings import FrameConfig, RebuildConfig
 from twin.scene.store.folder import BACKGROUND, SCENE_VERSION
@@ -108,7 +105,6 @@ def make_record(
             "seconds": round(fitted.seconds, 2),
             "cpu_seconds": round(fitted.cpu_seconds, 2),
             "colour_steps": fitted.colour_steps,
-            **_shares(fitted.cloud),
             "train_psnr_db": None
             if fitted.train_psnr_db is None
             else round(min(fitted.train_psnr_db, MOST_DB), 3),
@@ -118,12 +114,6 @@ def make_record(
         "seconds": round(cost.seconds, 2),
         "software": provenance.software(),
     }
-
-
-def _shares(cloud: GaussianCloud) -> dict[str, Any]:
-    """How many Gaussians have harmonics of degree 2 and 3, where these were asked for."""
-    shares = {str(degree): round(share, 4) for degree, share in degree_shares(cloud).items()}
-    return {"harmonics": shares} if shares else {}
 
 
 def protocol_of(
@@ -143,7 +133,6 @@ def protocol_of(
         "training": training_text(frames),
         "train_frames": sum(len(choice.train_ns) for choice in choices),
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),
-        "poses_refined": frames.align_poses or config.fit.refine_poses,
         "num_splats": len(fitted.cloud),
         "fit_iterations": fitted.iterations,
         "underfitted": fitted.underfitted,
@@ -212,15 +201,8 @@ def describe_scene(record: Mapping[str, Any]) -> str:
         for key, item in record.get("objects", {}).items()
         if item.get("num_completed")
     ]
-    if "depth_model" in record:
-        lines.append(describe_guesses(record["depth_model"]))
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
-    lines += [
-        f"harmonics of degree {degree}: {100 * share:.0f} % of the Gaussians, those that enough "
-        "views show"
-        for degree, share in fitted.get("harmonics", {}).items()
-    ]
     lines += _view_lines(record["views"])
     lines += record["scan"]["remarks"]
     if record["remark"]:

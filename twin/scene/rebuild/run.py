@@ -7,7 +7,6 @@ sees a held-out frame, and ``scene.json`` is written last: it vouches for all th
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +17,16 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
 from bridge.terminal import Output
+from twin.leaves import has_leaf, load_leaf
 from twin.scene.backdrop import Backdrop, backdrop_of
 from twin.scene.dataset.training_set import (
     TrainingSet,
     limits_of,
     read_training_set,
-    with_fitted_poses,
 )
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import FIT_STATE, Checkpoint, FitResult, fit
-from twin.scene.foundation.complete import complete_shapes
-from twin.scene.foundation.monocular_depth import DepthGuesser
-from twin.scene.foundation.stage import check_models
+from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
 from twin.scene.frames.swept_episode import find_or_sweep_sources
 from twin.scene.gaussians import (
@@ -44,7 +40,6 @@ from twin.scene.gaussians import (
 from twin.scene.objects.decompose import Decomposition, decompose, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
-from twin.scene.rebuild.semantics import write_scene_semantics
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
 from twin.scene.robot.extraction import DrivenRobot, LitLinks, write_robot
 from twin.scene.settings import DEFAULT_BUDGET_S, RebuildConfig
@@ -103,14 +98,16 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         MovedCameraError: When a camera moved that is said to stand still.
         SplatExtensionMissingError: When the native code is not built.
         UsageError: When a model that was named cannot be used.
-        MissingDependencyError: When the extra ``foundation`` is needed and not installed.
+        MissingDependencyError: When a model was named and the leaf or its extra is not installed.
     """
     load_native()
     sources = find_or_sweep_sources(run, config.frames, output)
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)
-    models = check_models(config.models, scanned_tasks(sources).task)
+    models: dict[str, str] = {}
+    if config.models.any_named:
+        models = load_leaf("check_models")(config.models, scanned_tasks(sources).task)
     key = _key(sources, config, calibration, models)
     done = None if config.force else _already_done(run, key)
     if done is not None:
@@ -121,16 +118,12 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     training = read_training_set(chosen.choices, config, output)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
-    kept = Checkpoint(path=run.scene_dir / FIT_STATE, key=key)
-    if config.force:
-        kept.path.unlink(missing_ok=True)
-    fitted = _fit(training, config, kept, output)
+    fitted = _fit(training, config, output)
     clock.end("initialise_and_fit")
-    training = with_fitted_poses(training, fitted.Ts_base_color)
-    completed, guesses = _close_holes(training, fitted, config, models, output)
+    completed = _close_holes(training, fitted, config, output)
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    decomposed = _decompose(run, sources, training, fitted.cloud, completed, config, output)
+    decomposed = _decompose(sources, training, fitted.cloud, completed, config, output)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("decompose")
@@ -154,15 +147,12 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         num_completed=int(decomposed.background.completed.sum()),
         cost=clock.cost(),
     )
-    record |= extras | guesses | {"backdrop": backdrop.write(run.scene_dir)}
+    record |= extras | {"backdrop": backdrop.write(run.scene_dir)}
     write_record(run, record)
-    kept.path.unlink(missing_ok=True)
     return record
 
 
-def _fit(
-    training: TrainingSet, config: RebuildConfig, kept: Checkpoint, output: Output
-) -> FitResult:
+def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitResult:
     began_s = time.monotonic()
     first = fuse(training.points, config.initialise, training.views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
@@ -173,13 +163,11 @@ def _fit(
             config.fit,
             advance,
             max_splats=config.initialise.max_splats,
-            checkpoint=kept,
             spent_s=time.monotonic() - began_s,
         )
 
 
 def _decompose(
-    run: RunFolder,
     sources: Sources,
     training: TrainingSet,
     cloud: GaussianCloud,
@@ -188,10 +176,7 @@ def _decompose(
     output: Output,
 ) -> Decomposition:
     """Objects and background of what was fitted; what closes holes belongs to the background."""
-    complete = partial(complete_shapes, config=config.models, folder=run.scene_dir, output=output)
-    found = decompose(
-        sources, cloud, training.choices, training.views, complete, output, config.initialise
-    )
+    found = decompose(sources, cloud, training.choices, training.views, output, config.initialise)
     if found.remark:
         output.say(found.remark)
     return replace(found, background=concatenate([found.background, completed]))
@@ -201,19 +186,13 @@ def _close_holes(
     training: TrainingSet,
     fitted: FitResult,
     config: RebuildConfig,
-    models: Mapping[str, str],
     output: Output,
-) -> tuple[GaussianCloud, dict[str, Any]]:
-    """Gaussians where no depth was measured, and the record of the network that guessed, if any.
-
-    The network lives no longer than this.
-    """
+) -> GaussianCloud:
+    """Gaussians where colour was seen and no depth measured."""
     raster = RasterConfig(threads=config.fit.threads)
-    guesser = DepthGuesser.load(config.models, models.get("depth_model", ""))
-    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster, guesser)
-    output.say(f"{len(closed.cloud)} Gaussians where colour was seen and no depth measured")
-    record = {} if guesser is None else {"depth_model": guesser.to_record(closed)}
-    return closed.cloud, record
+    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
+    output.say(f"{len(closed)} Gaussians where colour was seen and no depth measured")
+    return closed
 
 
 def _hold_out(
@@ -243,7 +222,6 @@ def _hold_out(
             for index, mask in training.ego_masks.items()
         },
         backdrop=backdrop,
-        align=config.frames.align_holdout,
     )
     total = sum(len(choice.holdout_ns) for choice in choices)
     with output.progress("render held-out views", total) as advance:
@@ -263,7 +241,9 @@ def _write_parts(
     """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
     output.say("write objects, robot links and the distances to what is static")
     written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
-    return written | write_scene_semantics(
+    if not config.models.any_named and not has_leaf("name_things"):
+        return written
+    named: dict[str, Any] = load_leaf("name_things")(
         run.scene_dir,
         decomposed,
         training.views,
@@ -274,6 +254,7 @@ def _write_parts(
         choices=training.choices,
         task=scanned_tasks(sources).task,
     )
+    return written | named
 
 
 def _evenly_fused(training: TrainingSet, config: RebuildConfig) -> GaussianCloud | None:
@@ -315,12 +296,7 @@ def _key(
     settings.pop("force")
     settings["fit"].pop("threads")
     settings["fit"]["budget_s"] = config.fit.budget_s or DEFAULT_BUDGET_S  # keys of older scenes
-    settings["fit"]["gain"] = config.fit.exposure != "none"  # likewise
-    if config.fit.exposure != "affine":
-        settings["fit"].pop("exposure")
     settings["models"].pop("device")
-    if not config.models.depth_model:
-        settings["models"].pop("depth_model")  # keys of older scenes
     hashes = {str(e.path.name): e.sha256() for e in sources.episodes}
     task = scanned_tasks(sources).task  # shapes and colours decide the objects
     return provenance.hash_settings(

@@ -4,8 +4,7 @@ Topics, all with the stamp of the recorded frame and the frame id of its colour 
 ``/<cell>/views/cam/<id>/{recorded,rendered}/image`` (PNG), ``.../rendered/depth`` (16UC1),
 ``.../recorded/depth`` where depth and colour come from the same camera and
 ``.../recorded/depth_in_color`` where it was carried over, ``.../mask/{static,objects}`` (PNG, white
-inside) where there is something to mask, ``.../pose_aligned/image`` (PNG) where pose and brightness
-were fitted to the recorded image, and ``.../color/info``.
+inside) where there is something to mask, and ``.../color/info``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +29,6 @@ from bridge.media.image_quality import aligned, as_float, psnr_db, ssim
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
-from twin.scene.fit.camera_correction import align_view
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
@@ -209,8 +207,6 @@ class ViewsJob:
     """By episode and camera: what moves with the camera and is not part of the scene."""
     backdrop: Backdrop | None = None
     """Stands behind everything; None: black."""
-    align: bool = False
-    """Also draw each view where it fits the recorded image best."""
 
     def settings(self) -> dict[str, Any]:
         """What the derived episode records about how its views were made."""
@@ -234,7 +230,6 @@ class HeldOutViews:
     seen_mask: Bool[np.ndarray, "height width"]
     """Where the view shows what was measured in the scan."""
     masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
-    aligned_u8: np.ndarray | None = None
 
 
 def write_views(
@@ -300,11 +295,6 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         if job.marked is not None:
             planes = rasteriser.draw_planes(job.marked, camera, T)
             masks["objects"] = planes[0] > OBJECT_SHARE
-        aligned = None
-        if job.align:
-            fitted = align_view(cloud, recorded.half, recorded.full, T, rasteriser)
-            image = np.clip(np.moveaxis(fitted.image, 0, -1), 0.0, 1.0)
-            aligned = np.rint(image * 255.0).astype(np.uint8)
         yield HeldOutViews(
             choice=choice,
             frame=frame,
@@ -312,7 +302,6 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
             view=view,
             seen_mask=seen,
             masks=masks,
-            aligned_u8=aligned,
         )
 
 
@@ -367,5 +356,3 @@ def _write_view(writer: EpisodeWriter, item: HeldOutViews) -> None:
     for name, mask in item.masks.items():
         if not mask.all():
             png(f"mask/{name}", np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255)
-    if item.aligned_u8 is not None:
-        png("pose_aligned/image", item.aligned_u8)

@@ -119,7 +119,6 @@ def scene_by_default(
     viewpoints: Iterable[Viewpoint],
     rasteriser: Rasteriser,
     config: SegmentConfig | None = None,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     known: Mapping[str, Bool[np.ndarray, " num_splats"]] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     fused: GaussianCloud | None = None,
@@ -137,7 +136,6 @@ def scene_by_default(
         viewpoints: Frames, to count in how many an instance shows.
         rasteriser: What to draw with.
         config: What counts as a thing; the defaults when None.
-        robot_m: Points on the robot where it stood, to leave it out.
         known: Gaussians of the objects that a task names, by their ids. They come first, under
             their names.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts
@@ -158,13 +156,12 @@ def scene_by_default(
         cloud, searched = (moved_cloud(item, T_level_base) for item in (cloud, searched))
         points = points_of(searched)
         frames = [replace(f, T_base_camera=T_level_base @ f.T_base_camera) for f in frames]
-        robot_m = None if robot_m is None else se3.apply(T_level_base, robot_m)
         surfaces_m = {key: se3.apply(T_level_base, p) for key, p in (surfaces_m or {}).items()}
     labels = np.zeros(len(cloud), dtype=np.uint16)
     things: tuple[Thing, ...] = ()
     plane: SupportPlane | None = None
     try:
-        found = segment_stably(points, config, robot_m)
+        found = segment_stably(points, config)
     except NoSupportError as error:
         remark = str(error)
     else:

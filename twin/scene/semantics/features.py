@@ -9,16 +9,13 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from bridge.whole_file import write_whole
-from twin.scene.fit.appearance import FeatureObservation, solve_features
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.lift import Viewpoint, camera_of_cells, lift_features
+from twin.scene.semantics.lift import Viewpoint, lift_features
 from twin.scene.semantics.result import FeatureMap, SemanticsError
 
 FEATURES_FILE = "features.npz"
 FORMAT_VERSION = 1
-FEATURE_STEPS = 2
-"""Conjugate gradient steps on the feature term; later ones gain nothing on held-out maps."""
 MAX_SAMPLES = 200_000
 """Cells the basis is computed from."""
 
@@ -107,8 +104,7 @@ def lift_reduced(
 ) -> SceneFeatures:
     """Reduce the maps of all frames and put them on the Gaussians; instances get no embedding yet.
 
-    The mean of what the maps say about each Gaussian is the start, from which the feature term of
-    the paper's Eq. 3 is brought down by two steps.
+    A Gaussian gets the mean of what the maps say about it.
 
     Args:
         rasteriser: Draws the cloud and carries values back.
@@ -119,18 +115,9 @@ def lift_reduced(
     """
     reduced = [(viewpoint, basis.reduce(item)) for viewpoint, item in frames]
     mean, weight = lift_features(rasteriser, cloud, reduced)
-    observations = [
-        FeatureObservation(
-            camera=camera_of_cells(viewpoint.camera, item),
-            T_base_camera=viewpoint.T_base_camera,
-            values=item.values,
-            valid_mask=np.ones(item.values.shape[1:], dtype=bool),
-        )
-        for viewpoint, item in reduced
-    ]
     return SceneFeatures(
         basis=basis,
-        features=solve_features(cloud, observations, rasteriser, steps=FEATURE_STEPS, start=mean),
+        features=mean,
         weight=weight,
         instance_ids=np.zeros(0, dtype=np.int32),
         instance_embeddings=np.zeros((0, 0), dtype=np.float32),

@@ -76,8 +76,6 @@ class SegmentConfig:
     """Larger groups are furniture, the robot, or things that touch a wall: they are cut."""
     patches: PatchConfig = field(default_factory=PatchConfig)
     """How."""
-    robot_distance_m: float = 0.015
-    """Points this near to the robot's surface are robot."""
     foot_colour_gap: float = 12.0
     """Lab distance up to which low points belong to the thing above them."""
     relief_score: float = 0.25
@@ -110,29 +108,6 @@ class Segmentation:
     """Why nothing was found; empty otherwise."""
 
 
-def segment_points(
-    points: SurfacePoints,
-    config: SegmentConfig,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
-) -> Segmentation:
-    """Find the things that stand on the plane.
-
-    Args:
-        points: What was seen, in a frame whose z points up.
-        config: What counts as a thing.
-        robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
-
-    Raises:
-        NoSupportError: When there is no level plane to stand on, and nothing stands out.
-    """
-    ground = ground_of(points, config, robot_m)
-    look = ground.look(1.0)
-    numbers = range(1, int(look.labels.max(initial=0)) + 1)
-    things = tuple(ground.thing(look.labels == number, look.voxel_m) for number in numbers)
-    remark = "" if things else ground.nothing
-    return Segmentation(labels=look.labels, things=things, plane=ground.plane, remark=remark)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Look:
     """What belongs together, seen with voxels of one size."""
@@ -146,20 +121,18 @@ class Look:
 def ground_of(
     points: SurfacePoints,
     config: SegmentConfig,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None,
 ) -> "OverPlane | WithoutPlane":
     """Find what things stand on, how high everything is over it, and what is free to be a thing.
 
     Args:
         points: What was seen, in a frame whose z points up.
         config: What counts as a thing.
-        robot_m: Points on the robot's surface, to leave it out.
     """
     try:
         plane = find_support(points.p_m, points.normals, config.support)
     except NoSupportError:
-        return WithoutPlane(points, config, robot_m)
-    return OverPlane(points, plane, config, robot_m)
+        return WithoutPlane(points, config)
+    return OverPlane(points, plane, config)
 
 
 class OverPlane:
@@ -170,7 +143,6 @@ class OverPlane:
         points: SurfacePoints,
         plane: SupportPlane,
         config: SegmentConfig,
-        robot_m: np.ndarray | None,
     ) -> None:
         """Measure heights, and choose what is free to be a thing."""
         plane = as_measured(plane, points.p_m, points.normals, config.support)
@@ -181,7 +153,7 @@ class OverPlane:
         self._height = height = plane.height_m(points.p_m)
         under = plane.under(points.p_m)
         self._lab = without_shading(lab_from_srgb(points.colors), config.split.lightness_weight)
-        free = under & (height < config.max_height_m) & ~_on_robot(points.p_m, robot_m, config)
+        free = under & (height < config.max_height_m)
         raised = free & (height > config.min_height_m)
         if least > FINE_M:
             raised &= ~_is_relief(self._lab, height, under, config)
@@ -225,25 +197,15 @@ def _is_relief(
     return np.asarray((height_m < config.relief_factor * config.min_height_m) & (away < own))
 
 
-def _on_robot(p_m: np.ndarray, robot_m: np.ndarray | None, config: SegmentConfig) -> np.ndarray:
-    if robot_m is None or not len(robot_m):
-        return np.zeros(len(p_m), dtype=bool)
-    distance, _ = cKDTree(robot_m).query(p_m, distance_upper_bound=config.robot_distance_m)
-    return np.asarray(np.isfinite(distance))
-
-
 class WithoutPlane:
     """Points where nothing level was measured, a shelf of bare metal: all of it is cut."""
 
     plane = None
 
-    def __init__(
-        self, points: SurfacePoints, config: SegmentConfig, robot_m: np.ndarray | None
-    ) -> None:
-        """Choose what is free to be a thing."""
+    def __init__(self, points: SurfacePoints, config: SegmentConfig) -> None:
+        """Measure how far points lie apart."""
         self._points, self._config = points, config
-        self._free = np.flatnonzero(~_on_robot(points.p_m, robot_m, config))
-        self._spacing_m = _spacing(points.p_m[self._free])
+        self._spacing_m = _spacing(points.p_m)
 
     @property
     def nothing(self) -> str:
@@ -258,10 +220,7 @@ class WithoutPlane:
         """
         patches = self._config.patches
         scaled = replace(patches, voxel_m=scale * patches.voxel_m)
-        labels = np.zeros(len(self._points), dtype=np.int64)
-        labels[self._free] = cut_into_patches(
-            self._points.take(self._free), scale * self._spacing_m, scaled
-        )
+        labels = cut_into_patches(self._points, scale * self._spacing_m, scaled)
         if not labels.any():
             raise NoSupportError(self.nothing)
         return Look(labels=_largest_first(labels), voxel_m=patches.voxel_m)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.segment import Look, Segmentation, SegmentConfig, ground_of
@@ -40,19 +40,17 @@ class _Found:
 def segment_stably(
     points: SurfacePoints,
     config: SegmentConfig,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
 ) -> Segmentation:
     """Find the things that most sizes of voxels find, the largest first.
 
     Args:
         points: What was seen, in a frame whose z points up; evenly spaced.
         config: What counts as a thing.
-        robot_m: Points on the robot's surface where it stood while it was seen, to leave it out.
 
     Raises:
         NoSupportError: When there is no level plane to stand on, and nothing stands out.
     """
-    ground = ground_of(points, config, robot_m)
+    ground = ground_of(points, config)
     looks = [ground.look(scale) for scale in VOXEL_SCALES]
     stable = sorted(
         (item for item in _all_found(looks) if item.share >= MIN_SHARE),

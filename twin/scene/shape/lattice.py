@@ -1,4 +1,4 @@
-"""A lattice of points, springs and tetrahedra inside a shape, for soft bodies.
+"""A lattice of points and tetrahedra inside a shape, for soft bodies.
 
 Cubes of 8-10 mm whose centre lies in the solid; nodes that stick out are drawn back to the
 surface. Each cube is five tetrahedra, mirrored from cube to cube so that they fit together.
@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from bridge.errors import refuse_outside
 from twin.scene.shape.carve import ShapeError
@@ -19,7 +18,7 @@ from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_BYTES = 64_000_000
-_NAMES = ("nodes_m", "springs", "rest_lengths_m", "tets", "mass_fraction", "spacing_m")
+_NAMES = ("nodes_m", "tets", "mass_fraction", "spacing_m")
 _CORNERS = np.array([[n & 1, n >> 1 & 1, n >> 2 & 1] for n in range(8)])
 """Corner number = x + 2 y + 4 z."""
 _EVEN = ((0, 3, 5, 6), (1, 0, 3, 5), (2, 0, 3, 6), (4, 0, 5, 6), (7, 3, 5, 6))
@@ -34,29 +33,17 @@ class LatticeConfig:
 
     spacing_m: float = 0.009
     """Distance of neighbouring nodes."""
-    neighbours: int = 12
-    """Each node has springs to so many nearest others."""
-    reach_spacings: float = 1.8
-    """Springs are no longer than this."""
 
     def __post_init__(self) -> None:
         """Refuse lattices that are none."""
-        allowed = {
-            "spacing_m": (1e-3, 0.1),
-            "neighbours": (3, 64),
-            "reach_spacings": (1.0, 4.0),
-        }
-        refuse_outside(self, allowed)
+        refuse_outside(self, {"spacing_m": (1e-3, 0.1)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lattice:
-    """Nodes, springs and tetrahedra at rest, in the object's frame."""
+    """Nodes and tetrahedra at rest, in the object's frame."""
 
     nodes_m: Float32[np.ndarray, "num_nodes 3"]
-    springs: Int32[np.ndarray, "num_springs 2"]
-    """Pairs of nodes, the lower number first; the edges of all tetrahedra are among them."""
-    rest_lengths_m: Float32[np.ndarray, " num_springs"]
     tets: Int32[np.ndarray, "num_tets 4"]
     """Four nodes each; the volume is positive."""
     mass_fraction: Float32[np.ndarray, " num_nodes"]
@@ -77,13 +64,13 @@ class Lattice:
         """
         found = read_npz(path, _NAMES, MAX_BYTES)
         num = len(found["nodes_m"])
-        kinds = [found[n].dtype for n in ("springs", "tets")] == [np.dtype(np.int32)] * 2
-        shapes = [found[n].shape[1:] for n in ("nodes_m", "springs", "tets")] == [(3,), (2,), (4,)]
-        if not kinds or not shapes or found["spacing_m"].shape != ():
+        shapes = [found[n].shape[1:] for n in ("nodes_m", "tets")] == [(3,), (4,)]
+        is_number = found["tets"].dtype == np.int32 and found["spacing_m"].shape == ()
+        if not shapes or not is_number:
             raise UnreadableArraysError(path=path, found="arrays that are no lattice")
-        numbers = np.concatenate([found["springs"].ravel(), found["tets"].ravel()])
+        numbers = found["tets"].ravel()
         if len(numbers) and not (numbers.min() >= 0 and numbers.max() < num):
-            raise UnreadableArraysError(path=path, found="a spring to a node that is not there")
+            raise UnreadableArraysError(path=path, found="a node that is not there")
         spacing = float(found.pop("spacing_m"))
         return Lattice(**found, spacing_m=spacing)
 
@@ -119,14 +106,10 @@ def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
     tets = _tets(cells, number)
     regular = first + config.spacing_m * index.astype(np.float64)
     nodes = _drawn_in(regular, tets, shape.sdf)
-    springs = _springs(nodes, tets, shape.sdf, config)
-    lengths = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
     shares = np.zeros(len(nodes))
     np.add.at(shares, tets, tet_volumes_m3(nodes, tets)[:, None] / 4)
     return Lattice(
         nodes_m=nodes.astype(np.float32),
-        springs=springs.astype(np.int32),
-        rest_lengths_m=lengths.astype(np.float32),
         tets=tets.astype(np.int32),
         mass_fraction=(shares / shares.sum()).astype(np.float32),
         spacing_m=config.spacing_m,
@@ -194,22 +177,3 @@ def _drawn_in(
         share[share < 0.01] = 0.0
         moved = nodes + share[:, None] * (target - nodes)
     return np.asarray(moved)
-
-
-def _springs(
-    nodes: Float[np.ndarray, "num_nodes 3"],
-    tets: Int[np.ndarray, "num_tets 4"],
-    sdf: SdfGrid,
-    config: LatticeConfig,
-) -> Int[np.ndarray, "num_springs 2"]:
-    """Edges of the tetrahedra, and nearest neighbours with solid half way between them."""
-    pairs = [tets[:, [a, b]] for a, b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))]
-    count = min(config.neighbours + 1, len(nodes))
-    reach = config.reach_spacings * config.spacing_m
-    distance, other = cKDTree(nodes).query(nodes, k=count, distance_upper_bound=reach)
-    found = np.isfinite(distance[:, 1:])
-    near = np.stack([np.nonzero(found)[0], other[:, 1:][found]], axis=1)
-    middle = nodes[near].mean(axis=1)
-    # Without this an arm that hangs beside the body would be tied to it.
-    pairs.append(near[sdf.distance(middle) < sdf.voxel_m])
-    return np.asarray(np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0))

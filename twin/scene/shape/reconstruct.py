@@ -1,4 +1,4 @@
-"""One closed metric shape of an object and its cavity, from masked depth or a foreign mesh."""
+"""One closed metric shape of an object, from masked depth or a foreign mesh."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,67 +22,6 @@ from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import Faces, Vertices, face_normals, is_watertight, volume_m3
 from twin.scene.shape.registration import laid_together
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
-
-MIN_SHARE = 0.05
-"""Of the volume with the cavity filled; less is a dent."""
-MIN_VOXELS = 30
-MAX_POINTS = 400
-LEAK_VOXELS = 2
-"""Gaps in a wall up to twice this are closed before looking for the cavity behind it."""
-CLEARANCE_VOXELS = 2.0
-"""Sample points keep this distance from the walls."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cavity:
-    """Free space that the object encloses on all sides at the same height."""
-
-    volume_m3: float
-    depth_m: float
-    """From its highest to its lowest voxel."""
-    points_m: Float[np.ndarray, "num_points 3"]
-    """Samples known to be free, away from the walls: no collision part may hold one."""
-
-
-def find_cavity(
-    solid: Bool[np.ndarray, "num_x num_y num_z"],
-    free: Bool[np.ndarray, "num_x num_y num_z"],
-    box: VoxelBox,
-) -> Cavity | None:
-    """Fill each horizontal layer; what that adds and somebody looked through is the cavity.
-
-    Only the largest connected cavity counts. None when there is no cavity worth the name. One that
-    no view looked into stays solid, and is found among the faces nobody saw.
-
-    Args:
-        solid: Voxels of the object; the third axis is up.
-        free: Voxels that some view looked through.
-        box: Where the voxels are.
-    """
-    in_layer = ndimage.generate_binary_structure(3, 1)
-    in_layer[:, :, [0, 2]] = False
-    tight = ndimage.binary_closing(solid, structure=in_layer, iterations=LEAK_VOXELS)
-    filled = ndimage.binary_fill_holes(tight | solid, structure=in_layer)
-    cavity = filled & ~solid & free
-    pieces, count = ndimage.label(cavity)
-    if count == 0:
-        return None
-    sizes = np.bincount(pieces.ravel())
-    sizes[0] = 0
-    cavity = pieces == sizes.argmax()
-    num = int(cavity.sum())
-    if num < max(MIN_VOXELS, MIN_SHARE * (num + int(solid.sum()))):
-        return None
-    layers = np.flatnonzero(cavity.any(axis=(0, 1)))
-    away = ndimage.distance_transform_edt(~solid) - 0.5
-    ids = np.flatnonzero(cavity & (away >= CLEARANCE_VOXELS))
-    chosen = ids[np.linspace(0, len(ids) - 1, min(MAX_POINTS, len(ids))).round().astype(np.int64)]
-    return Cavity(
-        volume_m3=num * box.voxel_m**3,
-        depth_m=float(layers[-1] - layers[0] + 1) * box.voxel_m,
-        points_m=box.centres_m(chosen),
-    )
-
 
 PAD_VOXELS = 4
 """Free voxels around the object, so that distances are known a little beyond it."""
@@ -148,15 +87,10 @@ class ObjectShape:
     """Faces that no view saw: the underside on the plane, and whatever was hidden."""
     completed_fraction: float
     """Their share of the area."""
-    unseen_top_m2: float
-    """Area of completed faces that look up: there may be an opening nobody looked into."""
     is_watertight: bool
     volume_m3: float
-    cavity: Cavity | None
     num_views: int
     truncation_m: float
-    source: str = ""
-    """Who made it, when it was not carved out of views."""
     view_shift_m: float = 0.0
     """Root mean square of the shifts that laid the views together; 0 without rounds."""
 
@@ -221,7 +155,7 @@ def _carved(
     distances = signed_distances(solid, evidence, truncation)
     values = smoothed(distances, box.voxel_m, config.smoothing_voxels)
     grid = SdfGrid(values_m=values, origin_m=box.origin_m, voxel_m=box.voxel_m)
-    return describe_solid(grid, evidence, solid, len(views), truncation)
+    return describe_solid(grid, evidence, len(views), truncation)
 
 
 def voxel_box(
@@ -245,7 +179,6 @@ def voxel_box(
 def describe_solid(
     grid: SdfGrid,
     evidence: Evidence,
-    solid: Bool[np.ndarray, "num_x num_y num_z"],
     num_views: int,
     truncation_m: float,
 ) -> ObjectShape:
@@ -254,23 +187,20 @@ def describe_solid(
     Args:
         grid: Its distances.
         evidence: Where views saw a surface, and what is known to be empty.
-        solid: Its voxels.
         num_views: So many views said so.
         truncation_m: How far a view's word reached.
     """
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
     completed = ~_observed(vertices, faces, evidence)
-    normals, areas = face_normals(vertices, faces)
+    _, areas = face_normals(vertices, faces)
     return ObjectShape(
         vertices_m=vertices,
         faces=faces,
         sdf=grid,
         completed=completed,
         completed_fraction=float(areas[completed].sum() / areas.sum()),
-        unseen_top_m2=float(areas[completed & (normals[:, 2] > 0.5)].sum()),
         is_watertight=is_watertight(faces),
         volume_m3=volume_m3(vertices, faces),
-        cavity=find_cavity(solid, evidence.empty, evidence.box),
         num_views=num_views,
         truncation_m=truncation_m,
     )
@@ -371,7 +301,7 @@ def shape_of_mesh(
     evidence = Evidence(
         box=box, tsdf=np.zeros_like(weight), weight=weight, free=~solid, empty=~solid
     )
-    return describe_solid(grid, evidence, solid, 1, truncation)
+    return describe_solid(grid, evidence, 1, truncation)
 
 
 def _filled(

@@ -26,12 +26,8 @@ def lattice_of_task(stretch: float = 1.0) -> Lattice:
     """The task's own lattice as a scene would hold it."""
     body = SoftModel.from_task(TASK.objects["sloth"])
     nodes = body.nodes_m * np.array([stretch, 1.0, 1.0], dtype=np.float32)
-    edges = body.rest_edges[0].astype(np.int32)
-    lengths = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     return Lattice(
         nodes_m=nodes.astype(np.float32),
-        springs=edges,
-        rest_lengths_m=lengths.astype(np.float32),
         tets=body.tets,
         mass_fraction=body.mass_fraction,
         spacing_m=body.spacing_m,

@@ -46,7 +46,7 @@ def test_a_hole_is_closed_at_its_true_distance_and_in_a_view_that_taught_nothing
     scanned: tuple[GaussianCloud, list[TrainingView], RgbdFrame],
 ) -> None:
     cloud, views, held_out = scanned
-    added = complete_holes(cloud, views, CONFIG, RASTER).cloud
+    added = complete_holes(cloud, views, CONFIG, RASTER)
     inside = np.linalg.norm(added.means_m[:, :2] - HOLE_M, axis=1) < RADIUS_M
     on_table = inside & (np.abs(added.means_m[:, 2]) < 0.1)
     assert on_table.sum() > 15
@@ -67,7 +67,7 @@ def test_what_was_measured_stays_visible(
 ) -> None:
     """Nothing new stands in the light of a measurement: each view still sees its depth."""
     cloud, views, _ = scanned
-    both = concatenate([cloud, complete_holes(cloud, views, CONFIG, RASTER).cloud])
+    both = concatenate([cloud, complete_holes(cloud, views, CONFIG, RASTER)])
     shares = []
     for view in views:
         full = view.full
@@ -84,8 +84,8 @@ def test_without_holes_or_without_leave_nothing_is_added(
     scanned: tuple[GaussianCloud, list[TrainingView], RgbdFrame],
 ) -> None:
     cloud, views, _ = scanned
-    assert len(complete_holes(cloud, views, replace(CONFIG, completion=0.0), RASTER).cloud) == 0
-    few = complete_holes(cloud, views, replace(CONFIG, completion=0.01), RASTER).cloud
+    assert len(complete_holes(cloud, views, replace(CONFIG, completion=0.0), RASTER)) == 0
+    few = complete_holes(cloud, views, replace(CONFIG, completion=0.01), RASTER)
     assert 0 < len(few) <= 200
     masked = [view.without(np.ones(view.half.depth_m.shape, dtype=bool)) for view in views]
-    assert len(complete_holes(cloud, masked, CONFIG, RASTER).cloud) == 0
+    assert len(complete_holes(cloud, masked, CONFIG, RASTER)) == 0

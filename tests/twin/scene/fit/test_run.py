@@ -1,18 +1,14 @@
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 import textured_room
 
-from bridge.geometry import se3
 from twin.scene.fit import densify, optimise
-from twin.scene.fit.appearance import ImageObservation, degree_shares
-from twin.scene.fit.camera_correction import corrected_pose
+from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import Checkpoint, fit
+from twin.scene.fit.optimise import fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, psnr_db
@@ -135,102 +131,6 @@ def test_errors_are_lifted_from_images_of_both_sizes_the_full_ones_last(
     assert widths == sorted(widths)
 
 
-@pytest.mark.slow
-def test_refining_poses_brings_shaken_cameras_back() -> None:
-    surfaces = [FrameSurface(textured_room.frame(i, 8), LIMITS) for i in range(8)]
-    start = fuse(
-        [surface.points() for surface in surfaces], InitialiseConfig(max_splats=1000, growth=0.25)
-    )
-    views = [training_view(surface) for surface in surfaces]
-    rng = np.random.default_rng(1)
-    shaken = list(views)
-    for index in (3, 5):
-        pose = corrected_pose(views[index].T_base_color, rng.normal(0, 0.004, 6))
-        shaken[index] = replace(views[index], T_base_color=pose)
-    config = FitConfig(iterations=240, threads=1, refine_poses=True, densify=False)
-    fitted = fit(start, shaken, config, lambda *_: None)
-
-    def off_px(index: int, pose: np.ndarray) -> float:
-        """How far points of the room appear from where they should [px]."""
-        camera, p = views[index].full.camera, start.means_m.astype(np.float64)
-        seen = [
-            camera.project(se3.apply(se3.invert(T), p))[0]
-            for T in (pose, views[index].T_base_color)
-        ]
-        return float(np.linalg.norm(seen[0] - seen[1], axis=1).mean())
-
-    before = [off_px(index, shaken[index].T_base_color) for index in (3, 5)]
-    after = [off_px(index, fitted.Ts_base_color[index]) for index in (3, 5)]
-    assert np.mean(after) < 0.75 * np.mean(before)
-    np.testing.assert_array_equal(fitted.Ts_base_color[0], views[0].T_base_color)
-    still = fit(start, shaken, replace(config, iterations=2, refine_poses=False), lambda *_: None)
-    np.testing.assert_array_equal(still.Ts_base_color[3], shaken[3].T_base_color)
-
-
-class StopError(Exception):
-    """The power went out."""
-
-
-def stop_after(count: int) -> Callable[[int, str], None]:
-    def advance(done: int, note: str) -> None:
-        if note.startswith(f"image {count},"):
-            raise StopError
-
-    return advance
-
-
-def test_higher_degrees_come_with_the_solved_colours_where_enough_views_show(
-    room: tuple[GaussianCloud, list[TrainingView]],
-) -> None:
-    start, views = room
-    config = FitConfig(iterations=20, threads=1)
-    plain, few, enough = (
-        fit(start, chosen, replace(config, harmonics=degree), lambda *_: None).cloud
-        for chosen, degree in ((4 * views, 1), (views, 3), (4 * views, 3))
-    )
-    assert (plain.num_harmonics, few.num_harmonics, enough.num_harmonics) == (3, 15, 15)
-    assert degree_shares(few) == {2: 0.0, 3: 0.0}
-    shares = degree_shares(enough)
-    assert 1.0 > shares[2] > shares[3] > 0.1
-    # Until then nothing is different.
-    assert np.median(np.abs(plain.means_m - enough.means_m)) < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("config", "stop"),
-    [
-        (FitConfig(iterations=14, threads=1, refine_poses=True), 9),
-        (FitConfig(iterations=20, threads=1, harmonics=2, exposure="affine"), 20),
-        (FitConfig(iterations=150, threads=1), 147),  # among the images that the mean is over
-    ],
-)
-def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(
-    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path, config: FitConfig, stop: int
-) -> None:
-    start, views = room
-    views = 3 * views if config.harmonics > 1 else views
-    most = len(start) + 50
-    whole = fit(start, views, config, lambda *_: None, max_splats=most)
-    kept = Checkpoint(path=tmp_path / "fit.npz", key="this fit", period_s=0.0)
-    with pytest.raises(StopError):
-        fit(start, views, config, stop_after(stop), max_splats=most, checkpoint=kept)
-    steps: list[str] = []
-    resumed = fit(
-        start,
-        views,
-        config,
-        lambda done, note: steps.append(note),
-        max_splats=most,
-        checkpoint=kept,
-    )
-    assert len(steps) == config.iterations - (stop - 1)
-    for name, rows in arrays(whole.cloud):
-        np.testing.assert_array_equal(rows, getattr(resumed.cloud, name))
-    np.testing.assert_array_equal(whole.Ts_base_color, resumed.Ts_base_color)
-    np.testing.assert_array_equal(whole.exposures, resumed.exposures)
-    assert whole.train_psnr_db == resumed.train_psnr_db
-
-
 def test_a_fit_ends_with_the_mean_of_its_last_gaussians(
     room: tuple[GaussianCloud, list[TrainingView]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,31 +148,6 @@ def test_a_fit_ends_with_the_mean_of_its_last_gaussians(
     for name, rows in arrays(fitted.cloud):
         mean = np.mean([getattr(cloud, name) for cloud in seen], axis=0, dtype=np.float64)
         np.testing.assert_allclose(rows, mean, rtol=1e-5, atol=1e-6)
-
-
-def test_a_state_of_other_settings_or_a_damaged_one_is_not_used(
-    room: tuple[GaussianCloud, list[TrainingView]], tmp_path: Path
-) -> None:
-    start, views = room
-    path = tmp_path / "fit.npz"
-    config = replace(ADAM_ALONE, iterations=3)
-    done: list[int] = []
-
-    def run(key: str, num_views: int = len(views)) -> int:
-        done.clear()
-        checkpoint = Checkpoint(path=path, key=key, period_s=0.0)
-        chosen = views[:num_views]
-        fit(start, chosen, config, lambda *_: done.append(1), checkpoint=checkpoint)
-        return len(done)
-
-    assert run("one") == 3
-    assert run("one") == 0
-    assert run("another") == 3
-    path.write_bytes(path.read_bytes()[:5000])
-    assert run("another") == 3
-    path.write_bytes(b"no archive")
-    assert run("another") == 3
-    assert run("another", len(views) - 1) == 3  # written by a version that chose other frames
 
 
 def test_a_number_of_images_repeats_bit_for_bit_with_any_threads(

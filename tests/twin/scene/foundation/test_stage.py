@@ -26,11 +26,11 @@ from twin.scene.foundation.stage import (
     thing_vectors,
     viewpoint_of,
 )
+from twin.scene.foundation.things import ask_models_about, training_frames
 from twin.scene.frames.selection import choose_frames, find_sources, spread
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.rebuild.run import rebuild
-from twin.scene.rebuild.semantics import ask_models_about, training_frames
 from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, ModelConfig, RebuildConfig

@@ -99,38 +99,3 @@ def save_dino_vit(folder: Path) -> None:
         image_size=64,
     )
     transformers.DINOv3ViTModel(config).eval().save_pretrained(folder)
-
-
-def save_dino_convnext(folder: Path) -> None:
-    torch.manual_seed(3)
-    config = transformers.DINOv3ConvNextConfig(
-        hidden_sizes=[8, 16, 24, 32], depths=[1, 1, 1, 1], image_size=64
-    )
-    transformers.DINOv3ConvNextModel(config).eval().save_pretrained(folder)
-
-
-def save_depth_anything(folder: Path, kind: str = "relative") -> None:
-    torch.manual_seed(4)
-    backbone = transformers.Dinov2Config(
-        hidden_size=32,
-        num_hidden_layers=4,
-        num_attention_heads=4,
-        image_size=56,
-        patch_size=14,
-        out_indices=[1, 2, 3, 4],
-        reshape_hidden_states=False,
-    )
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone,
-        reassemble_hidden_size=32,
-        neck_hidden_sizes=[8, 16, 24, 32],
-        fusion_hidden_size=16,
-        head_hidden_size=8,
-        depth_estimation_type=kind,
-        max_depth=20 if kind == "metric" else 1,
-    )
-    transformers.DepthAnythingForDepthEstimation(config).eval().save_pretrained(folder)
-
-
-def save_metric_depth_anything(folder: Path) -> None:
-    save_depth_anything(folder, "metric")

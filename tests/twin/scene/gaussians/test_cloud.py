@@ -18,7 +18,7 @@ from twin.scene.gaussians import (
     with_harmonics,
     write_ply,
 )
-from twin.scene.harmonics import NUM_HARMONICS, degrees_of, harmonic_basis, turned_harmonics
+from twin.scene.harmonics import NUM_HARMONICS, harmonic_basis, turned_harmonics
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
 CAMERA = Camera(width=40, height=33, fx=60.0, fy=60.0, cx=20.0, cy=16.5)
@@ -89,7 +89,6 @@ def test_the_basis_is_the_real_part_of_the_complex_harmonics() -> None:
     for count in NUM_HARMONICS[1:]:
         found = harmonic_basis(directions, count)
         np.testing.assert_allclose(found, np.stack(expected[:count], axis=1), atol=1e-12)
-    np.testing.assert_array_equal(degrees_of(15), [1] * 3 + [2] * 5 + [3] * 7)
 
 
 def some_directions(count: int = 50) -> np.ndarray:

@@ -9,7 +9,7 @@ from reference_loss import Loss
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from twin.scene.frames.rgbd import Target
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32, with_harmonics
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster.rasteriser import (
     FitSession,
     RasterConfig,
@@ -217,20 +217,6 @@ def test_moments_go_along_with_their_gaussians() -> None:
     other = twin.step(some_target(), a_pose(), RATES)
     assert report.loss == other.loss
     assert not np.array_equal(session.cloud.means_m[0], twin.cloud.means_m[0])
-
-
-def test_a_cloud_that_gets_more_harmonics_goes_on_with_its_moments() -> None:
-    wide, narrow = (FitSession(some_cloud(40), RasterConfig(threads=1)) for _ in range(2))
-    for session in (wide, narrow):
-        session.step(some_target(), a_pose(), RATES)
-    wide.rearrange(with_harmonics(wide.cloud, 15), np.arange(40))
-    for session in (wide, narrow):
-        session.step(some_target(), a_pose(), RATES)
-    for name, rows in arrays(narrow.cloud):
-        found = getattr(wide.cloud, name)
-        found = found[:, :3] if name == "harmonics" else found
-        np.testing.assert_allclose(found, rows, rtol=1e-4, atol=1e-6)
-    assert wide.cloud.harmonics[:, 3:].any()
 
 
 def test_an_image_of_another_size_is_refused() -> None:

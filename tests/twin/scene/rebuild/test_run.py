@@ -63,17 +63,6 @@ def test_the_scene_resembles_what_was_held_out(room: RunFolder) -> None:
     assert len(record["sources"][0]["sha256"]) == 64
 
 
-def test_harmonics_of_degree_two_are_stored_and_reported(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=16)
-    fit = replace(CONFIG.fit, iterations=20, harmonics=2, exposure="affine")
-    record = rebuild(run, replace(CONFIG, fit=fit), QUIET)
-    assert read_scene(run).background.num_harmonics == 8
-    assert record["settings"]["fit"]["exposure"] == "affine"
-    assert 0.1 < record["fit"]["harmonics"]["2"] < 1.0
-    assert "harmonics of degree 2: " in describe_scene(record)
-
-
 def test_the_views_episode_pairs_recorded_and_rendered_images(room: RunFolder) -> None:
     scene = read_scene(room)
     (path,) = room.derived("*views*")

@@ -2,18 +2,16 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import textured_room
 from seen_colors import effective_colors
-from small_scene import CONFIG, QUIET
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color
 from bridge.robots.default import ROBOT
@@ -22,19 +20,14 @@ from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
     moved_cloud,
-    read_ply,
     write_ply,
 )
-from twin.scene.rebuild.run import rebuild
 from twin.scene.render import compose, object_places, render
 from twin.scene.robot.splats import write_links
 from twin.scene.settings import RenderConfig
 from twin.scene.store.folder import (
-    UnreadableSceneError,
-    describe_edit,
     read_record,
     read_scene,
-    take_back,
     write_record,
 )
 
@@ -173,95 +166,3 @@ def test_a_robot_without_recorded_joints_is_left_out_with_a_reason(
     assert drawn["robot"].startswith("not drawn: ")
     with pytest.raises(UsageError, match="--joints takes 6 angles"):
         render(with_robot, RenderConfig(joints=(0.0, np.nan, 0.0, 0.0, 0.0, 0.0)))
-
-
-def foreign_ply(path: Path, cloud: GaussianCloud, num_rest: int) -> None:
-    """As other programs write it: no normals, a comment, harmonics of any degree."""
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{index}" for index in range(num_rest)]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    lines = ["ply", "format binary_little_endian 1.0", "comment made by an editor"]
-    lines += [f"element vertex {len(cloud)}", *(f"property float {name}" for name in names)]
-    parts = [cloud.means_m, cloud.colors, np.zeros((len(cloud), num_rest))]
-    parts += [cloud.opacities_logit[:, None], cloud.scales_log, cloud.quats_wxyz]
-    table = np.concatenate(parts, axis=1).astype("<f4")
-    path.write_bytes("\n".join([*lines, "end_header", ""]).encode() + table.tobytes())
-
-
-@pytest.mark.parametrize("num_rest", [0, 9, 24, 45])
-def test_an_edited_background_makes_a_new_scene(
-    room: RunFolder, tmp_path: Path, num_rest: int
-) -> None:
-    before = read_scene(room)
-    kept = before.background.take(np.arange(100))
-    foreign_ply(tmp_path / "edited.ply", kept, num_rest)
-    about = take_back(room, tmp_path / "edited.ply")
-    after = read_scene(room)
-    assert len(after.background) == 100
-    np.testing.assert_allclose(after.background.means_m, kept.means_m)
-    assert after.scene_hash == about["scene_hash"] != before.scene_hash
-    assert after.record["edited"][0]["from_scene"] == before.scene_hash
-    assert before.scene_hash in describe_edit(about)
-    assert rebuild(room, CONFIG, QUIET)["scene_hash"] == after.scene_hash  # the edit is kept
-
-
-def test_names_of_gaussians_go_when_others_take_their_rows(room: RunFolder, tmp_path: Path) -> None:
-    """An editor may sort them on saving: as many as before, but not the same in each row."""
-    cloud = read_scene(room).background
-    write_ply(tmp_path / "grey.ply", replace(cloud, colors=np.full_like(cloud.colors, 0.5)))
-    take_back(room, tmp_path / "grey.ply")
-    assert (room.scene_dir / "semantics.npz").is_file()
-    assert "file" in read_scene(room).record["semantics"]
-    write_ply(tmp_path / "sorted.ply", cloud.take(np.argsort(cloud.means_m[:, 0])))
-    take_back(room, tmp_path / "sorted.ply")
-    assert not (room.scene_dir / "semantics.npz").exists()
-    assert "edited" in read_scene(room).record["semantics"]["remark"]
-    assert rebuild(room, CONFIG, QUIET)["scene_hash"] == read_scene(room).scene_hash
-
-
-def test_a_background_edited_in_place_is_taken_after_being_refused(room: RunFolder) -> None:
-    path = room.scene_dir / "background.ply"
-    write_ply(path, read_ply(path).take(np.arange(50)))
-    with pytest.raises(UnreadableSceneError, match="robot-gst import splats"):
-        read_scene(room)
-    take_back(room, path)
-    assert len(read_scene(room).background) == 50
-
-
-def test_taking_the_background_back_unchanged_changes_nothing(room: RunFolder) -> None:
-    before = (room.scene_dir / "scene.json").read_bytes()
-    take_back(room, room.scene_dir / "background.ply")
-    assert (room.scene_dir / "scene.json").read_bytes() == before
-
-
-def test_an_edited_object_keeps_the_scene(room: RunFolder, tmp_path: Path) -> None:
-    before = read_scene(room).scene_hash
-    write_ply(tmp_path / "blob.ply", blob().take(np.arange(10)))
-    assert take_back(room, tmp_path / "blob.ply", "blob")["scene_hash"] == before
-    assert len(read_ply(room.scene_dir / "objects" / "blob" / "gaussians.ply")) == 10
-    with pytest.raises(UsageError, match=r"no object 'cup'\. It has: blob"):
-        take_back(room, tmp_path / "blob.ply", "cup")
-
-
-def test_a_bad_file_changes_nothing(room: RunFolder, tmp_path: Path) -> None:
-    background = read_scene(room).background
-    bad = tmp_path / "bad.ply"
-    nothing = background.take(np.zeros(0, dtype=np.int64))
-    foreign_ply(tmp_path / "empty.ply", nothing, 0)
-    broken = replace(background, opacities_logit=background.opacities_logit * np.float32("nan"))
-    foreign_ply(tmp_path / "nan.ply", broken, 0)
-    contents = {
-        "no PLY header": b"not a splat file",
-        "bytes of data": (room.scene_dir / "background.ply").read_bytes()[:-7],
-        "no Gaussians": (tmp_path / "empty.ply").read_bytes(),
-        "not finite": (tmp_path / "nan.ply").read_bytes(),
-    }
-    before = (room.scene_dir / "scene.json").read_bytes()
-    for found, data in contents.items():
-        bad.write_bytes(data)
-        with pytest.raises(GstError, match=found):
-            take_back(room, bad)
-    with pytest.raises(PathNotFoundError):
-        take_back(room, tmp_path / "missing.ply")
-    assert (room.scene_dir / "scene.json").read_bytes() == before
-    assert len(read_scene(room).background) == len(background)

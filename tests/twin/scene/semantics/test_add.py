@@ -7,8 +7,8 @@ import pytest
 from table_scene import World, make_world, table
 
 from bridge.geometry import se3
+from twin.scene.foundation.things import add_semantics
 from twin.scene.gaussians import concatenate, moved_cloud
-from twin.scene.rebuild.semantics import add_semantics
 from twin.scene.semantics.features import FeatureBasis, SceneFeatures
 from twin.scene.semantics.language import query
 from twin.scene.semantics.result import Mask, MaskSet

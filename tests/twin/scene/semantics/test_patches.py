@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from one_look import segment_points
 
 from twin.scene.semantics.cluster import SurfacePoints
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
-from twin.scene.semantics.segment import SegmentConfig, segment_points
+from twin.scene.semantics.segment import SegmentConfig
 
 WOOD, RED, BLUE = (0.55, 0.42, 0.30), (0.8, 0.1, 0.1), (0.1, 0.25, 0.75)
 SPACING_M = 0.004

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import table_scene
+from one_look import segment_points
 from table_scene import BLUE, GREEN, RED, World, box, duck, ellipsoid, iou, make_world, table
 
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -11,7 +12,6 @@ from twin.scene.semantics.segment import (
     Segmentation,
     SegmentConfig,
     points_of,
-    segment_points,
 )
 from twin.scene.semantics.support import NoSupportError
 
@@ -89,16 +89,6 @@ def test_a_thing_in_a_box_is_not_the_box() -> None:
     best = matched(world, found)
     assert [label for label, _ in best.values()] == ["blue open container", "red ball"]
     assert all(score > 0.75 for _, score in best.values())
-
-
-def test_points_of_the_robot_are_left_out(tabletop: World) -> None:
-    points = points_of(tabletop.cloud)
-    near = np.linalg.norm(points.p_m - [-0.13, -0.10, 0.02], axis=1) < 0.06
-    robot = points.p_m[near & (points.p_m[:, 2] > 0.01)]
-    found = segment_points(points, SegmentConfig(), robot_m=robot)
-    assert sorted(thing.label for thing in found.things) == sorted(
-        set(tabletop.names.values()) - {"red cube"}
-    )
 
 
 def test_an_empty_table_gives_one_sentence() -> None:

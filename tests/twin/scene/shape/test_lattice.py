@@ -1,4 +1,4 @@
-"""The lattice of a soft body: inside, connected, filling the volume, no spring across a gap."""
+"""The lattice of a soft body: inside, connected, filling the volume."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from test_collision import ball_shape, grid, shape_of
+from solid_shapes import ball_shape, grid, shape_of
 
 from twin.scene.shape.carve import ShapeError
-from twin.scene.shape.lattice import Lattice, LatticeConfig, lattice, tet_volumes_m3
+from twin.scene.shape.lattice import Lattice, lattice, tet_volumes_m3
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.store.npz import UnreadableArraysError, write_npz
 
@@ -52,40 +52,23 @@ def test_every_inner_face_belongs_to_two_tetrahedra(inside: Lattice) -> None:
     assert (counts == 2).sum() > (counts == 1).sum()
 
 
-def test_springs_tie_all_nodes_together_and_have_their_length(inside: Lattice) -> None:
+def test_tetrahedra_tie_all_nodes_together(inside: Lattice) -> None:
     num = len(inside.nodes_m)
-    ones = np.ones(len(inside.springs))
-    graph = coo_matrix((ones, inside.springs.T), shape=(num, num))
+    pairs = np.concatenate([inside.tets[:, [0, k]] for k in (1, 2, 3)])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(num, num))
     assert connected_components(graph, directed=False)[0] == 1
-    assert np.all(inside.springs[:, 0] < inside.springs[:, 1])
-    assert len(np.unique(inside.springs, axis=0)) == len(inside.springs)
-    a, b = inside.nodes_m[inside.springs[:, 0]], inside.nodes_m[inside.springs[:, 1]]
-    np.testing.assert_allclose(np.linalg.norm(a - b, axis=1), inside.rest_lengths_m, atol=1e-6)
-    assert np.bincount(inside.springs.ravel()).min() >= 3
-
-
-def test_no_spring_ties_two_legs_together() -> None:
-    x, y, z = grid(40)
-    legs = (np.abs(y) < 8) & (np.abs(x) < 16) & (np.abs(z) < 16)
-    legs &= ~((np.abs(x) < 3) & (z < 6))
-    shape = shape_of(legs, 0.002)
-    inside = lattice(shape, LatticeConfig(spacing_m=0.008))
-    middle = inside.nodes_m[inside.springs].astype(np.float64).mean(axis=1)
-    assert shape.sdf.distance(middle).max() < 0.006
-    gap = shape.sdf.origin_m + 0.002 * np.array([19.5, 19.5, 10.0])
-    assert np.linalg.norm(middle - gap, axis=1).min() > 0.004
 
 
 def test_a_lattice_is_read_back(inside: Lattice, tmp_path: Path) -> None:
     path = tmp_path / "soft.npz"
     inside.save(path)
     again = Lattice.load(path)
-    for name in ("nodes_m", "springs", "tets", "mass_fraction", "rest_lengths_m"):
+    for name in ("nodes_m", "tets", "mass_fraction"):
         np.testing.assert_array_equal(getattr(again, name), getattr(inside, name))
     assert again.spacing_m == inside.spacing_m
     arrays = {name: np.asarray(value) for name, value in vars(inside).items()}
     for change in (
-        {"springs": inside.springs + 10**6},
+        {"tets": inside.tets + 10**6},
         {"tets": inside.tets.astype(np.float64)},
         {"nodes_m": inside.nodes_m[:, :2]},
     ):

@@ -47,7 +47,9 @@ def test_objects_are_reconstructed_in_their_own_frame(
     known = cast_views.shape_mesh(TASK.objects[key])
     mean, _ = cast_views.mean_error_m((shape.vertices_m, shape.faces), known)
     assert mean < 0.002
-    assert (shape.cavity is not None) == (key == "box")
+    if key == "box":  # it is open
+        inside = np.array([0.0, 0.0, TASK.objects[key].size_m[2] / 2])
+        assert shape.sdf.distance(inside) > 0.01
 
 
 @pytest.mark.slow
@@ -119,17 +121,11 @@ def test_the_folder_holds_what_object_json_says(
         assert about["schema_version"] == 4
         assert about["shape_source"].startswith("reconstructed from 24")
         assert about["geometry"]["watertight"] is True
-        assert about["geometry"]["mass_prior"]["material"] == "plastic"
         present = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
         assert present == set(record[key]["files"])
-        parts = [name for name in present if name.startswith("collision/")]
-        assert len(parts) == about["geometry"]["collision"]["num_parts"]
         mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
         assert mesh.is_edge_manifold(allow_boundary_edges=False)
         assert SdfGrid.load(folder / "sdf.npz").distance(np.zeros(3)) < 0.01
-    box = json.loads((tmp_path / "objects" / "box" / "object.json").read_text())["geometry"]
-    assert box["cavity"]["volume_m3"] > 0.001
-    assert box["collision"]["cavity_blocked"] == 0.0
 
 
 @pytest.mark.slow

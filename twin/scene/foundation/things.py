@@ -42,7 +42,6 @@ def add_semantics(
     *,
     masks: Sequence[tuple[Viewpoint, MaskSet]] = (),
     features: SceneFeatures | None = None,
-    robot_m: Float[np.ndarray, "num_robot 3"] | None = None,
     surfaces_m: Mapping[str, Float[np.ndarray, "_ 3"]] | None = None,
     fused: GaussianCloud | None = None,
     threads: int = 0,
@@ -61,7 +60,6 @@ def add_semantics(
         viewpoints: Training frames, to count in how many an instance shows.
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
         features: Features of the same Gaussians, background first.
-        robot_m: Points on the robot where it stood, to leave it out.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
@@ -87,7 +85,6 @@ def add_semantics(
                 cloud.take(measured),
                 viewpoints[::step],
                 rasteriser,
-                robot_m=robot_m,
                 known={key: mask[measured] for key, mask in known.items()},
                 surfaces_m=surfaces_m,
                 fused=fused,
