@@ -60,7 +60,7 @@ GONE: dict[str, str] = {
         ("replay --engines-must-agree", "gate --engines-must-agree"),
         "--engine both replays in both and says where they differ.",
     ),
-    "replay --relocalise": "Remove the run's derived/*.localised.*.mcap; the next replay makes them.",
+    "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(
