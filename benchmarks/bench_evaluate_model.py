@@ -69,14 +69,7 @@ def shots() -> Iterator[Shot]:
 def fit(
     truth: Truth, num_groups: int, trials: tuple[int, int], rng: np.random.Generator
 ) -> AgreementModel:
-    """Draw one study of a truth, and fit the model.
-
-    Args:
-        truth: The population.
-        num_groups: Groups to draw.
-        trials: Of each group, recorded and in the twin.
-        rng: Draws rates and counts.
-    """
+    """Draw one study of a truth, and fit the model."""
     rates = truth.draw(num_groups, rng)
     counts = [rng.binomial(n, rates[:, side]) for side, n in enumerate(trials)]
     groups = [

@@ -112,7 +112,6 @@ def sample(study: list[tuple[str, int, int, int, int]], more: float) -> np.ndarr
     """Return draws (sweeps, chains, quantities): both means, rho within, rho between, mean gap.
 
     Args:
-        study: Counts of the groups.
         more: Variance that the model adds to the spread within tasks.
     """
     rng = np.random.default_rng(7)

@@ -310,12 +310,7 @@ def agreement(rows: list[tuple[float, bool]]) -> tuple[float, float]:
 def measured(
     chosen: argparse.Namespace, each: Callable[[Callable[[int], Any], range], Iterable[Any]]
 ) -> list[Target]:
-    """Every row of the table.
-
-    Args:
-        chosen: Objects and numbers of starts.
-        each: Does the same for all of some seeds.
-    """
+    """Every row of the table."""
     targets: list[Target] = []
     for name in chosen.objects:
         shape = scanned(*OBJECTS[name])

@@ -50,14 +50,7 @@ def make(run: Path) -> None:
 def errors_of(
     results: Mapping[str, Any], task: str, body: str, column: str
 ) -> dict[str, dict[str, float]]:
-    """Error of each recorded run by engine [mm].
-
-    Args:
-        results: The content of ``results.json``.
-        task: Of the runs.
-        body: ``tool`` or an object.
-        column: Which error.
-    """
+    """Error of each recorded run by engine [mm]."""
     found: dict[str, dict[str, float]] = {}
     for table in results["tables"]:
         if not table["id"].startswith("runs_of_end_points"):
@@ -72,13 +65,7 @@ def errors_of(
 def without_physics(
     run: Path, fitted: Sequence[str], held_out: Sequence[str]
 ) -> dict[str, dict[str, float]]:
-    """What saying the mean of the identifying runs gives: end point and displacement errors [mm].
-
-    Args:
-        run: Run folder.
-        fitted: Ids of the identifying runs.
-        held_out: Ids of the others.
-    """
+    """What saying the mean of the identifying runs gives: end and displacement errors [mm]."""
     cubes = {}
     for name in (*fitted, *held_out):
         episode = Episode.open(run / "episodes" / f"{name}.mcap")
@@ -108,13 +95,7 @@ def print_table(
     held_out: Sequence[str],
     rule: Mapping[str, Mapping[str, float]],
 ) -> None:
-    """Print the medians over held-out runs of every engine, the best first, and the tool's means.
-
-    Args:
-        results: The content of ``results.json``.
-        held_out: Ids of the runs that count.
-        rule: As ``without_physics`` gives it.
-    """
+    """Print every engine's medians over held-out runs, best first, and the tool's means."""
     ends = errors_of(results, "cubeexp", "cube", "end-point error (mm)")
     ways = errors_of(results, "cubeexp", "cube", "displacement error (mm)")
     ends[RULE], ways[RULE] = dict(rule["end"]), dict(rule["way"])

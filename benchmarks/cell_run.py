@@ -83,9 +83,6 @@ def record_ungated(
 
     Args:
         run: Where to; one session, one laboratory, one run.
-        task: A task of ``datasets/tasks``.
-        seed: Draws the laboratory and the starts.
-        trials: How many.
         cell_file: A cell of ``datasets/cells``; empty: the task's own.
 
     Returns:

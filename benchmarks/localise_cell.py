@@ -115,10 +115,7 @@ def look_at_start(
     """Draw a laboratory and a start, put the objects down and take a few frames of each camera.
 
     Args:
-        task_name: A task of ``datasets/tasks``.
-        seed: Draws what the laboratory hides, the start and the noise.
         count: Frames of each camera, 0.2 s apart, the arm at home.
-        moved: Objects let go elsewhere, from where they fall.
         honest: The laboratory hides nothing: poses, joints and depth are right but for noise.
     """
     laboratory = _Laboratory(task_name, seed, moved, honest=honest)

@@ -32,7 +32,6 @@ def mutated(base: Record, family: str, rng: Rng, solve: Solver) -> Any:
         base: A plan as sent; it is not altered.
         family: One of ``FAMILIES``.
         rng: Draws what is changed, and by how much.
-        solve: Kinematics, for plans whose joints follow what was moved.
     """
     plan = copy.deepcopy(base)
     plan["id"] = f"{family}_{int(rng.integers(1 << 40)):x}"

@@ -55,8 +55,6 @@ def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = 
     """Scan a start, fuse and fit it, find the objects and reconstruct them.
 
     Args:
-        task_name: A task of ``datasets/tasks``.
-        seed: Draws laboratory, start and noise.
         iterations: Images to fit the Gaussians to; 0 leaves them as fused.
         honest: A laboratory that hides nothing.
     """

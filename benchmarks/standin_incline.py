@@ -42,10 +42,7 @@ def mujoco_friction(
     """Effective friction of a pair in MuJoCo.
 
     Args:
-        slab: Coefficient of what slides.
-        ground: Coefficient of what it lies on.
         slab_priority: Above 0, its coefficient alone counts, as that of the cell's objects.
-        pad: The slab has the hard contacts of the cell's finger pads.
     """
 
     def acceleration(slope_rad: float) -> float:

@@ -39,10 +39,6 @@ SAME_M = 1e-9
 def settled_poses(run: RunFolder, row: dict[str, Any]) -> list[dict[str, Any]]:
     """Live the held-out episodes through again, and read the truth beside them.
 
-    Args:
-        run: The recordings.
-        row: With ``parameters`` and ``held_out`` of their calibration.
-
     Returns:
         Per pose of a held-out episode, in metres: ``true``, ``shifted``, ``localised``; and per set
         of parameters (``nominal``, ``calibrated``) what it predicts in the frame of the cameras

@@ -19,7 +19,6 @@ def dataset_file(folder: str, name: str, suffix: str = ".toml") -> Path:
     Args:
         folder: Name of a folder of ``datasets/``, in the plural: ``tasks``, ``cells``, ``robots``.
         name: A name without suffix, or the path of a file that ends with ``suffix``.
-        suffix: Ending of the files of this folder, with its dot.
 
     Raises:
         UsageError: Listing the names that exist.

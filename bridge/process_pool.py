@@ -167,8 +167,6 @@ class Worker:
         """Give it a piece of work; the function is one of a module that can be imported.
 
         Args:
-            function: What to do.
-            item: With what.
             timeout_s: For handing it over; ``PATIENCE_S`` for each part of it without a number.
 
         Raises:
@@ -304,7 +302,6 @@ class Runner(Protocol):
 
         Args:
             function: Of a module that can be imported; what it raises becomes ``Failed``.
-            items: Records that can be pickled.
             cost: How long an item takes, in any unit; the longest are begun first.
         """
 
@@ -351,7 +348,6 @@ class ProcessPool:
         Args:
             size: Processes beside this one, at most.
             prepare: Called with None in each before all else, for what takes long to import.
-            quiet: See ``Worker``.
         """
         self._size, self._prepare, self._quiet = size, prepare, quiet
         self.workers: list[Worker] = []
@@ -450,7 +446,6 @@ class ProcessPool:
         Args:
             work: A function of a module that can be imported; follows from the item alone.
             items: What to work on; they and the results cross between processes.
-            each_s: About how long one takes here [s].
         """
         try:
             while len(self.workers) < min(self._size, int(len(items) * each_s / WORTH_S)):

@@ -47,12 +47,7 @@ class Output:
             _err().print(text, highlight=False, markup=False, style="dim")
 
     def result(self, data: Mapping[str, Any], text: str) -> None:
-        """Print the result: ``data`` as JSON with ``--json``, else ``text``.
-
-        Args:
-            data: What a program reads.
-            text: What a person reads.
-        """
+        """Print the result: ``data`` as JSON with ``--json``, else ``text``."""
         if self.json:
             sys.stdout.write(json.dumps(data, indent=2, default=str) + "\n")
         else:
@@ -61,12 +56,7 @@ class Output:
 
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[Advance]:
-        """Show progress: a bar on a terminal, otherwise a plain line each ten seconds.
-
-        Args:
-            label: What is going on, in a word.
-            total: How many there are to do.
-        """
+        """Show progress: a bar on a terminal, otherwise a plain line each ten seconds."""
         if self.quiet:
             yield lambda done, note: None
         elif sys.stderr.isatty():

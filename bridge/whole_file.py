@@ -14,7 +14,6 @@ def write_whole(path: Path, data: bytes) -> None:
 
     Args:
         path: The file; an older one is replaced, and its folder must be there.
-        data: All its bytes.
     """
     part = part_of(path)
     try:

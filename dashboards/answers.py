@@ -8,34 +8,18 @@ from starlette.responses import JSONResponse, Response
 
 
 def kept(data: bytes, media_type: str) -> Response:
-    """Return what the browser may keep for ten minutes, for its address says which it is.
-
-    Args:
-        data: The bytes.
-        media_type: What they are.
-    """
+    """Return what the browser may keep for ten minutes, for its address says which it is."""
     headers = {"Cache-Control": "private, max-age=600"}
     return Response(data, media_type=media_type, headers=headers)
 
 
 def refused(status: int, message: str) -> Response:
-    """Return a refusal that a script of the page shows.
-
-    Args:
-        status: Of HTTP, 4xx or 5xx.
-        message: What was wrong.
-    """
+    """Return a refusal that a script of the page shows."""
     return JSONResponse({"message": message}, status_code=status)
 
 
 async def posted(request: Request, what: str, most_bytes: int) -> dict[str, Any] | Response:
-    """Read a JSON object that a page posts, or return the refusal.
-
-    Args:
-        request: Its body is read no further than is allowed.
-        what: It is, with its article.
-        most_bytes: It may have.
-    """
+    """Read a JSON object that a page posts, or return the refusal."""
     body = bytearray()
     async for part in request.stream():
         body += part

@@ -52,7 +52,6 @@ def create_app(
     """Build the application over some run folders.
 
     Args:
-        library: The runs that are shown.
         admission: Which host and token are answered; None answers only on the loopback address.
         live: Where the page Live finds the recorder; None asks at the usual place.
         door: Lets phones in at the operator's console; None leaves it closed.
@@ -131,12 +130,7 @@ def link(path: str, **query: object) -> str:
 
 
 def share_link(run: str | None, episodes: Sequence[str]) -> str:
-    """Build the address of a file with some trials.
-
-    Args:
-        run: Name of the run where several are shown.
-        episodes: Ids of the trials.
-    """
+    """Build the address of a file with some trials."""
     named = [*([] if run is None else [("run", run)]), *(("trial", name) for name in episodes)]
     return f"/share?{urlencode(named)}"
 
@@ -170,14 +164,7 @@ class Pages:
         *,
         looks_beside: bool = True,
     ) -> None:
-        """Remember the runs and load the templates.
-
-        Args:
-            library: The runs that are shown.
-            live: Where the recorder is.
-            door: Lets phones in at the operator's console, where it is open.
-            looks_beside: Whether runs in the same folder may be compared with them.
-        """
+        """Remember the runs and load the templates."""
         self._live, self._door = live, door
         self._console: ConsolePages | None = None
         self._library = library
@@ -366,7 +353,6 @@ class Pages:
         """Show one of our errors as a page.
 
         Args:
-            request: What was asked for.
             error: What went wrong; something that is not there gives 404, anything else 500.
         """
         missing = isinstance(error, NotHereError)
@@ -379,7 +365,6 @@ class Pages:
         """Show a wrong address as a page.
 
         Args:
-            request: What was asked for.
             error: Carries the HTTP status; one without gives 500.
         """
         status = error.status_code if isinstance(error, HTTPException) else 500

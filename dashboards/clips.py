@@ -85,11 +85,6 @@ def can_film() -> bool:
 def footage(run: RunFolder, row: IndexedTrial, config: ClipConfig = CONFIG) -> Footage:
     """Read the frames around the moment of a trial.
 
-    Args:
-        run: The run folder.
-        row: The trial.
-        config: How much of it, how large.
-
     Raises:
         NotHereError: When the recording has no picture.
         GstError: When it cannot be read.
@@ -189,12 +184,7 @@ def _beside(sides: Sequence[Image]) -> Image:
 
 
 def contact_sheet(frames: Sequence[Image], columns: int) -> Image:
-    """Lay frames of one size out in rows, in reading order.
-
-    Args:
-        frames: At least one.
-        columns: So many beside each other.
-    """
+    """Lay frames of one size out in rows, in reading order."""
     height, width = frames[0].shape[:2]
     rows = -(-len(frames) // columns)
     columns = min(columns, len(frames))
@@ -211,10 +201,6 @@ def contact_sheet(frames: Sequence[Image], columns: int) -> Image:
 
 def as_video(found: Footage, config: ClipConfig) -> bytes:
     """Make an MP4 file (H.264) of the frames.
-
-    Args:
-        found: The frames, all of one size.
-        config: Rate and quality.
 
     Raises:
         MissingDependencyError: Without PyAV.
@@ -247,12 +233,7 @@ def _rate_hz(times_s: Sequence[float], most_hz: int) -> int:
 
 
 def picture(run: RunFolder, row: IndexedTrial) -> bytes:
-    """Return a trial at its moment, recorded beside twin, as JPEG; drawn once.
-
-    Args:
-        run: The run folder.
-        row: The trial.
-    """
+    """Return a trial at its moment, recorded beside twin, as JPEG; drawn once."""
 
     def draw() -> bytes:
         found = footage(run, row, ClipConfig(before_s=0.1, after_s=0.1))
@@ -262,12 +243,7 @@ def picture(run: RunFolder, row: IndexedTrial) -> bytes:
 
 
 def clip(run: RunFolder, row: IndexedTrial) -> bytes:
-    """Return a trial around its moment, recorded beside twin, as MP4; made once.
-
-    Args:
-        run: The run folder.
-        row: The trial.
-    """
+    """Return a trial around its moment, recorded beside twin, as MP4; made once."""
     return drawn_once(
         run.results_dir / CLIPS,
         row.episode,

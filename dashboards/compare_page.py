@@ -106,8 +106,6 @@ def build_compare(
     """Gather the comparison that an address asks for.
 
     Args:
-        run: The run folder.
-        judgement: Its numbers and trials.
         others: Runs that it can be held against, by name; None but for the chosen one.
         query: ``with`` names another run; ``by``, ``a`` and ``b`` two things of this one.
     """

@@ -46,7 +46,6 @@ class ConsoleDoor:
         Args:
             tell: Shows a new code in the terminal, nowhere else.
             now_s: A clock that never jumps.
-            digits: Draws a code.
         """
         self._tell, self._now_s, self._digits = tell, now_s, digits
         self.code = digits()
@@ -67,7 +66,6 @@ class ConsoleDoor:
 
         Args:
             code: What was typed; blanks in it do not count.
-            name: What the person is called.
         """
         typed = "".join(code.split())
         with self._lock:

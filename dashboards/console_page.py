@@ -61,10 +61,6 @@ class RecorderLink:
     def ask(self, command: Callable[[RecorderClient], Any], timeout_s: float = COMMAND_S) -> Any:
         """Send one command; several threads wait for each other.
 
-        Args:
-            command: Sends it.
-            timeout_s: How long the answer is waited for.
-
         Raises:
             WireError: When nobody answers, or the recorder refuses.
         """
@@ -125,12 +121,6 @@ class ConsolePages:
         render: Render,
     ) -> None:
         """Ask nobody yet.
-
-        Args:
-            run: The run folder.
-            door: Who is let in.
-            config: Where the recorder is.
-            render: Fills in a template.
 
         Raises:
             UsageError: When the run has no protocol.
@@ -374,12 +364,7 @@ def _answer_words(outcome: Outcome, *, is_blind: bool) -> str:
 
 
 def may_write_into(told: Path, run_path: Path) -> bool:
-    """Whether a recorder writes into a run; it may have been given a path from its own folder.
-
-    Args:
-        told: Where it says that it writes.
-        run_path: The run folder.
-    """
+    """Whether a recorder writes into a run; it may have been given a path from its own folder."""
     here = run_path.resolve()
     if told.is_absolute():
         return told.resolve() == here

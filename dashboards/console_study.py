@@ -96,12 +96,7 @@ class ConsoleStudy:
     """The trials of a locked protocol, as far as they are made."""
 
     def __init__(self, run: RunFolder, protocol: Protocol) -> None:
-        """Remember whom to ask.
-
-        Args:
-            run: The run folder.
-            protocol: Its protocol.
-        """
+        """Remember whom to ask."""
         self.run = run
         self.protocol = protocol
 
@@ -136,11 +131,7 @@ class ConsoleStudy:
         return (entry.policy, arm) == (trial.policy, trial.arm)
 
     def unanswered(self, made: Mapping[int, Entry]) -> tuple[PlannedTrial, Entry] | None:
-        """Return the first trial that was made and that nobody said anything of.
-
-        Args:
-            made: As ``made`` returns it.
-        """
+        """Return the first trial that was made and that nobody said anything of."""
         for trial in self.order:
             entry = made.get(trial.number)
             if entry is not None and not entry.error and entry.cause == UNLABELLED:
@@ -148,11 +139,7 @@ class ConsoleStudy:
         return None
 
     def next(self, made: Mapping[int, Entry]) -> PlannedTrial | None:
-        """Return the first trial that was not made.
-
-        Args:
-            made: As ``made`` returns it.
-        """
+        """Return the first trial that was not made."""
         return next((trial for trial in self.order if trial.number not in made), None)
 
     def episode_id(self, trial: PlannedTrial) -> str:
@@ -163,12 +150,7 @@ class ConsoleStudy:
         return next(each for each in (name, *others) if each not in taken)
 
     def about(self, trial: PlannedTrial, operator: str) -> tuple[dict[str, Any], TaskFile | None]:
-        """Return what an episode of a trial says of itself, and its task file.
-
-        Args:
-            trial: The trial.
-            operator: Who makes it.
-        """
+        """Return what an episode of a trial says of itself, and its task file."""
         code = self.protocol.code_of(trial.policy, trial.arm)
         arm = {} if code else {"condition": CONDITION_OF[trial.arm]}
         tags = [] if code else [f"{STUDY_ARM_TAG}{trial.arm}"]
@@ -192,12 +174,7 @@ class ConsoleStudy:
         return info, file
 
     def view(self, trial: PlannedTrial, entry_id: str) -> TrialView:
-        """Gather what the operator sees of a trial.
-
-        Args:
-            trial: The trial.
-            entry_id: Id of its episode, made or not.
-        """
+        """Gather what the operator sees of a trial."""
         file = self._task_file(trial.task)
         task = None if file is None else file.task()
         code = self.protocol.code_of(trial.policy, trial.arm)
@@ -222,9 +199,6 @@ class ConsoleStudy:
     def start_picture(self, number: int) -> tuple[bytes, str]:
         """Return the first picture of an earlier trial from the same start, and its media type.
 
-        Args:
-            number: Of the trial that is to be made.
-
         Raises:
             NotHereError: When there is no such trial or no picture of its start.
         """
@@ -238,11 +212,7 @@ class ConsoleStudy:
         return read_frame(path, track.camera_id, track.stamps_ns[0])
 
     def answered(self, episode_id: str) -> Answered:
-        """Return what was said of a trial that was made.
-
-        Args:
-            episode_id: Id of its episode.
-        """
+        """Return what was said of a trial that was made."""
         path = episode_path(self.run, episode_id)
         outcome = outcome_of(self.run, Episode.open(path))
         shown = outcome
@@ -256,11 +226,9 @@ class ConsoleStudy:
         """Keep what the operator says of a trial; it is on disk when this returns.
 
         Args:
-            trial: The trial.
             record: ``trial`` (id of its episode), ``result`` (one of ``RESULTS``), ``reached``
                 (stages that were finished, or ``NOT_EXECUTED``), ``placed`` (objects where they
                 belong), ``cause`` and ``note``.
-            operator: Who says so.
 
         Raises:
             UsageError: When a part is missing or is something else than it should be.
@@ -313,12 +281,7 @@ def _stage_words(stage: Mapping[str, Any]) -> str:
 
 
 def drawn_start(task: Task, start_seed: int) -> StartView:
-    """Draw where a start's objects belong, as its seed declares them.
-
-    Args:
-        task: The task.
-        start_seed: Of the start.
-    """
+    """Draw where a start's objects belong, as its seed declares them."""
     poses = task.draw_start(np.random.default_rng(start_seed))
     objects, corners = [], [np.zeros((1, 2))]
     for name, T_base_object in poses.items():
@@ -356,10 +319,7 @@ def outcome_from(
     rest nobody knows.
 
     Args:
-        record: As for ``ConsoleStudy.answer``.
         task: The task; None where its file is not known, and then without stages.
-        operator: Who says so.
-        void_cause: How the outcome of a void trial begins.
 
     Raises:
         UsageError: When a part is missing or is something else than it should be.

@@ -128,8 +128,6 @@ def build_page(
     """Gather the page of one episode.
 
     Args:
-        run: The run folder.
-        episode_id: Id of the recorded episode, as it stands in the address.
         row: The trial beside its replays; None where it was not compared.
         t_s: Page time of the cursor [s]; None puts it at the first divergence, else at the first
             failure, else at the end.
@@ -187,11 +185,6 @@ def read_replays(
 
     Replays that never count, and those of other bytes than the file holds now, come first. Of
     several replays of one trajectory the last counts, as in the evaluator.
-
-    Args:
-        paths: The replays' files.
-        recording: What they were made from.
-        problems: Notes what cannot be read.
     """
     found = []
     for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):

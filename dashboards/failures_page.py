@@ -77,13 +77,7 @@ class FailuresPage:
 def build_failures(
     run: RunFolder, judgement: Judgement, selection: FailureSelection
 ) -> FailuresPage:
-    """Gather one screen of failures.
-
-    Args:
-        run: The run folder.
-        judgement: Its trials.
-        selection: Which failures, and by what they are grouped.
-    """
+    """Gather one screen of failures."""
     index = judgement.index
     if index is None:
         return FailuresPage(

@@ -137,7 +137,6 @@ def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
     """Return round numbers (1, 2, 5 times a power of ten) within a range.
 
     Args:
-        low: Lower end of the range.
         high: Upper end; a range that is empty or not finite has no ticks.
         wanted: About how many ticks; fewer where the round step is larger.
     """
@@ -163,12 +162,9 @@ def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5
     """Build an axis with round ticks; a single value gets a margin.
 
     Args:
-        low: Least value to show.
-        high: Greatest value to show.
         px_low: Where the least value is drawn [px].
         px_high: Where the greatest value is drawn [px]; below ``px_low`` for an axis that points
             up.
-        wanted: About how many ticks.
     """
     if high - low < 1e-12:
         margin = max(abs(low) * 0.1, 1e-3)
@@ -230,12 +226,9 @@ def time_plot(
     The value axis covers ``least_span`` at least, so that noise is not blown up to a motion.
 
     Args:
-        title: What is drawn.
-        unit: Unit of the values, as the page prints it.
         signals: One for each line; gaps where values are not finite.
         span_s: First and last page time of the horizontal axis [s].
         level: Value of a horizontal line, for example a safety distance; None draws none.
-        level_label: What stands at that line.
         least_span: Least range of the value axis, in ``unit``.
         note: A sentence below the plot; empty leaves it out.
         width: Of the whole plot [px].

@@ -95,8 +95,6 @@ def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     JPEG. Frames before the first whole picture of a video show that picture.
 
     Args:
-        path: The episode file.
-        camera_id: Id of the camera, without the parts of its topic.
         stamp_ns: Source time of the wanted instant [ns].
     """
     track = _track_of(path, camera_id)
@@ -118,10 +116,6 @@ def pack_frames(path: Path, camera_id: str) -> bytes:
 
     The length of the header (uint32, little-endian), the header in JSON with each picture's place
     in the track, size and media type, then the files one after another.
-
-    Args:
-        path: The episode file.
-        camera_id: Id of the camera, without the parts of its topic.
     """
     track = _track_of(path, camera_id)
     count = len(track.stamps_ns)
@@ -157,8 +151,6 @@ def read_span(
     """Yield the sRGB images of a camera between two instants, in one pass through the file.
 
     Args:
-        path: The episode file.
-        camera_id: Id of the camera, without the parts of its topic.
         start_ns: Source time of the first wanted [ns].
         end_ns: Source time of the last wanted [ns].
     """
@@ -218,12 +210,7 @@ def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None
 
 
 def media_type(data: bytes, path: Path) -> str:
-    """Name the image format by its first bytes; anything but JPEG and PNG is refused.
-
-    Args:
-        data: The image file.
-        path: The episode it comes from, for the message.
-    """
+    """Name the image format by its first bytes; anything but JPEG and PNG is refused."""
     for magic, name in MEDIA_TYPES:
         if data.startswith(magic):
             return name

@@ -122,9 +122,7 @@ def trials_to_label(judgement: Judgement, chosen: str, rater: str) -> list[str]:
     trial's place says nothing of twin or operator.
 
     Args:
-        judgement: The trials of the run.
         chosen: One of ``SETS``.
-        rater: Name of the rater.
     """
     ids = [row.episode for row in recorded_trials(judgement)]
     if chosen == "worst":
@@ -133,13 +131,7 @@ def trials_to_label(judgement: Judgement, chosen: str, rater: str) -> list[str]:
 
 
 def next_unrated(order: Sequence[str], rated: set[str], after: str | None) -> str | None:
-    """Return the first trial without a label behind another one, else the first of all.
-
-    Args:
-        order: The rater's trials.
-        rated: Those that have a label.
-        after: Where the rater is.
-    """
+    """Return the first trial without a label behind another one, else the first of all."""
     start = order.index(after) + 1 if after in order else 0
     return next((name for name in [*order[start:], *order[:start]] if name not in rated), None)
 
@@ -153,13 +145,6 @@ def build_label_page(
     run: RunFolder, order: Sequence[str], reviews: Sequence[Review], *, rater: str, trial_id: str
 ) -> LabelPage:
     """Gather what one rater sees of one trial.
-
-    Args:
-        run: The run folder.
-        order: The rater's trials.
-        reviews: The labels in the run.
-        rater: Name of the rater.
-        trial_id: The trial, as it stands in the address.
 
     Raises:
         NotHereError: When the run has no such trial.
@@ -204,10 +189,8 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
     """Keep what a rater's page sent; it is on disk when this returns.
 
     Args:
-        run: The run folder.
         record: trial_id, seen (the version before the rater), and result, cause, note, flag; a
             result of None takes the label away.
-        rater: Name of the rater.
 
     Raises:
         UsageError: When a part is missing or is something else than it should be.
@@ -238,11 +221,6 @@ def save_label(run: RunFolder, record: Mapping[str, Any], *, rater: str) -> Save
 def text_of(record: Mapping[str, Any], name: str, longest: int) -> str:
     """Read a text that a page sent; empty where it sent none.
 
-    Args:
-        record: What it sent.
-        name: Of the text.
-        longest: Characters that it may have.
-
     Raises:
         UsageError: When it is something else, or longer.
     """
@@ -268,10 +246,8 @@ def summarise(
     """Gather how far the raters are and, when nobody is labelling any more, how far they agree.
 
     Args:
-        judgement: The trials of the run.
         reviews: The labels in the run, and what is wrong with files that hold none.
         chosen: The set of trials, one of ``SETS``.
-        show: Show the agreement although somebody has trials left.
     """
     found, problems = reviews
     ids = set(trials_to_label(judgement, chosen, ""))

@@ -53,10 +53,6 @@ class Learned:
 def learned_in(run: RunFolder, protocol: Protocol) -> Learned:
     """Read what a run learned, and check that a study may use it.
 
-    Args:
-        run: After ``calibrate RUN --posterior``.
-        protocol: Of the study.
-
     Raises:
         UsageError: When it learned nothing of one of the study's tasks, in another laboratory, with
             another task file, or from one of the study's starts.

@@ -58,7 +58,6 @@ class Library:
         """Return the runs that one can be compared with, by name.
 
         Args:
-            run: The run in question.
             beside: Also the runs in the same folder that are not shown.
         """
         here = run.path.resolve()
@@ -78,7 +77,6 @@ def episode_path(run: RunFolder, episode_id: str) -> Path:
     """Return the file of a recorded episode; nothing outside the run folder is ever reached.
 
     Args:
-        run: The run folder.
         episode_id: As it stands in an address, so it may be anything.
     """
     what = f"episode {episode_id!r}"
@@ -93,8 +91,6 @@ def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
     """Return the derived episodes of one kind (replay, localised, views) of one episode.
 
     Args:
-        run: The run folder.
-        episode_id: Id of the recorded episode.
         kind: replay, localised or views.
     """
     found = run.derived(f"{escape(episode_id)}.{kind}.*")
@@ -114,7 +110,6 @@ def derived_path(run: RunFolder, name: str) -> Path:
     """Return one derived episode by file name, among those that exist in the run.
 
     Args:
-        run: The run folder.
         name: File name as it stands in an address, so it may be anything.
     """
     for path in run.derived():

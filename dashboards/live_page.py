@@ -118,9 +118,6 @@ class LiveFeed:
         """Listen to nothing yet.
 
         Args:
-            wire: Where the recorder is.
-            recorder: Its name.
-            open_wire: Opens a session.
             now_s: A clock that never jumps.
         """
         self._wire, self._recorder = wire, recorder
@@ -303,13 +300,7 @@ async def told(
     render: Callable[[LiveState], Mapping[str, Any]],
     is_gone: Callable[[], Awaitable[bool]],
 ) -> AsyncIterator[bytes]:
-    """Yield server-sent events while a viewer looks: parts of the page that changed.
-
-    Args:
-        feed: What is heard.
-        render: Makes the parts of the page of a state.
-        is_gone: Whether the viewer left, or the server ends.
-    """
+    """Yield server-sent events while a viewer looks: parts of the page that changed."""
     if not feed.enter():
         yield b"event: full\ndata: {}\n\n"
         return

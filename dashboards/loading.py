@@ -22,7 +22,6 @@ def late(load: Callable[[], Any], name: str) -> Callable[[Request], Awaitable[Re
 
     Args:
         load: Gives the object that answers, the same one each time; called from several threads.
-        name: Of its method that takes a request.
     """
 
     async def answer(request: Request) -> Response:

@@ -187,10 +187,6 @@ def rate_table(measurements: Sequence[Measurement], selection: Selection) -> Rat
     """Arrange rates by group and side; None when there are none.
 
     A side without a rate in any group is left out; the page lists what is undefined, and why.
-
-    Args:
-        measurements: Everything that was measured.
-        selection: Its groups come first where there are too many for one table.
     """
     rates = _rates(measurements)
     if not rates:
@@ -278,12 +274,7 @@ def gain_rows(measurements: Sequence[Measurement]) -> tuple[GainRow, ...]:
 
 
 def methods(measurements: Sequence[Measurement], start: str) -> str:
-    """Name the interval methods of the measurements whose id starts so.
-
-    Args:
-        measurements: Everything that was measured.
-        start: What the id begins with, for example ``gain.``.
-    """
+    """Name the interval methods of the measurements whose id starts so."""
     named = [
         wording.method(m.interval)
         for m in measurements
@@ -402,8 +393,6 @@ def neighbours(
     """Return the trials before and after one in the filtered list.
 
     Args:
-        judgement: Numbers and trials of the run.
-        selection: Which trials the list holds.
         episode_id: The trial in question; outside the list it has no neighbours.
     """
     if judgement.index is None:
@@ -415,8 +404,6 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     """Gather the first page of one run.
 
     Args:
-        run: The run folder.
-        judgement: Its numbers and trials.
         selection: Which trials are listed; the numbers are of all.
     """
     about = judgement.about
@@ -493,12 +480,7 @@ def _failures(table: Sequence[Sequence[Any]], *, twin: bool) -> tuple[Failure, .
 
 
 def trial_list(judgement: Judgement, selection: Selection) -> TrialList:
-    """Return the screen of trials that a selection asks for; beyond the last it is the last.
-
-    Args:
-        judgement: Numbers and trials of the run.
-        selection: Which trials, in which order, which screen.
-    """
+    """Return the screen of trials that a selection asks for; beyond the last it is the last."""
     index = judgement.index
     if index is None:
         return TrialList(trials=(), selected=0, of=0, page=1, pages=1, facets=())

@@ -123,8 +123,6 @@ def build_queue(
     """Gather one page of the queue.
 
     Args:
-        run: The run folder.
-        judgement: Its trials.
         reviews: The labels in the run, and what is wrong with files that hold none.
         show: One of ``SHOW``; anything else shows all.
         page: Which page, from 1; one that is not there shows the nearest.
@@ -179,12 +177,7 @@ def is_label(review: Review) -> bool:
 
 
 def moment_of(run: RunFolder, row: IndexedTrial) -> Moment | None:
-    """Find the first divergence that the replays of a trial tell, or the first failing factor.
-
-    Args:
-        run: The run folder.
-        row: The trial.
-    """
+    """Find the first divergence that the replays of a trial tell, or the first failing factor."""
     for name in (row.executed_replay, row.planned_replay):
         path = run.derived_dir / name if name else None
         if path is None or not path.is_file():
@@ -250,10 +243,6 @@ def thumbnail(run: RunFolder, row: IndexedTrial) -> bytes:
 
     Without such a moment it shows the last picture.
 
-    Args:
-        run: The run folder.
-        row: The trial.
-
     Raises:
         NotHereError: When the recording has no picture.
         GstError: When it cannot be read.
@@ -271,11 +260,7 @@ def drawn_once(
     """Return a picture of a trial that is drawn once and kept; one of something else goes.
 
     Args:
-        folder: Where it is kept, inside the run.
-        episode: Id of the trial.
         what: Everything that it depends on; equal text stands for an equal picture.
-        draw: Makes it.
-        ending: Of its file.
     """
     name = hashlib.sha256(episode.encode("utf-8", "surrogatepass")).hexdigest()[:16]
     key = hashlib.sha256(repr(what).encode("utf-8", "surrogatepass")).hexdigest()[:16]
@@ -305,12 +290,7 @@ def _drawn(path: Path, moment: Moment | None) -> bytes:
 
 
 def recorded_ns(path: Path, moment: Moment) -> int | None:
-    """Return when a moment is on the recording's clock; None where its plan was not executed.
-
-    Args:
-        path: The recorded episode.
-        moment: What its replays tell.
-    """
+    """Return when a moment is on the recording's clock; None where its plan was not executed."""
     start_ns, _ = streams.execution_ns(executed_events(Episode.open(path)), moment.plan_id)
     return None if start_ns is None else start_ns + moment.t_ns
 

@@ -32,12 +32,7 @@ class Problems:
     texts: list[str] = field(default_factory=list)
 
     def attempt(self, read: Callable[[], Part], otherwise: Part) -> Part:
-        """Return what ``read`` gives; on one of our errors, note it and return the fallback.
-
-        Args:
-            read: Reads one part of a file.
-            otherwise: What stands for the part when that fails.
-        """
+        """Return what ``read`` gives; on one of our errors, note it and return the fallback."""
         try:
             return read()
         except GstError as error:
@@ -215,7 +210,6 @@ class PageClock:
         """Return the page time of an instant of a plan; None if it never ran.
 
         Args:
-            plan_id: A plan of the recording.
             t_ns: Time since that plan's start [ns]; None stays None.
         """
         if t_ns is None or plan_id not in self.starts_ns:

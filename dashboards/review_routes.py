@@ -24,12 +24,7 @@ Page = Callable[..., Response]
 
 
 def review_routes(run_of: RunOf, page: Page) -> list[Route]:
-    """Return the addresses of queue and labels.
-
-    Args:
-        run_of: The run that a request is about.
-        page: Fills in a template.
-    """
+    """Return the addresses of queue and labels."""
     pages = _ReviewPages(run_of, page)
     return [
         Route("/queue", pages.queue),

@@ -108,8 +108,6 @@ def packed(path: Path, run_path: Path, stamps: Stamps) -> bytes:
     """The file of a recorded episode's scene.
 
     Args:
-        path: The recorded episode.
-        run_path: Folder of its run.
         stamps: Of what the scene is made of; another one is gathered anew.
     """
     with _GATHERING:
@@ -185,11 +183,7 @@ class _Blocks:
 
 
 def pack_scene(scene: TrialScene) -> bytes:
-    """Write everything that the 3D view of a trial needs into one file.
-
-    Args:
-        scene: What is to be seen.
-    """
+    """Write everything that the 3D view of a trial needs into one file."""
     clouds = {} if scene.parts is None else reduced_clouds(scene.parts, scene)
     clouds, by_node = _by_node(clouds, scene.sides)
     table, ranges, factor = _splat_table(clouds)
@@ -236,10 +230,6 @@ def reduced_clouds(parts: MovableScene, scene: TrialScene) -> dict[str, Gaussian
 
     What is largest and most opaque is kept, opacity times area, of objects ten times that: they are
     small, and what is looked at.
-
-    Args:
-        parts: All Gaussians of the scene.
-        scene: Says whether the robot is drawn.
     """
     clouds = {"background": parts.background}
     clouds |= {f"object {name}": item.cloud for name, item in parts.objects.items()}
@@ -263,10 +253,6 @@ def _by_node(
 
     Each follows the node nearest to it, rigidly: between neighbours that is off by the strain over
     half a cell of the lattice, about a millimetre for a toy.
-
-    Args:
-        clouds: What is drawn.
-        sides: The replays say how soft objects are bent.
 
     Returns:
         The clouds, and by cloud how many Gaussians follow which node, in their order.

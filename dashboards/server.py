@@ -93,8 +93,6 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
 
     Args:
         runs: Run folders; those of the same name get a number.
-        config: Where to listen.
-        output: Gets the address, and the command for another computer.
     """
     library = Library.open(runs)
     if config.console:

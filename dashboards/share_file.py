@@ -121,10 +121,6 @@ class Shared:
 def share(run: RunFolder, config: ShareConfig) -> tuple[Path, Shared]:
     """Write chosen trials into one file, and let the report name it.
 
-    Args:
-        run: The run folder.
-        config: Which trials, and where to.
-
     Raises:
         UsageError: When a trial is not there, none can be chosen, or they do not fit.
     """
@@ -147,8 +143,6 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
     """Make the file, as well as it fits.
 
     Args:
-        run: The run folder.
-        config: Which trials, and how large it may be.
         report: Where the report lies from the file; empty leaves the link out.
 
     Raises:
@@ -187,10 +181,6 @@ def build_share(run: RunFolder, config: ShareConfig, *, report: str = "") -> Sha
 
 def chosen_trials(judgement: Judgement, names: Sequence[str]) -> list[IndexedTrial]:
     """Return the trials that were named; without names the worst that have a recording.
-
-    Args:
-        judgement: The run's trials.
-        names: Ids of episodes.
 
     Raises:
         UsageError: For one that is not there, with the nearest name, or where none can be chosen.

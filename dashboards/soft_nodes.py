@@ -45,10 +45,6 @@ class SoftNodes:
 def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
     """Read the nodes of a soft object; None where the replay holds none that can be drawn.
 
-    Args:
-        replay: The replay.
-        name: Of the object.
-
     Raises:
         GstError: When the file cannot be read.
     """
@@ -73,12 +69,7 @@ def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
 
 
 def not_bent(name: str, trajectory: str | None) -> str:
-    """Return the note for an object whose nodes cannot be drawn.
-
-    Args:
-        name: Of the object.
-        trajectory: Of the replay.
-    """
+    """Return the note for an object whose nodes cannot be drawn."""
     return f"{name}: as replayed ({trajectory}) drawn without being bent"
 
 
@@ -91,10 +82,7 @@ def bend(
     """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
 
     Args:
-        nodes: Of the object.
-        track: Poses of the object as the robot finds it.
         own_ns: The page's samples on the replay's clock, evenly spaced.
-        found: Takes what is replayed to where cameras see it.
 
     Returns:
         The nodes unbent [m], and ``T_base_node`` at each instant.

@@ -44,11 +44,7 @@ class StudyPages:
         """Remember whom to ask.
 
         Args:
-            run_of: The run that a request is about.
-            page: Fills in a template.
-            others_of: The runs that one may be compared with.
             part: Fills in a part of the page Live, by name, with what is heard.
-            config: Where the recorder is.
         """
         self._run, self._page, self._others, self._part = run_of, page, others_of, part
         self._config = config

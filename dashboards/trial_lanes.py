@@ -40,9 +40,6 @@ def trial_lanes(
     """Draw stages, touches and divergences, and marks for failure, replanning and divergence.
 
     Args:
-        recording: The recorded episode.
-        replays: The replay that is shown for each trajectory, planned and executed.
-        clock: Converts its stamps to the page's time.
         failure_t_s: Page time of the first failure in the twin [s]; None marks none.
     """
     marks = [(each.t_s, f"replan: {each.reason}", "replan") for each in replans(recording, clock)]
@@ -64,12 +61,7 @@ def trial_lanes(
 
 
 def replans(recording: Recording, clock: PageClock) -> tuple[Replanned, ...]:
-    """Plans that the gate sent back, in their order, with its reasons.
-
-    Args:
-        recording: The recorded episode.
-        clock: Converts its stamps to the page's time.
-    """
+    """Plans that the gate sent back, in their order, with its reasons."""
     return tuple(
         Replanned(
             t_s=clock.seconds(event["stamp_ns"]),

@@ -46,11 +46,8 @@ def main_plots(
     """Tool error, tool position, gripper, clearance and objects; only those that have data.
 
     Args:
-        recording: The recorded episode.
-        replays: All replays that could be read.
         sent_plan: Only its replays are drawn; None where no plan was sent.
         row: The trial beside its replays, for the tool's error; None where it was not compared.
-        clock: Converts stamps to the page's time.
     """
     shown = shown_replays(replays, sent_plan)
     plots = [
@@ -169,8 +166,6 @@ def plots_of_joints(
     Args:
         recording: The recorded episode; joints are named by it, or by its first plan that names
             them.
-        shown: The replay that is drawn for each trajectory, planned and executed.
-        clock: Converts stamps to the page's time.
     """
     track = recording.joints
     planned = (plan.joint_names for _, plan in recording.plans if plan.joint_names)

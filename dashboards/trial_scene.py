@@ -145,9 +145,6 @@ def gather_scene(
     """Gather one trial in space.
 
     Args:
-        run: Whose rebuilt scene is shown.
-        recording: The trial.
-        replays: The replay to show for each trajectory, planned and executed.
         sent_plan: Its way is drawn as it was executed; None draws none.
     """
     problems = Problems()

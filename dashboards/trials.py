@@ -91,11 +91,6 @@ class Job:
 def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
     """Write the protocol, do every job that is not done, replay and evaluate.
 
-    Args:
-        path: The run folder; made, or continued.
-        config: What the study does.
-        output: Told of each step and of the result.
-
     Raises:
         DashboardError: When a command failed.
     """
@@ -206,7 +201,6 @@ def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
     """Every start under every policy, numbered in the protocol's order.
 
     Args:
-        protocol: What the study does.
         chosen: How each task was asked for, by its name.
     """
     jobs: list[Job] = []
@@ -421,13 +415,7 @@ def _try(
 
 
 def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
-    """The command that tries one start.
-
-    Args:
-        job: Which start, and how.
-        config: What all have in common.
-        endpoint: Where recorder, gate and planner are.
-    """
+    """The command that tries one start."""
     options: dict[str, Any] = {
         "--connect": endpoint,
         "--task": job.chosen,

@@ -55,7 +55,6 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
     """Gather the held-out views of a run, worst first where the results rate them.
 
     Args:
-        run: The run folder.
         judgement: Its numbers; without them the views are sorted by time.
     """
     views: list[HeldOutView] = []
@@ -139,10 +138,6 @@ def view_image(
     """Return the recorded or the rendered image of one held-out view.
 
     Args:
-        run: The run folder.
-        path: The views episode.
-        side: ``recorded`` or ``rendered``.
-        camera_id: Id of the camera.
         stamp_ns: Source time of the view [ns].
     """
     if side == "rendered":

@@ -67,7 +67,6 @@ def number(value: float, unit: str) -> str:
     """Print a value in its unit: fractions as percent, lengths in millimetres.
 
     Args:
-        value: The value in ``unit``.
         unit: Unit of the measurement: one of ``FORMS``, or another, which is printed as it is.
     """
     figure, shown = _figure(value, unit)
@@ -121,7 +120,6 @@ def bounds(interval: Interval | None, unit: str) -> str:
 
     Args:
         interval: The interval; None prints nothing.
-        unit: Unit of the measurement.
     """
     if interval is None:
         return ""

@@ -163,7 +163,6 @@ class SummaryCache:
         Args:
             folder: None keeps nothing.
             fresh: Believe nothing that was kept, and keep what is made now.
-            say: Called about whatever makes the evaluation take longer.
             monotonic: The clock of periodic saving [s].
         """
         self._folder = folder
@@ -179,7 +178,6 @@ class SummaryCache:
         """Return what is kept under a key, or make and keep it; what ``make`` raises passes.
 
         Args:
-            kind: The dataclass of the summaries.
             key: Names what they are made from, so that a changed file has another key.
             make: Makes them where nothing is kept.
         """
@@ -201,7 +199,6 @@ class SummaryCache:
         """Keep summaries under a key; now and then everything new is written.
 
         Args:
-            kind: The dataclass of the summaries.
             key: Names what they were made from, so that a changed file has another key.
             made: The summaries; none is an answer too.
         """

@@ -31,7 +31,6 @@ class AlikeNamesError(EvaluatorError):
         """Build the question about names that differ only by case or blanks.
 
         Args:
-            kind: What is named: task, condition, policy.
             alike: For each name its spellings with where they first stand; all are listed.
         """
         (first, place), (second, other), *_ = alike[0].items()

@@ -54,9 +54,6 @@ TRIAL_TYPES = {field.name: "string" for field in fields(TrialRecord)} | {
 def read_measurements(run: Path | str) -> pd.DataFrame:
     """Return one row per measured number of a run that was evaluated.
 
-    Args:
-        run: The run folder, or a ``results.json``.
-
     Raises:
         PathNotFoundError: When it was not evaluated yet.
     """
@@ -69,9 +66,6 @@ def read_groups(run: Path | str) -> pd.DataFrame:
     Sides are ``recorded``, ``sim_planned``, ``sim_executed`` and ``verdict``; ``rate`` is from 0
     to 1 and ``unit`` what was counted. Names are written as ids spell them.
 
-    Args:
-        run: The run folder, or a ``results.json``.
-
     Raises:
         PathNotFoundError: When it was not evaluated yet.
     """
@@ -80,9 +74,6 @@ def read_groups(run: Path | str) -> pd.DataFrame:
 
 def read_trials(run: Path | str) -> pd.DataFrame:
     """Return one row per trial of a run that was evaluated, as ``trials.csv`` holds them.
-
-    Args:
-        run: The run folder, or a ``trials.csv``.
 
     Raises:
         PathNotFoundError: When it was not evaluated yet.

@@ -250,7 +250,6 @@ def write_results(results: Results, path: Path) -> Path:
     """Write ``results.json``; a half-written file never carries the final name.
 
     Args:
-        results: Everything the evaluation has to say.
         path: Where the file goes; its folder is made.
     """
     text = _written(results.to_record())

@@ -191,8 +191,6 @@ class Selection(_Selected):
 
         Args:
             task: Task of the group; all three are slugs.
-            condition: Its condition.
-            policy: Its policy.
         """
         return (
             self.task in ("", task)
@@ -391,7 +389,6 @@ def written_index(
 
     Args:
         trials: Every trial in the order of the list, with the slugs of its ``FACETS``.
-        files: The other files of the run.
         about: Whatever else the pages show, as JSON.
     """
     with closing(sqlite3.connect(":memory:")) as db, db:
@@ -481,7 +478,6 @@ class ReviewIndex:
         """Return the trials of a selection in its order.
 
         Args:
-            selection: Which ones.
             limit: At most so many; all of them below 0.
             offset: So many are passed over.
         """
@@ -565,8 +561,6 @@ class ReviewIndex:
         """Return the trials of a selection of failures, in the order of ``severity``.
 
         Args:
-            selection: Which ones.
-            limit: At most so many.
             offset: So many are passed over.
         """
         where, values = selection.where()
@@ -580,7 +574,6 @@ class ReviewIndex:
         """Return what one part can be under the other filters, and how often it is.
 
         Args:
-            selection: The other filters.
             name: One of ``FAILURE_PARTS``.
         """
         where, values = selection.where(but=name)

@@ -79,7 +79,6 @@ def missed(thresholds: Sequence[Threshold], results: Results) -> list[Missed]:
 
     Args:
         thresholds: The least value of each number that counts as passed.
-        results: What the evaluation found.
     """
     by_id = {measurement.id: measurement for measurement in results.measurements}
     found = []

@@ -160,11 +160,7 @@ class Browser:
         return len(self._loaded)
 
     def await_load(self, before: int) -> None:
-        """Wait for the document that an action led to.
-
-        Args:
-            before: ``num_loaded`` before that action.
-        """
+        """Wait for the document that an action led to."""
         while self.num_loaded == before:
             self._read()
 

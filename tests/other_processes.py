@@ -32,8 +32,6 @@ def check_an_interrupted_evaluation(code: str, run: Path, at_work: str) -> None:
     Args:
         code: Evaluates the run it is given; prints the id of the process it starts, then
             ``at_work`` when it may be interrupted.
-        run: A run folder.
-        at_work: See ``code``.
     """
     with subprocess.Popen(
         [sys.executable, "-c", code, str(run)],

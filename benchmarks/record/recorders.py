@@ -21,8 +21,6 @@ class OurRecorder(Child):
 
         Args:
             folder: For its log; also where the run folder is made.
-            arguments: Further options of the command.
-            run: The run folder, if not in ``folder``.
         """
         self.run_path = run or folder / "run"
         self.endpoint = free_endpoint()

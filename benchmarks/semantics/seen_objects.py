@@ -80,9 +80,7 @@ def judge(
     """Match instances with objects.
 
     Args:
-        objects: What a person marked.
         labels: By frame, the instance each pixel shows; 0 is none.
-        instances: Ids of all instances, those included that no frame shows.
     """
     scores = np.zeros((len(objects), len(instances)))
     for column, number in enumerate(instances):

@@ -119,7 +119,6 @@ def area_means(fine_u8: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Means around the points that a view of ordinary size shows, as 8-bit colour.
 
     Args:
-        fine_u8: The view drawn FINER times as large.
         weights: Along rows and along columns, an odd number that adds up to 1.
     """
     reach = len(weights) // 2
@@ -187,7 +186,6 @@ def draw(indices: Iterable[int], finer: int = 1) -> tuple[np.ndarray, np.ndarray
     """Colour (views x height x width x 3) and depth along the axis [m] of some views.
 
     Args:
-        indices: Which views.
         finer: How many times the ordinary width and height.
     """
     import pybullet

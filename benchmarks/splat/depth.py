@@ -47,7 +47,6 @@ def depth_scores(
 
     Args:
         ways: By name, what draws depth along the axis [m]; 0 is nothing.
-        held_out: Recorded views with what moved masked.
     """
     errors: dict[str, list[np.ndarray]] = {name: [] for name in ways}
     for view in held_out:
@@ -97,12 +96,7 @@ class Tsdf:
     def depth_m(
         self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "height width"]:
-        """Cast rays to the zero crossing; 0 where there is none.
-
-        Args:
-            camera: Size of the image and intrinsics.
-            T_base_camera: Where the camera is.
-        """
+        """Cast rays to the zero crossing; 0 where there is none."""
         K, T = self._about(camera, T_base_camera)
         blocks = self._grid.hashmap().key_tensor()[
             self._grid.hashmap().active_buf_indices().to(self._o3d.core.int64)

@@ -23,7 +23,6 @@ def assigned(info: EpisodeInfo, path: Path) -> EpisodeInfo:
     """Apply the note on a recorded episode, where there is one.
 
     Args:
-        info: What the file says of itself.
         path: The file; one that lies in no run's ``episodes/`` has no note.
 
     Raises:
@@ -59,14 +58,6 @@ def assign(
     policy: str | None,
 ) -> Path:
     """Note that an episode is a trial; what is None stays as it was.
-
-    Args:
-        run: The run that holds it.
-        path: Its file.
-        info: What is known of it now.
-        task: Name of a task that is known to the run.
-        start_id: Start that it shares with others.
-        policy: What moved the robot.
 
     Raises:
         UsageError: When it is a scan, a probe or a retry.

@@ -40,7 +40,6 @@ def write_parquet(entries: Sequence[Entry], path: Path) -> None:
     """Write one row per episode; columns are the fields of ``Entry``, times in ns.
 
     Args:
-        entries: The episodes, one row each, in this order.
         path: The file to write; an older one is replaced.
 
     Raises:
@@ -84,8 +83,6 @@ def find_episodes(
 
     Args:
         run: The run folder; if it cannot be written, the answer is the same but takes longer.
-        query: What to look for.
-        advance: Called while files are read that the catalogue does not know yet.
     """
     path = run.path / FILE_NAME
     if not run.episodes_dir.is_dir():  # somebody else's folder: nothing is written into it
@@ -144,7 +141,6 @@ def sidecar_path(run: RunFolder, episode_id: str) -> Path:
     """Where the label of an episode is kept.
 
     Args:
-        run: The run that has, or will have, the episode.
         episode_id: Its id, which must be safe as a file name.
     """
     return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
@@ -154,7 +150,6 @@ def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
     """Return the label given after the fact if there is one, else what the episode says.
 
     Args:
-        run: The run whose ``notes/`` may hold a label.
         episode: One of its episodes; the label is looked up by the name of its file.
     """
     if not EPISODE_ID.fullmatch(episode.path.stem):
@@ -169,8 +164,6 @@ def write_label(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
     """Write the sidecar of a finished episode.
 
     Args:
-        run: The run that holds the episode.
-        episode_id: Id of a finished episode.
         outcome: The label, in place of any that was there.
 
     Raises:
@@ -198,12 +191,7 @@ _LARGEST = 2**63 - 1
 
 
 def read_entry(run: RunFolder, path: Path) -> Entry:
-    """Open an episode and sum it up; a broken one is listed with its error.
-
-    Args:
-        run: The run, for labels given after the fact.
-        path: The episode's file, the first part of a split one.
-    """
+    """Open an episode and sum it up; a broken one is listed with its error."""
     parts: tuple[Path, ...] = (path,)
     name: dict[str, Any] = {"file": printable(path.name), "id": printable(path.stem)}
     try:
@@ -295,13 +283,7 @@ def find_runs(folder: Path) -> list[RunFolder]:
 def find_in_runs(
     runs: Sequence[RunFolder], query: CatalogueQuery, *, advance: Advance | None = None
 ) -> list[tuple[RunFolder, Entry]]:
-    """Return the episodes of several runs that pass all filters, in one order.
-
-    Args:
-        runs: Where to look.
-        query: What to look for.
-        advance: Called while files are read that a catalogue does not know yet.
-    """
+    """Return the episodes of several runs that pass all filters, in one order."""
     found = [
         (run, entry)
         for run in runs
@@ -323,7 +305,6 @@ def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
 
     Args:
         run: The run that holds the episode; its catalogue is brought up to date.
-        episode_id: Id of a finished episode.
         outcome: The label, in place of any that was there.
     """
     path = write_label(run, episode_id, outcome)
@@ -337,9 +318,6 @@ def assign_trial(
     """Note that an episode is a trial of a task, beside the run.
 
     Args:
-        run: The run that holds it.
-        episode_id: Id of a finished episode.
-        task: Name of a task, or its file, which the run then keeps.
         start_id: Start it shares with others; None: as it says itself.
         policy: What moved the robot; None: as it says itself.
     """
@@ -379,10 +357,6 @@ def note_finished(run: RunFolder, path: Path) -> None:
     """Enter one episode, so that whoever reads the database finds it; takes milliseconds.
 
     Never raises: the next listing enters what is missing.
-
-    Args:
-        run: The run folder.
-        path: Any part of a finished episode.
     """
     with contextlib.suppress(Exception):  # a cache is not worth an episode
         first = first_part(path)

@@ -103,8 +103,6 @@ def trace(
     """Look at the files of one episode.
 
     Args:
-        run: The run folder.
-        path: First part.
         labels: Names of the sidecars that exist; None looks.
         now_ns: Wall time; None asks the clock [ns].
         parts: All its files; None looks.
@@ -334,7 +332,6 @@ class CatalogueStore:
 
         Args:
             rows: Entries with the stamp of their files (see ``stamp_of``).
-            gone: File names whose rows are to go.
         """
         values = [_values(entry, stamp) for entry, stamp in rows]
         with self._transaction():
@@ -347,7 +344,6 @@ class CatalogueStore:
         Args:
             clause: SQL after ``FROM episodes``, with ``?`` where a value goes; never text of a
                 user.
-            values: One for each ``?``.
         """
         try:
             return [_entry(row) for row in self._db.execute(_SELECT + clause, values)]

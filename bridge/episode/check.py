@@ -166,7 +166,6 @@ def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Ite
     """Check every episode among some files; a later part goes with the first of its episode.
 
     Args:
-        paths: Files, in any order.
         contract: Judge by this one; None takes the one each episode was recorded under.
     """
     done: set[Path] = set()

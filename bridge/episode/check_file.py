@@ -73,7 +73,6 @@ class Seen:
         """Take a schema, channel or metadata record; yields what is wrong with it.
 
         Args:
-            place: Where the record lies in the file.
             record: What was read there; None, and any other kind of record, is passed over.
         """
         if isinstance(record, records.Metadata):
@@ -98,11 +97,9 @@ def summary_faults(
     What a writer may leave out (statistics, repeated records, an index as a whole) is no fault.
 
     Args:
-        stream: The file, for the records the summary's offsets point at.
         seen: What the walk through the data found; the summary's schemas and channels are added to
             it.
         summary: What the file says of itself; None where it has no summary, which is no fault.
-        footer: The last record, which says where the summary lies.
         footer_at: Where the footer begins [bytes from the start of the file].
     """
     if summary is None:

@@ -167,7 +167,6 @@ class SequenceWatch:
         """Take the next number in the order of the file.
 
         Args:
-            sequence: The number.
             may_skip: What is missing before this one was left out on purpose.
         """
         if self._next is None:
@@ -270,7 +269,6 @@ class TopicWatch:
         """Take the next message in the order of the file.
 
         Args:
-            message: The next of this topic.
             decoder: Reads it; what it finds wrong is counted, and the first fault kept.
         """
         head, result = message.head, self.result

@@ -65,7 +65,6 @@ class ChunkQueue:
 
         Args:
             section: The growing file; nobody else writes to it unless ``drain`` has returned.
-            part_path: Its name, beside which a journal is made when one is needed.
             header: What a file like it begins with; the journal does too.
             monotonic: A clock without steps [s].
         """
@@ -94,13 +93,7 @@ class ChunkQueue:
         self._thread.start()
 
     def add(self, chunk: EncodedChunk, *, is_small: bool, since_s: float) -> None:
-        """Take a chunk; never waits.
-
-        Args:
-            chunk: What to write.
-            is_small: Whether it holds small messages.
-            since_s: When its first message came, by ``monotonic``.
-        """
+        """Take a chunk; never waits."""
         with self._changed:
             if is_small:
                 self._small.append(_Small(chunk, since_s, self._monotonic()))
@@ -129,7 +122,6 @@ class ChunkQueue:
         """Wait until a chunk may be added.
 
         Args:
-            num_bytes: Its size, roughly.
             limit: No more may wait with it, unless it is the only one.
 
         Raises:

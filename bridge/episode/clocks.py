@@ -81,7 +81,6 @@ def jump_of(before: Sequence[Reading], new: Reading) -> Jump | None:
 
     Args:
         before: Readings since the clock was last set, in order.
-        new: The next one.
     """
     for old in before[-COMPARED:]:
         allowed_ns = old.error_ns + new.error_ns + SLEW * abs(new.at_ns - old.at_ns)
@@ -200,13 +199,7 @@ class SourceClock:
 
 
 def told_jump(source: str, host: str, jump: Jump) -> str:
-    """Name a clock that was set.
-
-    Args:
-        source: Beginning of the source's topics.
-        host: Where it runs.
-        jump: When, and how far.
-    """
+    """Name a clock that was set."""
     sign = "ahead" if jump.by_ns > 0 else "back"
     return f"the clock of {source} on {host} was set {sign} by {_in_words(abs(jump.by_ns))}"
 
@@ -228,10 +221,6 @@ class StampWatch:
 
     def see(self, topic: str, delay_ns: int) -> int:
         """Take the least (arrival - stamp) of the next second; return how far stamps jumped.
-
-        Args:
-            topic: Whose messages.
-            delay_ns: The smallest one of a second [ns].
 
         Returns:
             Ahead is positive; 0 where there was no jump.
@@ -256,9 +245,7 @@ def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) ->
     """Make the record of ``/recorder/clocks``.
 
     Args:
-        clock: The source.
         identity: Of its process; another one has another clock.
-        readings: Those that the episode does not have yet.
     """
     return {
         "schema_version": 1,
@@ -326,7 +313,6 @@ class StampCorrection:
         message closest to its arrival. Sources that share a topic and differ are left alone.
 
         Args:
-            topic: Of the message.
             publish_ns: Its time by the source's clock.
             log_ns: When it arrived, by the recorder's clock.
         """
@@ -362,7 +348,6 @@ def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: 
     """Move the time of a message, and the time it holds itself, where its type has one.
 
     Args:
-        message: As stored.
         definition: Of its type; None where there is none.
         shift_ns: What is added [ns]; times that were never set stay 0.
     """
@@ -476,7 +461,6 @@ def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
     """Open an episode as ``Episode.open`` does, with the clock a person asked for.
 
     Args:
-        path: The file, the first part of a split one.
         clock: ``corrected`` takes the sources' offset and drift out of all stamps.
 
     Raises:

@@ -114,10 +114,6 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
     """Build a contract from parsed values.
 
-    Args:
-        values: As they stand in the TOML file, or in an episode's metadata record.
-        name: Where they come from, for errors.
-
     Raises:
         ContractError: When something in it is not what a contract holds.
     """
@@ -175,8 +171,6 @@ def write_contract(contract: Contract, path: Path, *, source: str) -> None:
     """Write a contract as a TOML file; one that is there is not replaced.
 
     Args:
-        contract: What to write.
-        path: Where.
         source: What it was learned from; goes into its first line.
 
     Raises:
@@ -219,7 +213,6 @@ class Presence:
         """Take the next message.
 
         Args:
-            stamp_ns: When it was received [ns].
             pauses: When nothing was to be recorded.
         """
         self.messages += 1
@@ -289,8 +282,6 @@ def judge(
 
     Args:
         presences: By topic.
-        contract: What was promised, if anybody said.
-        span: When it was recorded.
         lost: By topic, messages that were sent and are not in the episode; they are not taken for
             silence of their publisher.
         by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
@@ -446,7 +437,6 @@ def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
 
     Args:
         presences: By topic, of an episode that is clean.
-        cell: Name of the cell.
     """
     rules = {
         topic: _learned(topic, presence)

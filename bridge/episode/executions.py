@@ -81,10 +81,6 @@ def with_execution(episode: Episode, events: Iterable[Mapping[str, Any]]) -> lis
 
     A trial of a known task that carries no plan and says nothing of executions gets one of
     ``NO_PLAN``. One that says when, but not of which plan, keeps its times.
-
-    Args:
-        episode: The recording.
-        events: Its gst events, in log order.
     """
     found = [dict(event) for event in events]
     if any(event["type"] == EXECUTION[0] for event in found):

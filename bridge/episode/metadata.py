@@ -135,12 +135,7 @@ class Derived:
 
 
 def why_not_counted(derived: Derived, *, stand_in: bool) -> str:
-    """Why a replay never enters a number, whatever it says; empty where it may.
-
-    Args:
-        derived: What it was made from, and how.
-        stand_in: Whether that is a recording of the stand-in cell.
-    """
+    """Why a replay never enters a number, whatever it says; empty where it may."""
     if is_same_engine(derived.engine, stand_in=stand_in):
         return f"made in {derived.engine}, the {SAME_ENGINE}"
     if derived.settings.get(SECOND_ENGINE_KEY):
@@ -161,7 +156,6 @@ def build(of_type: type[Record], record: Mapping[str, Any]) -> Record:
     """Make one of the records above from parsed values; fields of later versions are left out.
 
     Args:
-        of_type: The class of the record, such as ``EpisodeInfo``.
         record: Values by field name, as parsed from JSON; a list may stand for a tuple.
 
     Raises:

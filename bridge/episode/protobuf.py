@@ -39,10 +39,6 @@ def bytes_field(number: int, value: bytes) -> bytes:
 def read_varint(data: memoryview, at: int) -> tuple[int, int]:
     """Return an unsigned integer and the place after it.
 
-    Args:
-        data: The message.
-        at: Where the number begins in it.
-
     Raises:
         ValueError: The bytes end inside the number, or it has more than 64 bits.
     """
@@ -101,15 +97,7 @@ def file_descriptor(
     members: Sequence[tuple[str, int, int, str]],
     imports: Sequence[str] = (),
 ) -> bytes:
-    """Describe a file with one message as an entry of a ``FileDescriptorSet``.
-
-    Args:
-        name: Path of the file.
-        package: Its package.
-        message: Name of the message.
-        members: Name, number, type and, for messages, full type name of each field.
-        imports: Files it imports.
-    """
+    """Describe a file with one message as an entry of a ``FileDescriptorSet``."""
     described = bytes_field(1, message.encode())
     for member, number, kind, type_name in members:
         field = bytes_field(1, member.encode()) + number_field(3, number)

@@ -102,7 +102,6 @@ def record_of(file: McapFile, name: str) -> dict[str, Any]:
     """Return a metadata record of one file with its values parsed, empty where there is none.
 
     Args:
-        file: One part of an episode.
         name: Of the record, such as ``episode`` or ``outcome``; the last of that name counts.
     """
     values: dict[str, Any] = {}

@@ -53,7 +53,6 @@ def recover(path: Path, *, in_place: bool | None = None) -> RecoveryReport:
     file is only renamed, if that.
 
     Args:
-        path: A part, or an MCAP file of any writer.
         in_place: Finish the file itself instead of a copy; None does so only for a part, and only
             when the disk has no room for a copy.
 

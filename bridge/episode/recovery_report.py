@@ -160,7 +160,6 @@ class RecoveryTally:
         """Say what was done with a file.
 
         Args:
-            path: The file that was read.
             output: The finished episode; None when there is none.
             finished: The file was whole before; its reason is then that of an earlier recovery.
         """

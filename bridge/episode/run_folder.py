@@ -32,7 +32,6 @@ def part_name(episode_id: str, index: int) -> str:
     """Return the file name of one part of an episode; the first, number 1, carries the bare id.
 
     Args:
-        episode_id: The id all parts share.
         index: Number of the part, from 1.
     """
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
@@ -61,12 +60,7 @@ def grouped_parts(names: Collection[str]) -> dict[str, list[str]]:
 
 
 def file_names(folder: Path, ending: str = SUFFIX) -> list[str]:
-    """Return the sorted names of a folder's files; of one that cannot be listed, none.
-
-    Args:
-        folder: Any folder of a run.
-        ending: What the names end in.
-    """
+    """Return the sorted names of a folder's files; of one that cannot be listed, none."""
     try:
         found = os.listdir(folder)  # noqa: PTH208  # a fifth of the time, for many files
     except OSError:  # not there, or not ours to read

@@ -130,12 +130,7 @@ class CopyTarget:
         return records, walk_records(records)
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
-        """Write the rest and sync; the caller verifies, renames and closes.
-
-        Args:
-            metadata_name: Name of the record that says what recovery did.
-            values: What that record holds.
-        """
+        """Write the rest and sync; the caller verifies, renames and closes."""
         self._flush_loose()
         self.section.add_metadata(metadata_name, values)
         self.section.seal()
@@ -296,7 +291,6 @@ def salvaged_head(records: bytes, contents: Contents) -> bytes:
     """Return the head of an unpacked chunk with the records that were saved from a cut one.
 
     Args:
-        records: The whole records from the chunk's front, unpacked.
         contents: What is in them; its log times become the chunk's.
     """
     start_ns, end_ns = contents.time_range()
@@ -315,7 +309,6 @@ def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
 
     Args:
         records: The whole records from the chunk's front, unpacked; they are written so.
-        contents: What is in them, with their message index.
     """
     head = salvaged_head(records, contents)
     start_ns, end_ns = contents.time_range()
@@ -445,10 +438,6 @@ class InPlaceTarget:
 
     def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
         """Cut off what is torn, write the rest and sync.
-
-        Args:
-            metadata_name: Name of the record that says what recovery did.
-            values: What that record holds.
 
         Raises:
             OSError: When there is no room even for that; what was whole still is.

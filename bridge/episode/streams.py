@@ -120,13 +120,7 @@ def camera_ids(episode: Episode) -> list[str]:
 
 
 def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
-    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found.
-
-    Args:
-        episode: Whose topics are searched.
-        camera_id: Name of the camera in its topics.
-        tail: What follows the camera in the topic, without a leading slash.
-    """
+    """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
     ending = f"{CAMERAS}{camera_id}/{tail}"
     found = (t for t in episode.topics() if t.endswith(ending) and not is_truth(t))
     return next(found, None)
@@ -144,13 +138,7 @@ def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
 
 
 def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> CameraInfo:
-    """Return the first intrinsics of ``color`` or ``depth``.
-
-    Args:
-        episode: Where to look.
-        camera_id: Name of the camera in its topics.
-        stream: ``color`` or ``depth``.
-    """
+    """Return the first intrinsics of ``color`` or ``depth``."""
     topic = _camera_topic(episode, camera_id, f"{stream}/info")
     for message in episode.messages([topic]):
         return CameraInfo.from_cdr(message.data)
@@ -169,8 +157,6 @@ def image_messages(
     Frames before a video's first whole picture are passed over: they show nothing by themselves.
 
     Args:
-        episode: Where they are.
-        topics: Topics wanted.
         start_ns: First log time wanted [ns since 1970]; None: from the start.
         end_ns: Log time to stop before [ns since 1970]; None: to the end.
 
@@ -218,7 +204,6 @@ def rgbd_frames(
 
     Args:
         episode: Must have colour and depth of the camera.
-        camera_id: Name of the camera in its topics.
         tree: The episode's frames where they are known; None reads them from it.
     """
     tree = transform_tree(episode) if tree is None else tree
@@ -264,10 +249,6 @@ def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
 
     ROS lets several nodes publish on one topic, each its own joints in its own order: those who
     know the most joints are taken, in the order of the first of them.
-
-    Args:
-        episode: Where to look.
-        ending: How the topic ends, such as ``GRIPPER_STATE``.
     """
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
@@ -341,12 +322,7 @@ def localisations(episode: Episode) -> list[dict[str, Any]]:
 
 
 def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | None:
-    """Source times between which a plan was executed, or None if it never was.
-
-    Args:
-        episode: Whose events say when plans were executed.
-        plan_id: The plan asked for.
-    """
+    """Source times between which a plan was executed, or None if it never was."""
     start, end = execution_ns(events(episode), plan_id)
     return None if start is None or end is None else (start, end)
 
@@ -358,7 +334,6 @@ def execution_ns(
 
     Args:
         records: Events in the order they were recorded.
-        plan_id: The plan asked for.
     """
     start: int | None = None
     for event in records:
@@ -372,12 +347,7 @@ def execution_ns(
 
 
 def pose_track(episode: Episode, topic: str) -> PoseTrajectory:
-    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped.
-
-    Args:
-        episode: Where to look.
-        topic: The whole topic, such as ``/lab/tcp/pose``.
-    """
+    """Collect the poses of one PoseStamped topic, ordered by source time, duplicates dropped."""
     track = pose_track_of([message.data for message in episode.messages([topic])])
     if track is None:
         raise EpisodeError(

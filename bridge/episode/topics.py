@@ -95,12 +95,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def cell_topic(cell: str, ending: str) -> str:
-    """Name a topic of a cell: ``cell_topic("lab", JOINT_STATES)`` is ``/lab/joint_states``.
-
-    Args:
-        cell: Name of the cell, without slashes.
-        ending: What follows it, with its leading slash.
-    """
+    """Name a topic of a cell: ``cell_topic("lab", JOINT_STATES)`` is ``/lab/joint_states``."""
     return f"/{cell}{ending}"
 
 
@@ -108,8 +103,6 @@ def camera_topic(cell: str, camera_id: str, ending: str = "") -> str:
     """Name a topic of a camera: ``COLOR_IMAGE``, ``DEPTH_INFO`` ...; "" is what all begin with.
 
     Args:
-        cell: Name of the cell, without slashes.
-        camera_id: Name of the camera.
         ending: What follows the camera, with its leading slash; "" for the common beginning.
     """
     return f"/{cell}{CAMERAS}{camera_id}{ending}"
@@ -119,8 +112,6 @@ def object_topic(cell: str, object_id: str, what: Literal["pose", "nodes"]) -> s
     """Name the topic of an object's pose or, of a soft one, of its points.
 
     Args:
-        cell: Name of the cell, without slashes.
-        object_id: Id of the object in the task.
         what: ``pose`` of the body, or ``nodes``, the points of a soft one.
     """
     return f"/{cell}{OBJECTS}{object_id}/{what}"
@@ -154,10 +145,6 @@ def is_latched(topic: str) -> bool:
 
 def refuse_bad_name(what: str, name: str) -> None:
     """Check that a name can stand between two slashes.
-
-    Args:
-        what: What is named, for the error: ``cell``, ``camera``.
-        name: What stands between the slashes.
 
     Raises:
         UsageError: When it cannot.

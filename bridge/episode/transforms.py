@@ -111,7 +111,6 @@ class TransformTree:
 
         Args:
             frame: Name of the frame.
-            stamps_ns: Source times [ns since 1970], in any order.
         """
         root = self.root_of(frame)
         Ts = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))

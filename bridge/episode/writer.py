@@ -82,7 +82,6 @@ class Channels:
         """Return the channel of a topic.
 
         Args:
-            topic: With its leading slash.
             record: Schema of the messages, or none.
             message_encoding: Used where there is no schema.
             about: What the channel's metadata says; another text is another channel.
@@ -164,7 +163,6 @@ def is_worth_compressing(type_name: str, front: bytes) -> bool:
     Raw colour is left as it is: zstd takes a quarter off it for more CPU time than JPEG.
 
     Args:
-        type_name: Of the stream's messages.
         front: First bytes of its first message, with the encoding of an image in them.
     """
     if type_name in _PACKED_TYPES:
@@ -286,9 +284,6 @@ class EpisodeWriter:
         """Append one serialised message of a type this project knows.
 
         Args:
-            topic: With its leading slash.
-            data: The serialised message, in one buffer or several.
-            type_name: A type of ``bridge.episode.schema``.
             log_time_ns: When it was received [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
             sequence: The publisher's number of it; None counts on from the message before.
@@ -321,7 +316,6 @@ class EpisodeWriter:
         """Append one message with the given schema, or none; the bytes are kept as they are.
 
         Args:
-            topic: With its leading slash.
             data: The serialised message, in one buffer or several; not looked at.
             schema_record: What it is; None where nobody knows.
             message_encoding: Used where there is no schema, which else says it itself.
@@ -417,10 +411,7 @@ class EpisodeWriter:
         """Append one JSON record.
 
         Args:
-            topic: With its leading slash.
             record: Written as it is; not checked against its schema.
-            type_name: A type of ``bridge.episode.schema`` that travels as JSON.
-            log_time_ns: When it was received or made [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
         """
         data = json.dumps(record, separators=(",", ":")).encode()
@@ -436,9 +427,6 @@ class EpisodeWriter:
         """Add an attachment, for example ``robot.urdf``; it is in the file at once.
 
         Args:
-            name: Of the attachment, as readers will look for it.
-            data: Its contents.
-            media_type: Such as ``application/xml``.
             log_time_ns: When it was recorded [ns since 1970]; taken as the time it was made, too.
         """
         self.wait_for_disk()
@@ -465,7 +453,6 @@ class EpisodeWriter:
         """Add the ``episode`` and ``software`` records, and the others where given.
 
         Args:
-            info: What the episode is.
             outcome: How it ended; None when that is not known yet.
             derived: What it was made from; None for a recording.
         """

@@ -113,7 +113,6 @@ class TableKind:
 
         Args:
             topic: With its leading slash; the truth of a stand-in cell never belongs into a file.
-            type_name: Type of its messages.
         """
         return (
             type_name == self.type_name
@@ -259,10 +258,6 @@ class _Sheet:
 def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
     """Return the episode files of a run, or the one given, and the folder they are named from.
 
-    Args:
-        source: A run folder, or one episode file.
-        derived: Of a run, take the derived episodes too.
-
     Raises:
         UsageError: When there is nothing to export.
     """
@@ -285,15 +280,7 @@ def export_csv(
     """Write ``episodes.csv`` and one CSV file per family of topics that has messages.
 
     Args:
-        source: An episode file, or a run folder.
-        out: The folder to make.
-        derived: Also the replays and localisations of a run.
         clock: Whose clock stamps are read in.
-        force: Replace an earlier export.
-        advance: Told how many episodes are done.
-
-    Returns:
-        Rows by file name.
 
     Raises:
         EpisodeError: Naming the episode, topic and message that cannot be read.

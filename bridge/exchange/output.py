@@ -20,8 +20,6 @@ def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
     """Name the message in whatever goes wrong in the block; ``number`` counts from 1.
 
     Args:
-        episode: Named by its path.
-        topic: Of the message.
         number: The message's place among those read, from 1.
 
     Raises:
@@ -47,7 +45,6 @@ def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
     """Yield a folder to fill; it becomes ``out`` when the block ends well, and is removed if not.
 
     Args:
-        out: The folder to make.
         force: Replace what an earlier export wrote there; nothing else is ever replaced.
 
     Raises:
@@ -107,8 +104,6 @@ def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict
     """Write what the folder is made of: sources with their hashes, software, every choice.
 
     Args:
-        folder: Where the note goes.
-        made_by: The command, such as ``export tum``.
         sources: The episode files; each is read once for its hash.
         choices: Whatever else decided about the result; must be JSON.
     """

@@ -90,10 +90,6 @@ def is_large(path: Path) -> bool:
 def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     """Read a file, or a folder of SIMPLER videos; its content tells what it is.
 
-    Args:
-        path: The file or folder.
-        options: How a table is read.
-
     Raises:
         PathNotFoundError: When it is not there.
         TableError: Naming the row that cannot be believed.
@@ -209,10 +205,6 @@ def _listed(path: Path) -> list[dict[str, Any]] | None:
 
 def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[Taken], list[Left]]:
     """Find what can be read in a folder of results, and say what was left and why.
-
-    Args:
-        folder: With any files, at any depth.
-        options: How tables are read.
 
     Raises:
         PathNotFoundError: When it is not a folder.

@@ -105,11 +105,6 @@ class ReviewConflictError(BridgeError):
 def saved_review(run_path: Path, trial_id: str, rater: str) -> SavedReview:
     """Return the label that a rater gave a trial in the run's own files.
 
-    Args:
-        run_path: The run folder.
-        trial_id: The trial.
-        rater: The rater.
-
     Raises:
         InvalidRecordError: When the file does not fit the schema.
     """
@@ -129,11 +124,7 @@ def save_review(
     It is on disk when this returns. Processes and threads that save at once wait for each other.
 
     Args:
-        run_path: The run folder.
-        trial_id: The trial.
-        rater: The rater.
         review: The label; None takes it away.
-        seen: The version that the rater had before them.
 
     Raises:
         ReviewConflictError: When another version is there, which says something else.
@@ -186,7 +177,6 @@ def read_reviews(path: Path, options: TableOptions = AS_SAVED) -> list[Review]:
 
     Args:
         path: The file or folder; files of other kinds are passed over.
-        options: Columns whose names differ from ours.
 
     Raises:
         PathNotFoundError: When it is not there.

@@ -78,12 +78,8 @@ def export_tum(
     """Write one camera into ``out`` itself, several into one folder each.
 
     Args:
-        episode: Where the images and poses are.
-        out: The folder to make.
         camera: Only this camera; None for all.
         color: Colour as recorded (JPEG passes through), or decoded to PNG.
-        force: Replace an earlier export.
-        advance: Told how many images are written.
 
     Raises:
         EpisodeError: When there is no such camera, or an image cannot be read.
@@ -241,8 +237,6 @@ def write_scan(
     """Write one episode; on any error nothing with its final name is left.
 
     Args:
-        run: Where the episode goes.
-        info: Who and what it is.
         messages: In time order; log time is their source time.
         source: Where they come from and what was rounded; kept as metadata ``source``.
     """

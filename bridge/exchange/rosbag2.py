@@ -145,10 +145,7 @@ def import_bag(
 
     Args:
         source: A file, or a folder with ``metadata.yaml`` or several files.
-        run: Where the episode goes.
-        episode_id: Its name.
         task: Name of the task it is a trial of; "": it is not known to be one.
-        advance: Told how many messages are done.
 
     Raises:
         EpisodeError: When a file is damaged or was never finished.

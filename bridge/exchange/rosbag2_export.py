@@ -66,11 +66,7 @@ def export_bag(
     """Write an episode as a bag.
 
     Args:
-        episode: What is exported, all its parts.
-        out: The folder to make.
         json_as_string: JSON records become std_msgs/String instead of being left out.
-        force: Replace an earlier export.
-        advance: Told how many messages are done.
 
     Raises:
         UsageError: When nothing can go into a bag, or ``out`` is in the way.

@@ -35,10 +35,6 @@ class BagFormatError(BridgeError):
 def unpack_file(path: Path, folder: Path) -> Path:
     """Return a file as it was before rosbag2 compressed it; one that is not compressed itself.
 
-    Args:
-        path: A file of a bag.
-        folder: Where to put what is unpacked.
-
     Raises:
         EpisodeError: When it is damaged.
     """

@@ -99,7 +99,6 @@ class SourceRow:
 
         Args:
             found: What is wrong, such as ``unit 'trial' in task 'a'``.
-            hint: What to do about it.
         """
         return TableError(path=self.path, row=self.row, found=found, hint=hint)
 
@@ -209,12 +208,7 @@ class TableText:
         return SourceRow(path=self.path, row=number, values=values, axes=self.axes)
 
     def understood(self, kind: str, num_rows: int) -> str:
-        """Say in one line what the table was read as.
-
-        Args:
-            kind: What it holds, such as ``trials``.
-            num_rows: Rows that were read.
-        """
+        """Say in one line what the table was read as."""
         parts = [f"{kind}, {num_rows:,} row{'' if num_rows == 1 else 's'}"]
         if self.delimiter != ",":
             name = DELIMITERS.get(self.delimiter, repr(self.delimiter))
@@ -237,8 +231,6 @@ def open_table(
 
     Args:
         path: The file, in UTF-8.
-        known: All columns that may be read.
-        options: Columns whose names differ from ours.
         near: Refuse a column whose name is almost one of ours.
 
     Raises:
@@ -321,7 +313,6 @@ def numbered_lines(path: Path, delimiter: str = ",") -> Iterator[tuple[int, list
 
     Args:
         path: The file, in UTF-8.
-        delimiter: What stands between the fields.
 
     Raises:
         TableError: When it is no text.
@@ -368,9 +359,7 @@ def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> 
     """Refuse a table that lacks a column.
 
     Args:
-        table: The table.
         required: Columns that must be there.
-        known: All columns that may be there, for the error.
 
     Raises:
         TableError: Naming the columns.
@@ -398,8 +387,6 @@ def read_rows(
     Args:
         path: The file, in UTF-8.
         required: Columns that must be there.
-        known: All columns that may be read.
-        options: Columns whose names differ from ours.
 
     Raises:
         PathNotFoundError: When the file is not there.

@@ -70,10 +70,6 @@ SIDES_OF_TRIAL = ("recorded", "sim_planned", "sim_executed", "verdict", "k")
 def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
     """Open a table of trials.
 
-    Args:
-        path: The file.
-        options: Columns whose names differ from ours, and those that hold axes.
-
     Raises:
         TableError: When it has no task, or neither ids nor outcomes.
     """
@@ -85,10 +81,6 @@ def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
 
 def read_trials(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
     """Read and check a trials CSV.
-
-    Args:
-        path: The file.
-        options: Columns whose names differ from ours, and those that hold axes.
 
     Raises:
         TableError: For a doubled trial id, an impossible count, or two units in one task.
@@ -102,7 +94,6 @@ def read_trials_by_side(path: Path, options: TableOptions = AS_SAVED) -> list[Tr
     Its column ``side`` says sim, real or stand-in; how the rollout ended is the outcome.
 
     Args:
-        path: The file.
         options: Columns whose names differ from ours; ``outcome`` is one of them, as a rule.
 
     Raises:
@@ -139,10 +130,6 @@ def _on_its_side(row: SourceRow, stand_in: str) -> SourceRow:
 def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[TrialRecord]:
     """Read trials that a JSON file lists as objects with our columns as keys.
 
-    Args:
-        path: The file, for errors.
-        items: One for each trial.
-
     Raises:
         TableError: As ``read_trials``; rows are counted from 1.
     """
@@ -152,13 +139,7 @@ def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[Tri
 def json_rows(
     path: Path, items: Sequence[dict[str, object]], known: Sequence[str]
 ) -> list[SourceRow]:
-    """Return the objects of a JSON list as rows of a table; other keys than ours are not read.
-
-    Args:
-        path: The file, for errors.
-        items: One for each row.
-        known: The keys that are read.
-    """
+    """Return the objects of a JSON list as rows of a table; other keys than ours are not read."""
     return [
         SourceRow(
             path=path,
@@ -203,8 +184,6 @@ def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, i
     """Refuse a second unit in one task; ``units`` remembers each task's unit and first row.
 
     Args:
-        row: Where the trial was read, for the error.
-        trial: The trial to check.
         units: By task: its unit and the row that gave it first; a new task is added.
 
     Raises:
@@ -326,11 +305,6 @@ def trials_path(run: RunFolder) -> Path:
 
 def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialRecord]:
     """Check a trials CSV and keep it in the run, with all columns and in one spelling.
-
-    Args:
-        table: The CSV file.
-        run: The run.
-        force: Replace trials imported earlier.
 
     Raises:
         TableError: Naming the row that cannot be believed; nothing is written then.

@@ -47,10 +47,6 @@ class RateRecord:
 def read_rates(path: Path, options: TableOptions = AS_SAVED) -> list[RateRecord]:
     """Read and check a rates CSV.
 
-    Args:
-        path: The file.
-        options: Columns whose names differ from ours.
-
     Raises:
         TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
     """
@@ -73,11 +69,6 @@ def rates_of(rows: Sequence[SourceRow]) -> list[RateRecord]:
 
 def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecord]) -> None:
     """Refuse a cell that is there already, and a second unit in one task.
-
-    Args:
-        row: Where the rate was read, for the error.
-        record: The rate to check.
-        earlier: Those of the rows before it.
 
     Raises:
         TableError: Naming both rows.

@@ -34,10 +34,6 @@ SINGLE = ("trial_id", "start_id", "p_success", "progress", "sim_progress")
 def count_trials(path: Path, options: TableOptions = AS_SAVED) -> list[tuple[TrialRecord, int]]:
     """Count equal rows of a trials CSV; their ids are empty.
 
-    Args:
-        path: The file.
-        options: Columns whose names differ from ours, and those that hold axes.
-
     Raises:
         PathNotFoundError: When the file is not there.
         TableError: Naming the row that cannot be believed, or that is there twice.

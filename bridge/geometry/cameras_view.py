@@ -13,9 +13,6 @@ def distance_to_what_is_seen(Ts_world_camera: Float[np.ndarray, "num_cameras 4 4
     """Median distance of the cameras to the point that all optical axes pass nearest.
 
     None where the axes are parallel, or the point lies behind cameras: they look at no one place.
-
-    Args:
-        Ts_world_camera: In any unit of length, which is that of the answer.
     """
     axes, centres = Ts_world_camera[:, :3, 2], Ts_world_camera[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

@@ -25,9 +25,6 @@ def sample_triangles(
     """Spread points over triangles, evenly over their area.
 
     Args:
-        areas: Of each triangle, in any unit.
-        count: How many points.
-        rng: Where the points come from.
         in_order: Go through the triangles in equal steps of area instead of drawing them.
 
     Returns:

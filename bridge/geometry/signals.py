@@ -26,8 +26,6 @@ def lag_of_least_cost(
     Of lags that fit equally well the smallest is taken: a motion that hardly moves has none.
 
     Args:
-        costs: How much the signals differ at each lag.
-        lags_s: The lags that were tried.
         equal: Costs above the least one by at most this count as equal to it.
     """
     near = lags_s[costs <= costs.min() + equal]

@@ -35,9 +35,6 @@ def to_millimetres(
     """Apply a folder's decode rules; every invalid code becomes 0.
 
     Args:
-        stored: Pixels as the file holds them.
-        unit_m: Metres per stored number.
-        invalid_values: Numbers that stand for "no measurement", as stored.
         encoding: ``ROTATED_ENCODING`` where bits are rotated; "" for plain numbers.
     """
     values = undo_rotation(stored) if encoding == ROTATED_ENCODING else stored
@@ -84,7 +81,6 @@ def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False)
 
     Args:
         rows: Pixels of each row, two bytes each; rows may lie apart in memory.
-        swap_bytes: The high byte comes first.
 
     Returns:
         What a CompressedImage of ``RVL_FORMAT`` holds, in two parts.
@@ -101,7 +97,6 @@ def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]
     Args:
         image_format: As the CompressedImage states it; without ``rvl`` it is PNG. A bare PNG file
             is read whatever the format says.
-        data: What the CompressedImage holds.
 
     Raises:
         UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.

@@ -348,7 +348,6 @@ class SsimMaps:
         """Average over pixels and channels; with a mask, over window centres inside it.
 
         Args:
-            padding: Custom at the border of the image.
             mask: Pixels whose windows count; None: all.
 
         Raises:
@@ -405,7 +404,6 @@ def ssim(
         recorded: In 0..1.
         replayed: In 0..1.
         mask: Pixels whose windows count; None: all.
-        padding: Custom at the border of the image.
 
     Raises:
         ImageShapeError: When the sizes differ.

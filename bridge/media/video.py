@@ -63,7 +63,6 @@ class VideoDecoder:
         """Decode one frame; what comes before the first whole picture gives no image.
 
         Args:
-            data: The frame as it was sent.
             number: Given back with its image; larger than the one before.
 
         Returns:

@@ -44,7 +44,6 @@ class ClockBook:
 
         Args:
             tell: Called with each clock that was set.
-            write: Called with each record for the open episode.
         """
         self._tell = tell
         self._write = write
@@ -79,12 +78,7 @@ class ClockBook:
             ]
 
     def has_named(self, topics: Collection[str], by_ns: int) -> bool:
-        """Say whether the jump that stamps show is one that their source's answers have shown.
-
-        Args:
-            topics: Whose stamps jumped.
-            by_ns: How far.
-        """
+        """Say whether the jump that stamps show is one that their source's answers have shown."""
         with self._lock:
             return any(
                 clock.topics.issuperset(topics) and abs(jump.by_ns - by_ns) < STAMP_JUMP_NS

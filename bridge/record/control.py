@@ -39,7 +39,6 @@ class RecorderClient:
         """Send one command and return the recorder's answer.
 
         Args:
-            verb: One of the recorder's commands, such as ``status``.
             request: Fields of the command; None for none.
 
         Raises:
@@ -64,7 +63,6 @@ class RecorderClient:
         """Begin an episode, with its task file where there is one.
 
         Args:
-            episode_id: Id of the new episode, which names its file.
             info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
                 known.
             task: What the episode is of; it is attached to it.
@@ -81,7 +79,6 @@ class RecorderClient:
 
         Args:
             outcome: Fields of ``Outcome``; None leaves it as it was labelled.
-            discard: Throw the episode away.
         """
         return self.ask("stop", {"outcome": outcome, "discard": discard})
 
@@ -100,7 +97,6 @@ def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
     """Answer the control keys until the session closes.
 
     Args:
-        session: Where the keys are announced.
         recorder: What the commands go to; its configured name is part of the keys.
     """
 

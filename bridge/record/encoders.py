@@ -90,13 +90,7 @@ class EncoderThreads:
     def __init__(
         self, encoder: ImageEncoder, done: Callable[[Item, int], None], preview: Preview
     ) -> None:
-        """Start without threads.
-
-        Args:
-            encoder: What is done to each image.
-            done: Called with each image, and the bytes it has become smaller.
-            preview: Called with each image as it came.
-        """
+        """Start without threads."""
         self._encoder = encoder
         self._done = done
         self._preview = preview

@@ -36,12 +36,8 @@ class EpisodeFiles:
         """Create the first part.
 
         Args:
-            folder: Where episodes lie.
-            info: What is being recorded.
-            config: How it lies on the disk.
             now_ns: When the first part begins [ns], by the recorder's clock.
             contract: What the topics promise; each part holds it.
-            task: Attached to every part.
 
         Raises:
             UsageError: When the episode exists, or is being written.

@@ -63,7 +63,6 @@ class Channels:
 
         Args:
             max_topics: Further ones are refused.
-            warn: Called with what a person should know.
             msg_folder: Definitions of ROS 2 types of one's own.
         """
         self._msg_folder = msg_folder
@@ -78,7 +77,6 @@ class Channels:
         """Return the channel of a message, or None when there are too many.
 
         Args:
-            sample: With the topic, the encoding and the hash of the type.
             type_name: The type after ``resolve_type``; "" where nobody knows it.
         """
         is_defined = sample.definition is not None
@@ -92,7 +90,6 @@ class Channels:
         """Return a log time for a record of our own.
 
         Args:
-            topic: Where the record will go.
             stamp_ns: Wanted log time [ns since 1970]; a later one is returned rather than one step
                 back.
         """
@@ -177,15 +174,8 @@ class EpisodeRecording:
         """Create the episode file and say in it who and what it is.
 
         Args:
-            folder: Where episodes lie.
-            info: What is being recorded.
-            config: The recorder's settings.
-            start_ns: When it begins [ns].
             latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
-            contract: What the topics promise.
-            task: The task file, to be attached.
-            clocks: Readings of the sources' clocks made before.
 
         Raises:
             UsageError: When the episode exists already.
@@ -297,7 +287,6 @@ class EpisodeRecording:
 
         Args:
             now_ns: The recorder's clock.
-            health: Numbers that go into each drop record.
         """
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1
@@ -328,7 +317,6 @@ class EpisodeRecording:
         """Append readings of a source's clock.
 
         Args:
-            record: As ``bridge.episode.clocks.to_record`` makes it.
             stamp_ns: Now, by the recorder's clock [ns since 1970].
         """
         self._write_json(CLOCKS, record, schema.CLOCKS, stamp_ns)
@@ -346,7 +334,6 @@ class EpisodeRecording:
 
         Args:
             kind: One of the types of the event schema, such as ``mark`` or ``label``.
-            stamp_ns: When it happened [ns since 1970].
             text: Free text; "" for none.
             outcome: Of a label; None leaves the episode's outcome as it is.
             data: Fields of this kind of event; None for none.
@@ -407,8 +394,6 @@ class EpisodeRecording:
         May be called again after an OSError, when there is space.
 
         Args:
-            end_ns: When recording ended [ns since 1970].
-            reason: Who or what stopped it, for the metadata.
             outcome: How it ended; None: as it was labelled last.
             health: Counts of what went wrong in the recorder, by name.
         """

@@ -49,9 +49,7 @@ def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
     """Check a message without building anything from it.
 
     Args:
-        type_name: As ``resolve_type`` gives it.
         message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
-        data: The payload.
     """
     return inspector(type_name, message_encoding)(data)
 

@@ -129,12 +129,7 @@ class Ledger:
         return any(first <= ticket and (end is None or ticket < end) for first, end in self._spans)
 
     def count_received(self, item: Item, finding: MessageState) -> None:
-        """Book a message that was written.
-
-        Args:
-            item: The message, with the gap before it and its size.
-            finding: What ``inspect`` said of it.
-        """
+        """Book a message that was written."""
         sample = item.sample
         tally = self._tally(sample.topic, second_of(sample.received_ns))
         tally.received += 1

@@ -93,7 +93,6 @@ class PreRoll:
         Args:
             seconds: How far back it reaches [s]; 0 holds nothing.
             max_bytes: Memory; with less than the seconds need, it reaches less far.
-            passed: Called with each message that is too old now.
         """
         self._span_ns = ns_from_s(seconds)
         self._max_bytes = max_bytes
@@ -163,14 +162,7 @@ class Lifecycle:
         queued_bytes: Callable[[], int],
         latched: LatchedTopics,
     ) -> None:
-        """Begin idle.
-
-        Args:
-            run: Where episodes go.
-            config: Settings.
-            queued_bytes: How much waits in the queues.
-            latched: Topics whose last message stays true.
-        """
+        """Begin idle."""
         self.take: EpisodeRecording | None = None
         self.is_paused = False
         self.is_closing = False
@@ -295,7 +287,6 @@ class Lifecycle:
         Args:
             info: What the episode is; its id must be new in the run.
             command: When it was asked for, which is when the episode begins but for its pre-roll.
-            task: The task file to attach.
         """
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
@@ -312,8 +303,6 @@ class Lifecycle:
 
         Args:
             info: What the episode is; its id must be new in the run.
-            command: When it was asked for, which is when the pre-roll ends.
-            task: The task file to attach.
         """
         if not self.ring.is_on:
             raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
@@ -400,9 +389,6 @@ class Lifecycle:
 
         Args:
             outcome: How it ended; None: as it was labelled last.
-            command: When it was asked for, which is when the episode ends.
-            discard: Throw it away.
-            reason: Who or what stopped it, for the metadata.
         """
         take = self._open_take()
         end_ns = command.received_ns
@@ -425,7 +411,6 @@ class Lifecycle:
 
         Args:
             kind: One of the types of the event schema: ``mark`` or ``label``.
-            command: When it was asked for, which is the event's time.
             text: Free text; "" for none.
             outcome: Of a label; None leaves the episode's outcome as it is.
         """
@@ -462,9 +447,6 @@ class Lifecycle:
         """End a recording the disk has refused, and finish its file if there is any way.
 
         Args:
-            cause: What the disk said.
-            now_ns: When.
-            rest: Gives the messages received before, which can no longer be written.
             in_reserve: The disk still takes what there is; it is ended before it is full.
         """
         take = self.take

@@ -53,8 +53,6 @@ class Previews:
         """Publish nothing yet.
 
         Args:
-            session: Where to publish.
-            recorder: Name of the recorder.
             rate_hz: At most this many a second for each camera; 0 makes none.
             shed: Says how far shedding has gone; previews go first.
         """
@@ -98,7 +96,6 @@ class Previews:
         """Send a small copy of an image, if somebody looks and it is time for one.
 
         Args:
-            sample: An image as it arrived.
             kind: ``color``, ``depth`` (never shown) or "" for unknown.
         """
         topic = sample.topic
@@ -211,13 +208,6 @@ class LiveRecorder:
         task: TaskFile | None = None,
     ) -> None:
         """Recover what a crash left, then listen.
-
-        Args:
-            session: Where to listen.
-            run: Where episodes go.
-            config: Settings.
-            say: Told what a person should know.
-            task: The task file of episodes that name this task or none.
 
         Raises:
             UsageError: When ``msg_folder`` holds no definitions, or one that is none, when the
@@ -335,7 +325,6 @@ def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
     """Keep other recorders out of a run folder, until the process ends.
 
     Args:
-        run: Where the recorder writes.
         shared: Only those out that do not share it.
 
     Raises:

@@ -92,8 +92,6 @@ class PresenceMonitor:
         """Begin to listen.
 
         Args:
-            seen: Messages of each topic so far.
-            tell: Called with what a person should hear of while something is recorded.
             now_s: A clock without steps [s].
         """
         self.contract: Contract | None = None
@@ -243,13 +241,7 @@ class PresenceMonitor:
             self._is_recording = False
 
     def publisher(self, prefix: str, *, is_there: bool, others: tuple[str, ...] = ()) -> None:
-        """Note that the publisher of topics that begin so came or left.
-
-        Args:
-            prefix: Beginning of its topics.
-            is_there: False where it left.
-            others: Longer beginnings, whose publishers are there.
-        """
+        """Note that the publisher of topics that begin so came or left."""
         news = []
         with self._lock:
             if is_there:
@@ -316,9 +308,6 @@ class Heartbeat:
 
         Args:
             session: The recorder's, which must hear.
-            recorder: Name of the recorder.
-            monitor: Is told of each heartbeat that is heard.
-            say: Called once with words when the recorder cannot connect to itself.
         """
         self._monitor = monitor
         self._ended = threading.Event()

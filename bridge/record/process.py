@@ -61,7 +61,6 @@ def next_info(run: RunFolder, about: EpisodeAbout) -> EpisodeInfo:
     """Describe the next episode: the first free number after the kind's name.
 
     Args:
-        run: Whose episodes have taken numbers already.
         about: What all episodes of this process have in common; its kind names them.
     """
     taken = {path.name.split(".")[0] for path in run.episodes_dir.iterdir()}
@@ -140,17 +139,9 @@ def run_recorder(
     """Record until ``stop`` is set, the duration is over, or the disk fails.
 
     Args:
-        run_path: The run folder; made where needed.
-        wire: Where to listen.
-        config: The recorder's settings.
-        stop: Set by a signal handler.
-        output: Where remarks go.
         episode: Start this one at once instead of waiting for a command.
-        duration_s: With ``episode``, stop after this long [s].
-        about: What episodes started from the keyboard are.
         anyway: Start ``episode`` although topics are missing that the contract requires; else it
             waits for them.
-        task: The task file of episodes that name this task or none.
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.

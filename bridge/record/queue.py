@@ -73,12 +73,7 @@ class LatchedMessages:
             self._bytes -= len(self._kept.pop(key).data)
 
     def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
-        """Drop the messages of topics that begin so: their publisher has gone.
-
-        Args:
-            prefix: Beginning of the topics.
-            but: Longer beginnings whose publisher is there.
-        """
+        """Drop the messages of topics that begin so: their publisher has gone."""
         gone = [key for key in self._kept if key[0].startswith(prefix)]
         self._drop([key for key in gone if not key[0].startswith(but)])
 
@@ -270,9 +265,7 @@ class InputQueue:
         """Set the budgets.
 
         Args:
-            limits: Budgets and limits.
             hand_over: Called with each image; it comes back through ``put_image``.
-            kinds: color or depth, for each image topic whose encoder knows.
         """
         self._limits = limits
         self._bulk_budget = limits.camera_queue_mb * BYTES_PER_MB
@@ -402,8 +395,6 @@ class InputQueue:
         """Count a message that is left out.
 
         Args:
-            sample: The message.
-            step: Its place in its stream.
             limit: The limit it broke, "" for want of space, None for shedding.
         """
         if self._dropped is None:
@@ -426,12 +417,7 @@ class InputQueue:
             self._dropped.warn(f"{sample.topic}: {limit} are dropped")
 
     def put_image(self, item: Item, saved: int) -> None:
-        """Take an image back from its encoder.
-
-        Args:
-            item: As it is to be written.
-            saved: Bytes it has become smaller.
-        """
+        """Take an image back from its encoder."""
         if saved:
             with self._lock:
                 self._bulk_bytes -= saved

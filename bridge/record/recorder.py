@@ -64,11 +64,7 @@ class Recorder:
         """Start the writer thread.
 
         Args:
-            run: Where episodes go.
             now_ns: The clock that also stamps received messages.
-            config: Settings.
-            preview: Called with images of which somebody wants a preview.
-            task: The task file of episodes that name this task or none.
             wall_ns: The system clock, watched for steps.
 
         Raises:
@@ -148,7 +144,6 @@ class Recorder:
         """Begin an episode, with the pre-roll if there is one.
 
         Args:
-            info: What is being recorded.
             task: Its task file: attached to the episode, and kept in the run's ``tasks/``; looked
                 up by the name in ``info`` when it is not given.
             anyway: Warn of topics that are required and missing, instead of refusing.
@@ -248,8 +243,6 @@ class Recorder:
 
         Args:
             outcome: How it ended; None: as it was labelled last.
-            discard: Throw it away.
-            reason: Who or what stopped it, for the metadata.
         """
 
         def act(command: Command) -> Answer:
@@ -347,12 +340,7 @@ class Recorder:
         self.input_queue.latched.declare(topic)
 
     def forget(self, prefix: str, but: tuple[str, ...] = ()) -> None:
-        """Repeat no latched message of topics that begin so: their publisher has gone.
-
-        Args:
-            prefix: Beginning of the topics.
-            but: Longer beginnings whose publisher is there.
-        """
+        """Repeat no latched message of topics that begin so: their publisher has gone."""
 
         def act(command: Command) -> None:
             self._life.latched.forget(prefix, but)
@@ -374,7 +362,6 @@ class Recorder:
         """Add something to every status and episode; ``ask`` must answer at once.
 
         Args:
-            name: Its key in the status and in the metadata.
             ask: Returns what to tell, something JSON can hold; called from several threads.
         """
         self._status.others[name] = ask

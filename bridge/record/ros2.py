@@ -155,8 +155,6 @@ def watch_ros2(
     at all, and the second copy is left out or counted as repeated.
 
     Args:
-        session: An open session.
-        recorder: Gets the history of each transient-local publisher, once for each publisher.
         msg_folder: Definitions of ROS 2 types of one's own.
     """
     return Ros2Graph(session, recorder, msg_folder)

@@ -66,7 +66,6 @@ class SequenceTracker:
         """Compare a message's number with the one expected; without a number nothing is known.
 
         Args:
-            sample: The message as it arrived.
             ticket: Its place in the order of arrival.
         """
         if sample.sequence is None or sample.source_gid is None:

@@ -104,12 +104,7 @@ class Status:
 
 
 def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str:
-    """One line about a recorder.
-
-    Args:
-        status: As the recorder answers ``status``.
-        rate_hz: Messages per second, where the caller has counted them.
-    """
+    """One line about a recorder."""
     free = f"{status['disk_free_bytes'] / 1e9:.1f} GB free"
     if status["state"] == "failed":
         return f"failed: {status['error']}"

@@ -104,11 +104,6 @@ class WireListener:
     def __init__(self, session: WireSession, key: str, *, enough: int | None = None) -> None:
         """Begin to listen.
 
-        Args:
-            session: An open session.
-            key: Which keys, for example ``lab/**``.
-            enough: ``is_enough`` is set after so many messages.
-
         Raises:
             WireConfigError: When the key cannot be one.
         """
@@ -181,11 +176,7 @@ class WireListener:
             heard.offsets_ns.append(sample.received_ns - source_ns)
 
     def finish(self, *, rate_hz: float | None = None) -> list[TopicHeard]:
-        """Stop listening and return what was found, by topic.
-
-        Args:
-            rate_hz: What every topic should have [Hz].
-        """
+        """Stop listening and return what was found, by topic."""
         for subscriber in self._subscribers:
             subscriber.close()
         with self._lock:

@@ -50,7 +50,6 @@ class HostClock:
         """Return the host time of a sample, or None while the offset is still being found.
 
         Args:
-            device_ns: The device's stamp.
             received_ns: When it arrived here, by the host's clock.
 
         Raises:
@@ -107,8 +106,6 @@ class NumberedPublisher:
 
         Args:
             number: The device's count of this stream; starting again is no loss.
-            data: The serialised message.
-            source_ns: When the sample was taken [ns].
         """
         gap = 0 if self._expected is None else number - self._expected
         if not 0 < gap <= MAX_GAP:

@@ -29,13 +29,7 @@ class Source(Protocol):
         """The topics it publishes, or some of them where the device lacks a signal."""
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
-        """Publish until ``stop`` is set or there is nothing left, and count what was sent.
-
-        Args:
-            session: Where the messages go.
-            stop: Set from elsewhere, by a signal or when the time is over.
-            output: For progress and remarks.
-        """
+        """Publish until ``stop`` is set or there is nothing left, and count what was sent."""
 
 
 def run_source(
@@ -44,13 +38,7 @@ def run_source(
     """Run a source until it ends, SIGINT or SIGTERM arrives, or the time is over.
 
     Args:
-        source: What to run.
-        wire: Where the recorder listens.
-        output: How to talk.
         duration_s: Stop after this long [s]; None: never.
-
-    Returns:
-        What the source counted.
     """
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 

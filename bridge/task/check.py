@@ -45,9 +45,6 @@ class TaskFileError(UsageError):
 def task_problems(table: Mapping[str, Any]) -> list[str]:
     """List what is wrong with the content of a task file; nothing for a good one.
 
-    Args:
-        table: The parsed TOML.
-
     Returns:
         One line each: the place, what was found, what is allowed, and the nearest name.
     """

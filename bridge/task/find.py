@@ -56,8 +56,6 @@ def find_task_file(
 
     Args:
         name: Of the task; never read as a path.
-        tasks_dir: The run's folder of task files.
-        attached: What the episode carries.
 
     Raises:
         MissingTaskError: Saying where it looked and what is there.

@@ -69,7 +69,6 @@ def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
     """Evaluate every success predicate of a task on a rollout's final state.
 
     Args:
-        task: Whose ``success`` lists the predicates.
         rollout: Poses of the objects over time, with contacts where a predicate asks for them.
     """
     return [_evaluate(spec, task, rollout) for spec in task.success]
@@ -82,7 +81,6 @@ def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0)
 
     Args:
         task: Its own ``allowed_contacts`` predicate is used where it has one.
-        rollout: With ``contacts``.
         tolerance_m: Depth up to which two bodies do not count as touching.
     """
     listed = (spec for spec in task.success if spec["kind"] == ALLOWED_CONTACTS)
@@ -306,12 +304,7 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
 def objects_done(
     findings: list[PredicateResult], manipulated: tuple[str, ...]
 ) -> dict[str, bool | None]:
-    """Per manipulated object: whether everything asked of it holds.
-
-    Args:
-        findings: Results of all predicates.
-        manipulated: Ids of the objects asked about.
-    """
+    """Per manipulated object: whether everything asked of it holds."""
     return {
         key: all_hold([finding for finding in findings if finding.object_id == key])
         for key in manipulated

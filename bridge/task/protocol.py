@@ -203,23 +203,12 @@ class Protocol:
 
 
 def arms_in_order(arms: Sequence[str], study_seed: int, start_seed: int) -> list[str]:
-    """Return the arms in the order in which they are tried on one start.
-
-    Args:
-        arms: Of one policy.
-        study_seed: Of the study.
-        start_seed: Of the start.
-    """
+    """Return the arms in the order in which they are tried on one start."""
     return _shuffled(arms, ARMS_STREAM, study_seed, start_seed)
 
 
 def blinding_codes(policies: Sequence[PolicyArms], study_seed: int) -> dict[str, str]:
-    """Return a code for each "policy, arm", in an order that the seed draws.
-
-    Args:
-        policies: With their arms.
-        study_seed: Of the study.
-    """
+    """Return a code for each "policy, arm", in an order that the seed draws."""
     names = [f"{policy.policy}, {arm}" for policy in policies for arm in policy.arms]
     drawn = _shuffled(names, STARTS_STREAM, study_seed, len(names))
     return {name: f"arm_{place:02d}" for place, name in enumerate(drawn, start=1)}
@@ -265,11 +254,6 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
 
     A design that is there stays as it is, where what carries it out fits it.
 
-    Args:
-        run_path: The run folder.
-        protocol: What the study will do.
-        has_trials: Whether the run holds trials already.
-
     Raises:
         UsageError: When another protocol is there, or trials are and none is, or the file was
             edited.
@@ -303,9 +287,7 @@ def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> P
     """Fix the chance of yes for each task.
 
     Args:
-        protocol: Whose tasks get them.
         coins: By name of the task.
-        coin_from: Where they are from, in words.
     """
     tasks = tuple(replace(each, coin=coins.get(each.task)) for each in protocol.tasks)
     return replace(protocol, tasks=tasks, coin_from=coin_from)

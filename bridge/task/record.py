@@ -52,11 +52,6 @@ def check_record(
 ) -> Mapping[str, Any]:
     """Return the record if it fits ``schemas/<name>.schema.json``.
 
-    Args:
-        record: As parsed from JSON.
-        name: Of the schema, such as ``plan``.
-        package: Where its folder ``schemas`` is.
-
     Raises:
         InvalidRecordError: With the place and the value that does not fit.
     """
@@ -104,8 +99,6 @@ def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dic
 
     Args:
         data: UTF-8 text.
-        name: Of the schema, such as ``plan``.
-        package: Where its folder ``schemas`` is.
     """
     return dict(check_record(load_record(data, name=name), name=name, package=package))
 
@@ -115,7 +108,6 @@ def load_record(data: bytes, *, name: str) -> dict[str, Any]:
 
     Args:
         data: UTF-8 text.
-        name: What the record is, for the error.
     """
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)

@@ -22,10 +22,6 @@ def is_same_engine(engine: str | None, *, stand_in: bool) -> bool:
 
     Such a verdict agrees with what was recorded for a reason that no real cell gives: it is shown
     and never counted.
-
-    Args:
-        engine: Of the verdict, as it names itself.
-        stand_in: Whether the recording is of the stand-in cell.
     """
     return stand_in and STAND_IN_ENGINE in (engine or "")
 

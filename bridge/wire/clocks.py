@@ -59,7 +59,6 @@ def ask_clocks(session: WireSession, *, timeout_s: float) -> list[ClockAnswer]:
 
     Args:
         session: Of the recorder; its clock is compared with.
-        timeout_s: How long to wait for the slowest [s].
 
     Raises:
         WireError: When the session is closing.

@@ -27,9 +27,7 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
     """Return the ``ros2msg`` schema of a type, or None when no definition is known.
 
     Args:
-        type_name: For example ``nav_msgs/msg/Odometry``.
         type_hash: The definition must have this RIHS01 hash; "" takes the newest.
-        folder: Searched first for ``<package>/msg/<Name>.msg`` files, at any depth.
 
     Raises:
         MissingDependencyError: When rosbags is not installed.
@@ -48,7 +46,6 @@ def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
     """Return the RIHS01 hash of the newest definition of a type, or None when none is known.
 
     Args:
-        type_name: Such as ``sensor_msgs/msg/JointState``.
         folder: Message definitions of the user's own, looked at as well; None for none.
 
     Raises:
@@ -62,8 +59,6 @@ def is_known_definition(type_name: str, type_hash: str, *, folder: Path | None =
     """Say whether any release, or the folder, has the type with exactly this hash.
 
     Args:
-        type_name: Such as ``sensor_msgs/msg/JointState``.
-        type_hash: RIHS01, as publishers state it.
         folder: Message definitions of the user's own, looked at as well; None for none.
     """
     return any(found == type_hash for found, _ in _hashes(type_name, folder))

@@ -149,10 +149,7 @@ def copy_sample(
     """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory.
 
     Args:
-        sample: A ``zenoh.Sample``.
-        received_ns: When it came in [ns since 1970].
         max_bytes: A larger payload is left out, its size stands in ``oversize_bytes``.
-        definitions: What publishers told of their types, by type name and message encoding.
     """
     size = len(sample.payload)
     is_oversize = size > max_bytes
@@ -260,8 +257,6 @@ class WireSession:
         """Announce a topic.
 
         Args:
-            topic: With its leading slash.
-            type_name: As in ``bridge.episode.schema``.
             qos: What happens when the network is behind; control loops use ``Qos.CONTROL``.
             message_encoding: cdr, json, protobuf ...; that of the type where it is left out, and
                 foreign types then count as CDR.
@@ -393,8 +388,6 @@ class WireSession:
         """Answer requests on a key; a ``GstError`` of the handler goes back as the answer.
 
         Args:
-            key: Without a leading slash.
-            handler: Called with one request after another, or with several at once.
             max_waiting: Requests that may wait for their turn; further ones are refused.
             side_by_side: Requests that are answered at once, each on its own thread.
         """
@@ -410,11 +403,6 @@ class WireSession:
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Ask and wait for the answer.
-
-        Args:
-            key: Whom to ask.
-            payload: The request.
-            timeout_s: How long to wait for the answer [s].
 
         Raises:
             RemoteError: When the other side refused; carries its message.
@@ -443,8 +431,6 @@ class WireSession:
         ``max_mb`` [MB], for nobody knows what a cache holds.
 
         Args:
-            key_expression: Whom to ask.
-            timeout_s: How long to wait [s].
             max_mb: Bound on all answers together [MB].
         """
         answers: list[WireSample] = []
@@ -478,12 +464,7 @@ class WireSession:
         return token
 
     def query_alive(self, key_expression: str, *, timeout_s: float = 5.0) -> list[str]:
-        """Return the keys of everybody who is there now.
-
-        Args:
-            key_expression: Of the liveliness tokens asked for.
-            timeout_s: How long to wait for answers [s].
-        """
+        """Return the keys of everybody who is there now."""
         try:
             replies = self._inner.liveliness().get(key_expression, timeout=timeout_s)
             return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
@@ -497,13 +478,7 @@ class WireSession:
         *,
         history: bool = True,
     ) -> Subscriber:
-        """Hear who comes and goes, on the network thread.
-
-        Args:
-            key_expression: Which tokens, for example ``rec/*/alive``.
-            callback: Called with the key and whether it is there now.
-            history: Also tell of those that are there already.
-        """
+        """Hear who comes and goes, on the network thread."""
 
         def on_sample(sample: Any) -> None:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)

@@ -151,10 +151,6 @@ def read_real_run(path: Path) -> KinovaRun:
 def read_sim_run(path: Path, duration_s: float) -> KinovaRun:
     """Read a simulator file; it has no times, so they are spread evenly over ``duration_s``.
 
-    Args:
-        path: A file named like ``Single_PyBullet_0.csv``.
-        duration_s: From its first row to its last [s].
-
     Raises:
         KinovaFormatError: When columns are missing or are not numbers, the simulator is not known,
             or a body is farther away than ``FARTHEST_M``.
@@ -227,8 +223,6 @@ def import_runs(
     """Write every run that can be used as an episode; yields file and run as each is done.
 
     Args:
-        folder: The data set, with ``real/Experiment*`` and ``sim/Experiment*``.
-        run: Where the episodes go.
         skipped: Takes what was wrong with each file that is left out.
 
     Raises:

@@ -44,7 +44,6 @@ def shared_trials(mine: Sequence[TrialRow], theirs: Sequence[TrialRow]) -> Share
     """Match trials by their id, else by task, policy, condition and start.
 
     Args:
-        mine: Trials with this twin's answers.
         theirs: The same trials with the other's; what was recorded must agree.
 
     Raises:
@@ -94,9 +93,6 @@ def against_tables(
     """Lay out how much better one twin is, which trials flip, and which settings differ.
 
     Args:
-        mine: Trials with this twin's answers.
-        theirs: The same recorded trials with the other's.
-        names: What both are called.
         trials: The trials with their replays, of runs; settings are read from those.
     """
     shared = shared_trials(mine, theirs)
@@ -248,12 +244,7 @@ def _word(answer: bool | None) -> str | None:
 def settings_table(
     trials: tuple[Sequence[Trial], Sequence[Trial]], names: tuple[str, str]
 ) -> tuple[Table, ...]:
-    """List the settings in which the replays of both differ; nothing where none does.
-
-    Args:
-        trials: The trials of both sides, with the replays that count.
-        names: What both are called.
-    """
+    """List the settings in which the replays of both differ; nothing where none does."""
     found = [_settings_of(each) for each in trials]
     rows: list[dict[str, Cell]] = [
         {"setting": name, names[0]: found[0].get(name), names[1]: found[1].get(name)}

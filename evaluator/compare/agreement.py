@@ -84,19 +84,11 @@ class GroupIntervals:
         return "points" if self.unit == "groups" else "clusters"
 
     def model(self, statistic: str) -> Interval | None:
-        """Return the interval of the model of all counts, which goes before all others.
-
-        Args:
-            statistic: r and bias have one, where trials are counted and groups are enough.
-        """
+        """Return the interval of the model of all counts, which goes before all others."""
         return headline_interval(statistic, self._groups)
 
     def of(self, statistic: str) -> Found:
-        """Return Fisher's interval of r, Student's of the bias, and the jackknife's of others.
-
-        Args:
-            statistic: A name in ``weighted.STATISTICS``.
-        """
+        """Return Fisher's interval of r, Student's of the bias, and the jackknife's of others."""
         interval, reason, key = None, "", f"jackknife-{self.kind}:{statistic}"
         is_fisher = (statistic, self.kind) == ("pearson", "points")
         try:
@@ -179,12 +171,7 @@ OTHERS, AGAIN = "other {} like these", "the same groups measured again"
 def interval_table(
     intervals: GroupIntervals, statistics: Sequence[tuple[str, str, float]]
 ) -> tuple[Table, ...]:
-    """Lay out both intervals of every statistic; none without groups.
-
-    Args:
-        intervals: Of the groups.
-        statistics: Words, name and factor to the printed unit.
-    """
+    """Lay out both intervals of every statistic; none without groups."""
     if intervals.num_units == 0:
         return ()
     try:
@@ -313,13 +300,7 @@ def measure_over(
     """Measure one statistic with its interval.
 
     Args:
-        groups: With both rates.
-        intervals: Of the groups; the model's goes first.
-        what: Says over which groups.
         quantity: Percentage points or 1.
-        statistic: A name in ``weighted.STATISTICS``.
-        value: Computes it.
-        **parts: Further variable parts of its id or definition.
     """
     factor = 100.0 if quantity.unit == "pp" else 1.0
     found = intervals.of(statistic)

@@ -27,7 +27,6 @@ def axis_tables(
     """Lay out, for every value of every axis, how sim and outcome agree; none without tags.
 
     Args:
-        rows: Trials with their tags.
         word: What the recorded side is called: stand-in, real or recorded.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """

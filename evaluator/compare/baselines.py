@@ -55,9 +55,7 @@ def apply_rule(
     """Ask the geometric rule about the plan that was sent; None where there is nothing to ask.
 
     Args:
-        recorded: The recorded episode, with the plan.
         localised: Its localisation by the twin; the cell's own records count without it.
-        plan_id: The plan that was sent.
         task: Shapes and predicates; the one the episode names without it.
 
     Raises:
@@ -72,12 +70,7 @@ def apply_rule(
 
 
 def with_rule(rows: Iterable[TrialRow], summaries: Sequence[RuleSummary]) -> list[TrialRow]:
-    """Enter the rule's answers into the trials' rows; an open answer is left out.
-
-    Args:
-        rows: The recorded trials.
-        summaries: What the rule answered, one for each trial asked.
-    """
+    """Enter the rule's answers into the trials' rows; an open answer is left out."""
     answers = {rule.episode: rule.value for rule in summaries if rule.value is not None}
     return [
         replace(row, baselines=(*row.baselines, (GEOMETRIC_RULE, answers[row.episode])))

@@ -39,7 +39,6 @@ def conclusions_table(
     out.
 
     Args:
-        groups: Success rates per task, condition and policy.
         rows: The trials behind them; none for a table of rates.
     """
     usable = usable_groups(groups)
@@ -160,7 +159,6 @@ def direction(low: float | None, high: float | None) -> str:
 
     Args:
         low: Its lower end; None where there is none.
-        high: Its upper end.
     """
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return ""

@@ -132,13 +132,7 @@ def moved_bodies(real: Side) -> list[str]:
 
 
 def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyComparison]:
-    """Compare one body run by run; recorded runs without a counterpart are left out.
-
-    Args:
-        real: Recorded runs of a task.
-        simulated: Runs of one engine.
-        body: ``tool`` or the id of an object.
-    """
+    """Compare one body run by run; recorded runs without a counterpart are left out."""
     courses = {run.episode: _Course(track) for run in simulated.runs if (track := run.body(body))}
     found = []
     for run in real.runs:
@@ -171,14 +165,7 @@ def compare_bodies(real: Side, simulated: Side, body: str) -> list[BodyCompariso
 def body_measurements(
     task: str, engine: str, body: str, compared: Sequence[BodyComparison]
 ) -> list[Measurement]:
-    """Measure the medians over recorded runs; runs that something was fitted to do not count.
-
-    Args:
-        task: Task of the runs, a part of the ids.
-        engine: The simulated side, another part.
-        body: ``tool`` or the id of an object.
-        compared: One for each recorded run.
-    """
+    """Measure the medians over recorded runs; runs that something was fitted to do not count."""
     counted = [item for item in compared if not item.fitted]
     words = f"{body}, {len(counted)} recorded runs against {engine}"
     episodes = [name for item in counted for name in (item.recorded, *item.simulated)]
@@ -213,14 +200,7 @@ def _median_of(defined: Defined, values_m: list[float], episodes: list[str]) -> 
 
 
 def compare_end_points(task: str, real: Side, sides: Sequence[Side], table_id: str) -> Part:
-    """Compare every moved body of a task with every engine.
-
-    Args:
-        task: Task of the runs.
-        real: Recorded runs.
-        sides: Simulated runs, by engine.
-        table_id: Id of the table, its file name too.
-    """
+    """Compare every moved body of a task with every engine."""
     measurements: list[Measurement] = []
     rows: list[dict[str, Cell]] = []
     each: list[dict[str, Cell]] = []

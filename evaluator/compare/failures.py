@@ -58,9 +58,6 @@ def start_regions(rows: Sequence[TrialRow]) -> dict[str, str]:
 
     In each task it is the object whose start varies most. Halves are parted at the median of the
     task's trials, along x (ahead) and y (left) of the robot's base.
-
-    Args:
-        rows: Trials, with where objects were localised at the start.
     """
     tasks: dict[str, list[TrialRow]] = {}
     for row in rows:

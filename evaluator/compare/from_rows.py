@@ -74,12 +74,7 @@ def compare_rows(
     """Measure everything that follows from trial rows alone, wherever they came from.
 
     Args:
-        rows: One for each trial, or, from a streamed table, one for equal trials.
-        run: Name of the run or table.
-        source: run or trials.
-        stand_in: Whether the recorded side is a simulated laboratory.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: Success rate to stop or continue for.
         void_causes: How outcomes of a study begin that make a start void in all arms.
 
     Raises:

@@ -101,7 +101,6 @@ def start_distance_m(first: TrialRow, second: TrialRow) -> float | None:
     """Return the largest distance between objects localised in both trials [m].
 
     Args:
-        first: A trial of the pair.
         second: The other one; without an object localised in both the answer is None.
     """
     shared = first.start_positions_m.keys() & second.start_positions_m.keys()

@@ -82,7 +82,6 @@ def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     """Count what was said against what was labelled, over trials where both are known.
 
     Args:
-        rows: Trials, each as often as its ``count`` says.
         answer_of: Reads what the twin said of a trial; None where it said nothing.
     """
     return Confusion.weigh(

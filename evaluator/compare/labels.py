@@ -55,9 +55,6 @@ def perceive_outcome(
     when the task file is not known.
 
     Args:
-        recorded: The recorded episode.
-        localised: Its localisation by the twin.
-        plan_id: The plan that was sent.
         task: With the success predicate; the one the episode names without it.
 
     Raises:
@@ -164,9 +161,7 @@ def label_results(
     """Count the trials in which label and predicate say the same, and list the others.
 
     Args:
-        perceived: What the predicate says, of trials that were localised afterwards.
         rows: The trials with their labels; these alone enter every other number.
-        method: Interval of rates.
     """
     if not perceived:
         reason = "no trial of a known task was localised after its execution"

@@ -55,7 +55,6 @@ def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> floa
     """Return the mean of what is known; None when nothing is.
 
     Args:
-        items: What is averaged over.
         read: Gives the number of an item; None leaves the item out.
     """
     values = [value for item in items if (value := read(item)) is not None]
@@ -83,7 +82,6 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
     """Refuse two names that would share an id: the number of one would stand for both.
 
     Args:
-        kind: What is named: task, condition, policy.
         named: Each name with where it stands: an episode, or a row of a table.
 
     Raises:
@@ -102,12 +100,7 @@ def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
 def interval_or_reason(
     interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]
 ) -> tuple[Interval | None, str | None]:
-    """Return the interval of some values, or None and the reason why they have none.
-
-    Args:
-        interval_of: Estimates the interval; refuses by ``UndefinedStatisticError``.
-        values: What it is estimated from.
-    """
+    """Return the interval of some values, or None and the reason why they have none."""
     try:
         return interval_of(values), None
     except UndefinedStatisticError as error:
@@ -133,13 +126,11 @@ def measured(
     and what to use ``instead``.
 
     Args:
-        defined: Id, unit and definition.
         compute: Gives the value, or the value with its interval; refuses by
             ``UndefinedStatisticError``.
         n: How many were counted; None where nothing is counted.
         counted: What was counted, in the singular: trial, pair, run.
         reason_without_interval: Said where there is no interval.
-        episodes: Ids of the episodes that the number rests on.
         interval_n: What the coverage of the interval depends on, where it is not ``n``.
         coverage_key: Name in ``coverage.HOLDS_FROM``, where one method serves several statistics.
         instead: What to use where the interval is refused; what its method says without.
@@ -184,12 +175,8 @@ def proportion(
     """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0.
 
     Args:
-        defined: Id, unit and definition.
-        k: Successes.
-        n: How many were counted.
         counted: What was counted, in the singular: trial, pair.
         reason_if_undefined: Said where n is 0.
-        episodes: Ids of the episodes that the number rests on.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     interval, refusal = vouched_rate(k, n, method) if n else (None, "")
@@ -210,7 +197,6 @@ def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
     """Return the interval of k/n by a named method, or None and why it is not printed.
 
     Args:
-        k: Successes.
         n: Trials, 1 or more.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """

@@ -50,9 +50,6 @@ def shared_by(groups: Sequence[RateGroup]) -> list[str]:
 def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
     """Return what was counted in each group, paired trials apart from those without a partner.
 
-    Args:
-        groups: With both rates.
-
     Raises:
         UndefinedStatisticError: When the number of trials of a group is not known.
     """
@@ -92,7 +89,6 @@ def headline_interval(statistic: str, groups: Sequence[RateGroup]) -> Interval |
     """Return the model's interval of ``pearson`` or ``bias`` [1] over other groups like these.
 
     Args:
-        statistic: Other statistics have no interval by the model.
         groups: With both rates; None without counts or below four.
     """
     if statistic not in ("pearson", "bias") or len(groups) < HEADLINE_FROM:
@@ -108,11 +104,7 @@ def headline_interval(statistic: str, groups: Sequence[RateGroup]) -> Interval |
 def model_results(
     groups: Sequence[RateGroup],
 ) -> list[Measurement]:
-    """Measure everything that the model says beyond the headline.
-
-    Args:
-        groups: With both rates.
-    """
+    """Measure everything that the model says beyond the headline."""
     if len(groups) < 2:
         return []
     try:

@@ -96,9 +96,7 @@ def summarise_motions(
     What has no tool poses in common with another one is left out.
 
     Args:
-        recorded: The recorded episode.
         replays: Its dynamic replays, ``planned`` and ``executed``, as far as there are any.
-        plan_id: Whose execution.
 
     Raises:
         EpisodeError: When a file turns out to be damaged.

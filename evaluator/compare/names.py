@@ -14,7 +14,6 @@ def settle_names(items: Iterable[Named], choice: str) -> tuple[list[Named], list
     """Settle names that differ only by case or blanks: ask, merge, or leave them apart.
 
     Args:
-        items: Trials or rates with a task, a condition and a policy.
         choice: ``ask`` refuses them, ``merge`` takes the spelling that came first, ``apart``
             leaves them.
 

@@ -29,12 +29,7 @@ Note = tuple[str, str]
 
 
 def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> list[Note]:
-    """Collect what follows from the groups and the numbers alone.
-
-    Args:
-        groups: Success rates per task, condition and policy.
-        measurements: Everything that was measured over them.
-    """
+    """Collect what follows from the groups and the numbers alone."""
     by_id = {measurement.id: measurement for measurement in measurements}
     return [
         *_opposed(groups, by_id),
@@ -59,7 +54,6 @@ def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, .
     """Put notes before those that are among some tables already.
 
     Args:
-        tables: Tables of the evaluation, perhaps with one of notes.
         found: Notes to add; without any the tables stay as they are.
     """
     kept, found = list(tables), list(found)
@@ -205,12 +199,7 @@ HASH_DIGITS = 12
 
 
 def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> list[Note]:
-    """Say what a reader of one rate over all trials would not expect of the replays behind it.
-
-    Args:
-        trials: Each with the dynamic replays that count.
-        derived: All derived episodes of the run.
-    """
+    """Say what a reader of one rate over all trials would not expect of the replays behind it."""
     used = [file for trial in trials for file in trial.replays.values()]
     reasons = [file.why_not_counted for file in derived]
     known = list(zip(derived, reasons, strict=True))

@@ -111,7 +111,6 @@ def shares_of(name: str, values: Sequence[float]) -> Shares | None:
     """Return the empirical distribution of finite values, thinned evenly; None without any.
 
     Args:
-        name: What the values are called in the legend.
         values: Any numbers; those that are not finite are left out.
     """
     found = np.sort(np.array([v for v in values if np.isfinite(v)], dtype=np.float64))

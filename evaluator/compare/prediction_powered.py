@@ -70,7 +70,6 @@ def start_positions(tried: Sequence[TrialRow], others: Sequence[TrialRow]) -> St
     """Gather where objects lay; those localised in most starts count.
 
     Args:
-        tried: Trials that the robot and the twin made.
         others: Trials that only the twin made.
 
     Raises:

@@ -38,7 +38,6 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
     in is no trial.
 
     Args:
-        rows: Trials of a run.
         protocol: Its protocol; rows stay as they are without a design.
     """
     if protocol is None or protocol.primary is None or is_streamed(rows):
@@ -72,10 +71,6 @@ def protocol_results(
     """Compare a study with its design, and answer the design's questions; nothing without one.
 
     Args:
-        rows: Trials as ``as_designed`` returns them.
-        protocol: The run's protocol.
-        method: The interval of rates that was asked for.
-        left_out: Episodes that could not be read.
         task_hashes: Hashes of the task files that the episodes were recorded with, by task.
     """
     if protocol is None or protocol.primary is None or is_streamed(rows):

@@ -104,9 +104,7 @@ def check_published(
     """Recompute every printed figure of a table.
 
     Args:
-        path: The table.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        options: Columns whose names differ from ours.
 
     Raises:
         TableError: Naming the row that cannot be read at all, or that is there twice.

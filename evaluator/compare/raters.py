@@ -28,7 +28,6 @@ def with_reviews(comparison: Comparison, reviews: Sequence[Review]) -> Compariso
     """Add what other raters say to an evaluation: kappa, PPV and r by rater, label error.
 
     Args:
-        comparison: With its trials.
         reviews: Labels of other raters; of trials that are not there they are named.
     """
     rows = {row.episode: row for row in comparison.rows}

@@ -26,7 +26,6 @@ def compare_records(
     """Compare rates that were read already; ``path`` is where they come from.
 
     Args:
-        records: One for each row that was read.
         path: The file they come from, for the name of the run and the hash.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
 

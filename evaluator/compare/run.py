@@ -54,12 +54,9 @@ def compare_run(
     A broken episode is left out and named; a missing part is listed, never guessed.
 
     Args:
-        run: The run folder.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: Success rate to stop or continue for.
         images: Backbones of LPIPS, and other methods to compare with the views of the run.
         cache: What earlier evaluations read; without one every file is read.
-        output: Shows progress.
 
     Raises:
         PathNotFoundError: When the run folder is not there.
@@ -107,11 +104,7 @@ class ReadRun:
         return self.run.path.resolve().name
 
     def renamed(self, names: Mapping[str, str]) -> "ReadRun":
-        """Return the same with other ids of episodes, which another run has too.
-
-        Args:
-            names: New id by the old one.
-        """
+        """Return the same with other ids of episodes, which another run has too."""
 
         def with_new_ids(items: Iterable[Any]) -> Any:
             return tuple(
@@ -128,12 +121,7 @@ class ReadRun:
         )
 
     def without(self, episodes: Container[str], reason: str) -> "ReadRun":
-        """Return the same without some trials, which are named as left out.
-
-        Args:
-            episodes: Ids.
-            reason: Why they do not count.
-        """
+        """Return the same without some trials, which are named as left out."""
         there = {row.episode for row in self.rows if row.episode in episodes}
         parts = {
             name: tuple(item for item in items if item.episode not in there)
@@ -149,13 +137,7 @@ class ReadRun:
 
 
 def read_run(run: RunFolder, cache: SummaryCache, output: Output = QUIET) -> ReadRun:
-    """Read the trials of a run and sum them up; what cannot be read is left out and named.
-
-    Args:
-        run: The run folder.
-        cache: What earlier evaluations read.
-        output: Shows progress.
-    """
+    """Read the trials of a run and sum them up; what cannot be read is left out and named."""
     with evaluation_pool() as pool:
         contents = read_contents(run, cache, output, pool)
         trials, left_out = trials_of(contents)
@@ -190,10 +172,7 @@ def compare_read(
 
     Args:
         reads: The runs; an episode has another id in each.
-        name: What they are called together.
-        more_rows: Trials of tables beside them.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: Success rate to stop or continue for.
     """
     rows = [row for read in reads for row in read.rows]
     rows += more_rows

@@ -65,12 +65,8 @@ def compare_several(
     id are one start, wherever they were tried.
 
     Args:
-        sources: Run folders, tables, result files, and folders of them.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: The success rate that is asked about, 0 to 1; None asks nothing.
-        options: How tables are read.
-        force: Read every file of the runs again.
-        output: Told what was taken for what.
 
     Raises:
         UsageError: When a source is given twice, or nothing can be read.
@@ -101,11 +97,7 @@ def with_against(
     """Add the paired comparison with another twin's answers to the same recorded trials.
 
     Args:
-        comparison: What was evaluated.
         source: Where it is from; settings of replays are read there.
-        other: A run or table with the other twin's answers.
-        options: How tables are read.
-        output: Shows progress.
 
     Raises:
         UsageError: When both are the same, or the other is nothing that can be read.
@@ -125,13 +117,7 @@ def with_against(
 def answers_of(
     path: Path, options: TableOptions = AS_SAVED, output: Output = QUIET
 ) -> tuple[Sequence[TrialRow], Sequence[Trial]]:
-    """Read trials with the twin's answers, and of a run the replays behind them.
-
-    Args:
-        path: A run or a table.
-        options: How tables are read.
-        output: Shows progress.
-    """
+    """Read trials with the twin's answers, and of a run the replays behind them."""
     if not (path / "episodes").is_dir():
         return list(map(row_from_record, take(path, options).trials)), ()
     run = RunFolder.open(path)
@@ -142,9 +128,6 @@ def answers_of(
 
 def refuse_twice(sources: Sequence[Path]) -> None:
     """Refuse a source that is given twice: its trials would count double.
-
-    Args:
-        sources: As they were given.
 
     Raises:
         UsageError: Naming it.

@@ -57,7 +57,6 @@ def imported_rows(
 
     Args:
         run: The run folder; without imported trials there are no rows.
-        recorded_ids: Ids of the recorded episodes, which count before imported ones.
 
     Raises:
         TableError: When somebody has changed the file so that a row contradicts itself.
@@ -92,10 +91,8 @@ def compare_csv(
     and a folder of SIMPLER videos.
 
     Args:
-        path: The table, result file or folder.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: The success rate that is asked about, 0 to 1; None asks nothing.
-        options: How a table is read.
 
     Raises:
         TableError: Naming the row that contradicts itself.
@@ -121,7 +118,6 @@ def compare_taken(
     """Compare what one file or folder holds.
 
     Args:
-        taken: What was read of it.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: The success rate that is asked about, 0 to 1; None asks nothing.
         options: What becomes of names that differ only by case.
@@ -168,12 +164,10 @@ def compare_trials(
     single trials (pairs of starts, success probabilities, the list of trials) is left out by name.
 
     Args:
-        path: The trials CSV.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
         goal: The success rate that is asked about, 0 to 1; None asks nothing, and so does a
             streamed table.
         stream_above: Size of the file from which it is streamed [bytes].
-        options: How the table is read.
     """
     if path.stat().st_size > stream_above:
         return _compare_streamed(path, method, options)

@@ -87,10 +87,8 @@ def summarise_states(
     recording. Nothing is found when the plan predicts no object.
 
     Args:
-        recorded: The recorded episode, with the plan.
         replays: Its dynamic replays, ``planned`` and ``executed``, as far as there are any.
         localised: Its localisation by the twin; the cell's own records count without it.
-        plan_id: The plan that was sent.
         task: Says which objects are soft or symmetric; the one the episode names without it.
 
     Raises:

@@ -58,7 +58,6 @@ def study_starts(
 
     Args:
         rows: Trials; those outside a study are passed over.
-        void_causes: How outcomes begin that make a trial void, as the protocol named them.
     """
     if is_streamed(rows):
         return [], []
@@ -108,8 +107,6 @@ def study_results(
     """Measure the gain of *with* over the other arms: pooled test, and each task's interval.
 
     Args:
-        rows: Trials of a run.
-        void_causes: As for ``study_starts``.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
 
     Returns:
@@ -283,9 +280,6 @@ def _gains_table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
 
 def retry_table(recorded: Sequence[tuple[EpisodeInfo, Outcome | None]]) -> tuple[Table, ...]:
     """Count new starts after failed executions, beside the first attempts and in none of them.
-
-    Args:
-        recorded: Every episode of a run with its label.
 
     Returns:
         The table ``retries``; nothing where no execution was retried.

@@ -81,10 +81,7 @@ def answered(
     """Measure the share of yes among the trials whose answer is known.
 
     Args:
-        defined: Id, unit and definition of the share.
-        rows: Trials, each as often as its ``count`` says.
         answer: Reads yes, no, or None for unknown from a trial.
-        reason_if_undefined: Said where no answer is known.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     known = [row for row in rows if answer(row) is not None]
@@ -103,7 +100,6 @@ def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Meas
     """Measure every side of every group, counted in trials; object counts beside them.
 
     Args:
-        rows: Trials of all groups.
         method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     measurements = []
@@ -174,11 +170,6 @@ def rate_groups(
     """Lay the recorded and the headline sim rate of each group side by side.
 
     Over the trials where both sides are known; where there is none, each side over its own trials.
-
-    Args:
-        rows: Trials of all groups.
-        rates: What ``side_rates`` measured of the same trials.
-        method: Interval of the rates over trials where both sides are known.
     """
     by_id = {measurement.id: measurement for measurement in rates}
     groups = []
@@ -239,12 +230,7 @@ def fraction_of(measurement: Measurement) -> Fraction | None:
 def trial_table(
     both: Sequence[TrialRow], answers: Sequence[bool | None]
 ) -> tuple[int, int, int, int]:
-    """Count trials in which both succeed, only sim, only recorded, neither.
-
-    Args:
-        both: Trials with both sides.
-        answers: The twin's, one for each.
-    """
+    """Count trials in which both succeed, only sim, only recorded, neither."""
     table = [0, 0, 0, 0]
     for row, yes in zip(both, answers, strict=True):
         place = (0 if row.recorded else 1) if yes else (2 if row.recorded else 3)
@@ -313,13 +299,7 @@ def _macro(rates: Sequence[Measurement]) -> float:
 
 
 def of_group(quantity: Quantity, key: Key, **words: object) -> Defined:
-    """Name a measurement of one task, condition and policy.
-
-    Args:
-        quantity: What is measured.
-        key: Task, condition and policy.
-        **words: Further variable parts of its id or definition.
-    """
+    """Name a measurement of one task, condition and policy."""
     return quantity.of(task=key[0], condition=key[1], policy=key[2], **words)
 
 

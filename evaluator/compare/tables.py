@@ -60,9 +60,7 @@ def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "")
     """Success without and with replanning, in the twin and recorded.
 
     Args:
-        groups: Success rates per task, condition and policy.
         word: What the recorded side is called: stand-in, real or recorded.
-        source_note: Where rates come from that are no rates of our trials.
     """
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
@@ -114,7 +112,6 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
     """The replanning gain: percentage points and relative gain are two columns; none without.
 
     Args:
-        gains: What ``replanning_gains`` measured.
         word: What the recorded side is called: stand-in, real or recorded.
     """
     if not gains:
@@ -164,7 +161,6 @@ def layout_table(
 
     Args:
         groups: Success rates per task, condition and policy; one condition alone makes no table.
-        measurements: Holds the averages, for the last rows.
         word: What the recorded side is called: stand-in, real or recorded.
     """
     conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
@@ -252,7 +248,6 @@ def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
     """What the twin said against what happened, counted over trials.
 
     Args:
-        rows: Trials, each as often as its ``count`` says.
         word: What the recorded side is called: stand-in, real or recorded.
     """
     lines: list[dict[str, Cell]] = []

@@ -62,13 +62,7 @@ class Trial:
 
 
 def lay_out(file: RunFile, facts: RecordedFacts, index: DerivedIndex) -> Trial:
-    """Find what was made from a recorded trial, build its row, and say what it lacks.
-
-    Args:
-        file: The recorded episode, with its hash as it is now.
-        facts: What the episode says of itself.
-        index: The derived episodes of the run, by what they were made from.
-    """
+    """Find what was made from a recorded trial, build its row, and say what it lacks."""
     source, sha256 = facts.info.id, file.sha256
     lacking = _unlabelled(facts.outcome)
     gate = facts.verdict
@@ -225,13 +219,7 @@ def tcp_track(episode: Episode) -> PoseTrajectory | None:
 def read_tcp_errors(
     recorded_path: Path, plan_id: str | None, replays: Mapping[str, Path]
 ) -> tuple[TcpErrorSeries, ...]:
-    """Compare the recorded tool centre point with each replay's, over time; as far as files allow.
-
-    Args:
-        recorded_path: The recorded episode.
-        plan_id: Whose execution.
-        replays: Derived episodes by trajectory, planned or executed.
-    """
+    """Compare the recorded tool centre point with each replay's, over time, if files allow."""
     if plan_id is None or not replays:
         return ()
     recorded = _tracks_of(recorded_path, plan_id)

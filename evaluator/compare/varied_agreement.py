@@ -37,12 +37,7 @@ class VariedIntervals(GroupIntervals):
     """
 
     def __init__(self, groups: Sequence[RateGroup], members: Sequence[Sequence[TrialRow]]) -> None:
-        """Prepare; no model is fitted before it is asked for.
-
-        Args:
-            groups: With both rates.
-            members: Trials of each, with both sides.
-        """
+        """Prepare; no model is fitted before it is asked for."""
         super().__init__(groups)
         self._names = shared_by(groups)
         self._members = members
@@ -82,10 +77,6 @@ def drawn_answers(rows: Sequence[TrialRow], rng: np.random.Generator) -> np.ndar
 
     Systematic sampling: of an even share as many replicates say yes, to within one.
 
-    Args:
-        rows: Trials with varied replays.
-        rng: Decides which replicates.
-
     Returns:
         Booleans, one row for each trial, one column for each replicate.
     """
@@ -95,12 +86,7 @@ def drawn_answers(rows: Sequence[TrialRow], rng: np.random.Generator) -> np.ndar
 
 
 def varied_agreement(rows: Sequence[TrialRow], groups: Sequence[RateGroup]) -> list[Measurement]:
-    """Measure r, bias and MMRV of varied replays; nothing where fewer than two groups have any.
-
-    Args:
-        rows: Trials of all groups.
-        groups: Their nominal rates.
-    """
+    """Measure r, bias and MMRV of varied replays; nothing where fewer than two groups have any."""
     by_key = {(group.task, group.condition, group.policy): group for group in groups}
     kept: list[RateGroup] = []
     members: list[list[TrialRow]] = []

@@ -39,10 +39,7 @@ def within_tables(read: ReadRun, kind: Kind, first: str, second: str) -> tuple[T
     Conditions and policies are paired by task and start; engines by trial.
 
     Args:
-        read: The run.
-        kind: What both are.
         first: One of ``choices``.
-        second: Another one.
 
     Raises:
         EvaluatorError: When there is no pair, or they are not two of the run's.

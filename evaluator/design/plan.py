@@ -92,10 +92,6 @@ class Design:
 def design(study: StudyOptions, wanted: Wanted) -> Design:
     """Find the number of starts and everything else that a study fixes before its first trial.
 
-    Args:
-        study: What is tried.
-        wanted: What is expected, and what is to be shown.
-
     Raises:
         UsageError: When an option contradicts another, or nothing is asked for.
     """
@@ -373,7 +369,6 @@ def lock(run_path: Path, made: Design) -> Protocol:
 
     Args:
         run_path: The run folder; made where it is not there.
-        made: The design.
 
     Returns:
         The protocol as written, with its hash.
@@ -411,14 +406,7 @@ def order_list(protocol: Protocol) -> bytes:
 
 
 def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOptions) -> str:
-    """Return the design in words.
-
-    Args:
-        made: The design.
-        written: The protocol with its hash.
-        run_path: Where it lies.
-        study: The options, for the command that carries it out.
-    """
+    """Return the design in words."""
     protocol = made.protocol
     arms = sum(len(policy.arms) for policy in protocol.policies)
     starts, count = protocol.tasks[0].starts, len(protocol.tasks)
@@ -443,13 +431,7 @@ def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOpt
 
 
 def trials_command(run_path: Path, protocol: Protocol, study: StudyOptions) -> str:
-    """Return the command that carries a design out on the stand-in cell.
-
-    Args:
-        run_path: The run folder.
-        protocol: What was designed.
-        study: The options it was made with.
-    """
+    """Return the command that carries a design out on the stand-in cell."""
     words = ["robot-gst", "trials", str(run_path)]
     for name, values in (
         ("--task", study.task),

@@ -75,7 +75,6 @@ def advice_words(advice: Advice | None, changed: str, stop: str) -> str:
     Args:
         advice: What the interval settles; None without a goal.
         changed: Why no interval is left; empty where there is one.
-        stop: What is settled, said when the advice is to stop.
     """
     if changed:
         return f"stop: {changed}"
@@ -92,7 +91,6 @@ def rate_words(rate: RateSummary, goal: float | None) -> str:
     """One group's rate, its interval at any time, and what follows.
 
     Args:
-        rate: Counts of one group, its interval and the advice.
         goal: The success rate that is asked about, 0 to 1; None where none is.
     """
     percent = 0.0 if goal is None else 100 * goal
@@ -132,7 +130,6 @@ def change_line(
 
     Args:
         change: The trial that is new, or corrected, and what was known of it before.
-        summary: What is known with that trial.
         proposal: Which start to run next; None when every question is settled.
         goal: The success rate that is asked about, 0 to 1; None where none is.
     """
@@ -150,7 +147,6 @@ def state_lines(
     """Everything that is known, one line for each group and gain.
 
     Args:
-        summary: What is known of the session.
         proposal: Which start to run next; None when every question is settled.
         goal: The success rate that is asked about, 0 to 1; None where none is.
     """
@@ -176,13 +172,7 @@ def record(
     """Return what is published, as ``advice.schema.json`` describes it.
 
     Args:
-        run: Name of the run folder.
-        stamp_ns: When [ns].
-        text: The line that is printed.
         change: The trial it is about; None for the state at the start and at the end.
-        summary: All groups and gains.
-        proposal: What to run next.
-        goal: The success rate asked about.
     """
     return {
         "schema_version": SCHEMA_VERSION,
@@ -220,11 +210,7 @@ def follow(
     """Say after every trial what is settled, until ``stop`` is set; then print the state.
 
     Args:
-        run_path: The run folder that is recorded into.
-        config: Whom to listen to.
         goal: Success rate that is asked about, None for the gain with replanning only.
-        stop: Set by a signal handler.
-        output: How to talk.
 
     Raises:
         PathNotFoundError: When there is no such run folder.

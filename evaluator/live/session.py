@@ -164,7 +164,6 @@ class SessionSummary:
         """Return the gain of one task and policy.
 
         Args:
-            task: Task of the pairs.
             policy: Policy of the pairs; without a complete pair of both the answer is None.
         """
         return next((g for g in self.gains if (g.task, g.policy) == (task, policy)), None)
@@ -175,7 +174,6 @@ def summarise_session(trials: Sequence[LiveTrial], goal: float | None) -> Sessio
 
     Args:
         trials: In the order in which they were recorded.
-        goal: Success rate that is asked about.
     """
     known = [trial for trial in trials if trial.recorded is not None]
     outcomes_of: dict[Key, list[bool]] = {}
@@ -213,11 +211,6 @@ def changes_of(known: Sequence[LiveTrial], task: str, policy: str) -> list[int]:
 
     In the order in which the pairs became complete. A start tried twice in one condition is no
     pair: which of the two would count?
-
-    Args:
-        known: Trials with an outcome, of any task and policy.
-        task: Task whose pairs are wanted.
-        policy: Policy whose pairs are wanted.
     """
     starts: dict[str, list[LiveTrial]] = {}
     for trial in known:
@@ -278,7 +271,6 @@ def next_start(trials: Sequence[LiveTrial], summary: SessionSummary) -> NextStar
     Args:
         trials: In the order in which they were recorded; those without an outcome count as tried
             but not as known.
-        summary: What they have settled.
     """
     open_groups = [
         (sum(t.recorded is not None for t in members), place, key, members)

@@ -50,7 +50,6 @@ def judge_by_geometry(
 
     Args:
         plan: With its whole trajectory, in the robot's base frame.
-        task: Shapes and success predicates.
         Ts_base_object: Where the objects were localised before the execution; what is missing
             leaves the answer open.
     """

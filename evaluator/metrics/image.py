@@ -74,10 +74,6 @@ def score_depth(
 ) -> DepthScore:
     """Compare two depth images [m]; 0 is "no measurement".
 
-    Args:
-        recorded_m: Depth that the camera measured [m].
-        rendered_m: Depth of the twin from the same place [m].
-
     Raises:
         ImageShapeError: When the sizes differ.
         UndefinedStatisticError: When no pixel has both.

@@ -30,7 +30,6 @@ def metric_id(net: NetName, given: InputName) -> str:
     """Return the id of LPIPS with one backbone and one input range.
 
     Args:
-        net: The backbone, ``vgg`` or ``alex``.
         given: The range in which it is fed with images: ``01`` or ``pm1``, see ``INPUTS``.
     """
     return f"lpips_{net}_{given}"
@@ -82,7 +81,6 @@ class PerceptualNet(Protocol):
 
         Args:
             recorded: Recorded image in RGB, 0 to 1.
-            replayed: The image held against it, of the same size.
         """
 
 
@@ -91,6 +89,5 @@ def net_of(metric: ImageMetric, nets: Sequence[PerceptualNet]) -> PerceptualNet 
 
     Args:
         metric: Any image metric; for one that is no LPIPS the answer is None.
-        nets: The networks that were loaded.
     """
     return next((net for net in nets if metric.id.startswith(f"lpips_{net.name}_")), None)

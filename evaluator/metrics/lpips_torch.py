@@ -143,13 +143,7 @@ def read_heads(net: NetName) -> tuple[list[Float[Tensor, "_channels 1 1"]], str]
 
 
 def describe_weights(net: NetName, sha256: str, heads: str) -> str:
-    """Write where the weights of a stamp came from.
-
-    Args:
-        net: The backbone, ``vgg`` or ``alex``.
-        sha256: Hash of the backbone's file, in hexadecimal digits.
-        heads: Where the heads came from, in words.
-    """
+    """Write where the weights of a stamp came from."""
     origin = (
         "torchvision's published file"
         if sha256.startswith(PUBLISHED[net])
@@ -257,10 +251,6 @@ class LpipsNet:
     def open(cls, name: NetName, path: Path) -> "LpipsNet":
         """Load a backbone from a file, and the heads from an installed wheel.
 
-        Args:
-            name: The backbone, ``vgg`` or ``alex``.
-            path: File with the backbone's weights.
-
         Raises:
             LpipsWeightsError: When one of them is not what it should be.
             MissingDependencyError: When no installed package holds the heads.
@@ -280,7 +270,6 @@ class LpipsNet:
 
         Args:
             recorded: Recorded image in RGB, 0 to 1.
-            replayed: The image held against it, of the same size.
         """
         ids = {given: metric_id(self.name, given) for given in INPUTS}
         if min(recorded.shape[:2]) < MIN_SIDE_PX:

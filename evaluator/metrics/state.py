@@ -57,8 +57,6 @@ def turn_between_rad(
     Range: 0 rad to pi, 0 is perfect.
 
     Args:
-        R_base_first: One rotation.
-        R_base_second: The other.
         turns: What cannot be seen, in the object's frame.
     """
     return float(se3.rotation_angle_rad(R_base_first.T @ (R_base_second @ turns)).min())
@@ -79,9 +77,6 @@ def soft_box(
     Args:
         nodes_m: Its nodes now, in the base frame.
         T_base_object: Its pose now; the origin is the middle at rest.
-        rest_nodes_m: Its nodes at rest.
-        T_base_rest: Its pose then.
-        size_m: Its extents at rest.
     """
     now = se3.apply(se3.invert(T_base_object), nodes_m)
     rest = se3.apply(se3.invert(T_base_rest), rest_nodes_m)
@@ -96,7 +91,6 @@ def extents_difference_m(
     """Return the largest difference of an extent [m]. Range: 0 m and up, 0 is perfect.
 
     Args:
-        first_m: Extents of the object in one state [m].
         second_m: Its extents in the other, along the same axes [m].
     """
     return float(np.abs(first_m - second_m).max())

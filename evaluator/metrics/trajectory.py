@@ -37,7 +37,6 @@ def find_lag_s(
 
     Args:
         stamps_ns: Instants on the common clock.
-        p_recorded_m: Where the recorded motion was.
         replayed: The same motion; held at its ends where it is shorter.
 
     Raises:
@@ -107,10 +106,6 @@ def without_rigid_motion(
 ) -> Float[np.ndarray, " num_poses"]:
     """Distance [m] of the same instants after the replay was laid over the recording.
 
-    Args:
-        p_recorded_m: Recorded positions [m].
-        p_replayed_m: Replayed positions at the same instants [m].
-
     Raises:
         UndefinedStatisticError: When the replayed positions lie on a line, or are not finite.
     """
@@ -177,8 +172,6 @@ def relative_errors(
     Range: 0 and up, 0 is perfect. Undefined when: there are not more samples than ``step``.
 
     Args:
-        recorded: Poses at some instants.
-        replayed: Poses at the same instants.
         step: Samples, at least 1.
 
     Returns:
@@ -223,7 +216,6 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
     Range: 0 m and up, 0 is perfect. Undefined when: the two share no instant.
 
     Args:
-        recorded: Recorded poses over time.
         replayed: Those of the replay, in the same frame and on the same clock.
 
     Raises:
@@ -247,8 +239,6 @@ def position_errors(
     """Return the distances [m] of ``pose_errors``, to the bit, where no angle is asked for.
 
     Args:
-        stamps_ns: When the recorded positions were taken [ns].
-        p_recorded_m: Recorded positions [m].
         replayed: Poses of the replay, in the same frame and on the same clock.
 
     Raises:
@@ -280,10 +270,6 @@ def angles_rad(
 
     Range: 0 rad to pi. The arc tangent of the chords is exact at zero and for opposite signs, where
     the arc cosine of a product is noisy.
-
-    Args:
-        q_first_wxyz: Rotations of one side, at each instant.
-        q_second_wxyz: Those of the other side, at the same instants.
     """
     near = np.linalg.norm(q_first_wxyz - q_second_wxyz, axis=1)
     far = np.linalg.norm(q_first_wxyz + q_second_wxyz, axis=1)
@@ -300,7 +286,6 @@ def moving_part(run: PoseTrajectory, *, threshold_m: float = MOVING_THRESHOLD_M)
     A run that never leaves its start is returned whole.
 
     Args:
-        run: Poses of one run.
         threshold_m: Distance from the start, or the end, up to which the body counts as waiting
             [m].
     """

@@ -67,11 +67,7 @@ def conclusions(results: Results) -> list[Row]:
 
 
 def sentence(row: Row) -> str:
-    """Write what one task's numbers mean.
-
-    Args:
-        row: A row of the table of conclusions.
-    """
+    """Write what one task's numbers mean."""
     parts = [_bias_words(row)]
     yes, right = row["yes"], row["yes and right"]
     if isinstance(yes, int) and isinstance(right, int):
@@ -92,9 +88,6 @@ def answer(row: Row) -> str:
 
     Yes where the whole interval of the bias lies within ``CLOSE_PP``; not for this where it leaves
     zero out; not yet where it is too wide for either, or is not known.
-
-    Args:
-        row: A row of the table of conclusions.
     """
     low, high = _number(row["low"]), _number(row["high"])
     if low is None or high is None:

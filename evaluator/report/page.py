@@ -88,9 +88,6 @@ def page(
     """Build the page of the results.
 
     Args:
-        results: What was found.
-        figures: Drawn from it.
-        pairs: Pictures of the worst views.
         everything: Show the tables that nobody decides by and the list of all numbers, too.
     """
     shown = shown_tables(results, everything=everything)

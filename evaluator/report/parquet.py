@@ -59,12 +59,7 @@ MEASUREMENT_TYPES = {
 
 
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
-    """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null.
-
-    Args:
-        path: Where the file goes.
-        trials: One for each row.
-    """
+    """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
     names = [field.name for field in fields(TrialRecord)]
     columns = {name: [getattr(trial, name) for trial in trials] for name in names}
     columns["tags"] = [tags_text(tags) or None for tags in columns["tags"]]
@@ -75,7 +70,6 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
     """Write one row per measured number, its interval in columns.
 
     Args:
-        path: Where the file goes.
         measurements: One for each row; an undefined one has an empty value and its reason.
     """
     columns: dict[str, list[Any]] = {
@@ -91,12 +85,7 @@ def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
 
 
 def write_table(path: Path, table: Table) -> Path:
-    """Write one row per row of a table, each column with the type of what it holds.
-
-    Args:
-        path: Where the file goes.
-        table: Any table of the evaluation, unrounded.
-    """
+    """Write one row per row of a table, each column with the type of what it holds."""
     columns = {name: [row[i] for row in table.rows] for i, name in enumerate(table.columns)}
     types = {name: _type_of(values) for name, values in columns.items()}
     return _write(path, columns, types)

@@ -47,12 +47,7 @@ FIGURES: dict[str, str] = {
 
 
 def shown_tables(results: Results, *, everything: bool = False) -> list[Table]:
-    """Return the tables that a report shows, in their own order.
-
-    Args:
-        results: What was found.
-        everything: Show the tables that nobody decides by, too.
-    """
+    """Return the tables that a report shows, in their own order."""
     if everything:
         return list(results.tables)
     places = {table.id: _place(table.id) for table in results.tables if table.rows}

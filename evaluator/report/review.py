@@ -71,9 +71,6 @@ def index_run(run: RunFolder, comparison: Comparison, results: Results, began_ns
     """Write the index of an evaluation that has just been written.
 
     Args:
-        run: The run folder.
-        comparison: Everything the evaluation found.
-        results: The content of its ``results.json``.
         began_ns: When it began to read; what changed since is looked at again [ns since 1970].
     """
     _write(run, comparison, _Stored(results=results), None, began_ns)

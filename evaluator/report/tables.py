@@ -32,7 +32,6 @@ def as_text(table: Table, *, width: int | None = None) -> str:
     table is too wide, and rows become lists of their cells where it still is.
 
     Args:
-        table: Any table of the evaluation.
         width: Characters in a line; None asks the terminal.
     """
     width = width or shutil.get_terminal_size(fallback=(80, 24)).columns

@@ -69,7 +69,6 @@ def is_number(table: View, index: int) -> bool:
     """Say whether a column holds numbers, or mostly numbers with their intervals.
 
     Args:
-        table: A table as it is printed.
         index: Place of the column, from 0.
     """
     cells = [row[index] for row in table.rows if row[index] is not None]
@@ -90,8 +89,6 @@ def percent(value: float | None, low: Any = None, high: Any = None, digits: int 
     Args:
         value: The share, 0 to 1; None where it is unknown.
         low: Lower end of its interval, 0 to 1; None leaves the interval out.
-        high: Upper end.
-        digits: Digits after the point.
     """
     if not _known(value):
         return None

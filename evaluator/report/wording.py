@@ -67,7 +67,6 @@ def number(value: float, unit: str) -> str:
     """Write a value in the unit a reader thinks in.
 
     Args:
-        value: What was measured, in ``unit``.
         unit: Unit of the measurement: one of ``SHOWN_UNITS``, or another, which is left out.
     """
     _, name, _ = SHOWN_UNITS.get(unit, PLAIN)

@@ -65,12 +65,6 @@ def write_report(
 ) -> Written:
     """Write every file of one evaluation into ``folder``, replacing an earlier one.
 
-    Args:
-        comparison: What to report.
-        folder: Where to.
-        everything: Show and write the tables that nobody decides by, too.
-        latex: Write the headline tables for a paper as well.
-
     Raises:
         EvaluatorError: When the folder cannot be written.
     """

@@ -63,9 +63,7 @@ def read_contents(
     """Read what is new or has changed in a run; a broken file is left out and named.
 
     Args:
-        run: The run folder.
         cache: What was read before; a file that has not changed is taken from there.
-        output: Told how far the reading is.
         pool: Reads several files at once; one after the other without.
     """
     inventory = take_inventory(run, cache, output)
@@ -199,8 +197,6 @@ def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusi
     """Leave a file out of something, with what reading it raised.
 
     Args:
-        name: Name of the file.
-        error: What reading it raised.
         scope: What it is left out of.
     """
     words = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"

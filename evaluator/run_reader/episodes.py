@@ -165,10 +165,6 @@ class _Log:
 def read_recorded(run: RunFolder, episode: Episode) -> RecordedFacts:
     """Sum up a recorded episode; of one that is no trial, only who and what.
 
-    Args:
-        run: The run folder, for labels beside the episode.
-        episode: The recorded episode, open.
-
     Raises:
         EpisodeError: When its metadata was written by another program and cannot be read.
     """
@@ -499,12 +495,6 @@ class DerivedIndex:
         """Find the dynamic replay of a recorded episode's plan, planned or executed.
 
         The newest file wins where several settings were tried; what never counts is passed over.
-
-        Args:
-            source: Id of the recorded episode.
-            source_sha256: Its hash as it is now; a replay of another version does not count.
-            plan_id: Plan that was sent.
-            trajectory: ``planned`` or ``executed``.
         """
         made = self._replays.get((source, plan_id, trajectory), [])
         if not made:
@@ -541,11 +531,6 @@ class DerivedIndex:
 
         It never counts as the twin's answer; it is what another simulation has to be held against.
         None without such a replay, or where it could not decide.
-
-        Args:
-            source: Id of the recorded episode.
-            source_sha256: Its hash as it is now; a replay of another version does not count.
-            plan_id: Plan that was sent.
         """
         made = _current(self._replays.get((source, plan_id, "planned"), []), source_sha256)
         alone = [
@@ -557,13 +542,7 @@ class DerivedIndex:
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 
     def by_engine(self, *, source: str, source_sha256: str, plan_id: str) -> dict[str, DerivedFile]:
-        """Return the newest planned replay of a plan in each engine, those that never count too.
-
-        Args:
-            source: Id of the recorded episode.
-            source_sha256: Its hash as it is now; a replay of another version does not count.
-            plan_id: Plan that was sent.
-        """
+        """Return the newest planned replay of a plan in each engine, those that never count too."""
         found: dict[str, list[DerivedFile]] = {}
         for file in _current(self._replays.get((source, plan_id, "planned"), []), source_sha256):
             if file.derived.engine:
@@ -574,7 +553,6 @@ class DerivedIndex:
         """Find the newest localisation of a recorded episode.
 
         Args:
-            source: Id of the recorded episode.
             source_sha256: Its hash as it is now; a localisation of another version does not count.
         """
         current = _current(self._localised.get(source, []), source_sha256)

@@ -93,9 +93,7 @@ def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inven
     """Look at every file of a run, and hash those that are new or have changed.
 
     Args:
-        run: The run folder.
         cache: Hashes found before; a file whose stamp on disk is the same is not hashed again.
-        output: Told how far the hashing is.
     """
     seen = list(_look(run))
     hashes, left_out = _hash(seen, cache, output)

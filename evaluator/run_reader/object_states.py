@@ -61,12 +61,7 @@ class Sent:
 
 
 def read_sent(recorded: Episode, plan_id: str) -> Sent | None:
-    """Find a plan in the recording; None when it is not there.
-
-    Args:
-        recorded: The recorded episode.
-        plan_id: Plan that was sent.
-    """
+    """Find a plan in the recording; None when it is not there."""
     names = (schema.PLAN, schema.EVENT, schema.LOCALISATION)
     topics = [topic for name in names for topic in recorded.topics_of_type(name)]
     plan: Plan | None = None
@@ -101,7 +96,6 @@ def recorded_states(sent: Sent, localised: Episode | None) -> dict[str, ObjectSt
     """The poses localised after the execution, from the twin's localisation or the cell's own.
 
     Args:
-        sent: The plan, when it ended, and what the cell localised itself.
         localised: The twin's localisation of the episode; None takes the cell's own.
     """
     records = sent.localisations if localised is None else streams.localisations(localised)
@@ -131,7 +125,6 @@ def replayed_states(replay: Episode, sent: Sent, task: Task | None) -> dict[Key,
     """The poses at the end of each stage; after an object's last stage, when all has settled.
 
     Args:
-        replay: A replay of the plan.
         sent: The plan; its stages name the objects whose poses are wanted.
         task: Knows which objects are soft; None takes all of them as rigid.
     """

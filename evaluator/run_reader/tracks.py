@@ -78,10 +78,6 @@ def read_tracks(episode: Episode, plan_id: str) -> Tracks:
     """Read tool and joints, and when a plan was executed; other topics stay unread.
 
     A stream that is not there, or is broken, is None.
-
-    Args:
-        episode: A recorded episode, or a replay.
-        plan_id: Plan whose start and end of execution are wanted.
     """
     poses = [t for t in episode.topics_of_type(schema.POSE_STAMPED) if t.endswith(TCP_POSE)]
     joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]

@@ -34,10 +34,8 @@ def exact(
     """Return both sides as exact fractions.
 
     Args:
-        statistic: What is to be computed, as the refusal names it.
         recorded: Recorded rate of each group; a fraction stays exact.
         sim: The twin's, of the same groups in the same order.
-        at_least: Fewest groups with which the statistic is defined.
 
     Raises:
         UndefinedStatisticError: Below ``at_least`` groups.
@@ -61,8 +59,6 @@ def varying(
     """Return both sides, at least 3 groups of which not all are the same on either side.
 
     Args:
-        statistic: What is to be computed, as the refusal names it.
-        recorded: Recorded rate of each group.
         sim: The twin's, of the same groups in the same order.
 
     Raises:
@@ -294,7 +290,6 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
 
     Args:
-        recorded: Recorded rate of each group.
         sim: The twin's, of the same groups in the same order.
 
     Raises:
@@ -311,9 +306,6 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
 def within_and_between(tasks: Sequence[Sequence[tuple[Number, Number]]]) -> tuple[float, float]:
     """Return r of the distances to the means of tasks, and r of those means.
-
-    Args:
-        tasks: For each task the recorded rate and the twin's of its groups.
 
     Raises:
         UndefinedStatisticError: When one of both is undefined.
@@ -372,7 +364,6 @@ def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Inter
 
     Args:
         r: Pearson's r over the groups.
-        num_groups: Groups that r was computed over.
         level: Confidence level, 0 to 1.
 
     Raises:
@@ -420,10 +411,6 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
 
     Source: the decision audit of sim-to-real correlations (winner sets and selection regret,
     with ties as sets). Exact on counts.
-
-    Args:
-        recorded: Recorded success rate of each candidate.
-        sim: The twin's, of the same candidates.
 
     Raises:
         UndefinedStatisticError: Below two candidates: there is nothing to choose.

@@ -48,7 +48,6 @@ class Scale:
         """Go ``error`` to both sides of a value, on this scale by the delta method.
 
         Args:
-            statistic: What the value is, as the refusal names it.
             value: Where the interval has its middle, in units of the statistic.
             error: How far to go to each side where the scale is straight, in units of the
                 statistic.
@@ -66,10 +65,6 @@ class Scale:
 
     def refuse_limit(self, statistic: str, value: float) -> None:
         """Refuse a value at which the scale has no end.
-
-        Args:
-            statistic: What the value is, as the refusal names it.
-            value: The statistic that was found.
 
         Raises:
             UndefinedStatisticError: Naming it.
@@ -145,8 +140,6 @@ class GroupSample:
         """Prepare.
 
         Args:
-            recorded: Recorded rate of each group.
-            sim: The twin's.
             clusters: What each group belongs to, for example its policy; groups alone without.
         """
         self._recorded, self._sim = (floats(side) for side in exact("interval", recorded, sim))
@@ -162,7 +155,6 @@ class GroupSample:
         On Fisher's z or the logarithm where ``SCALES`` says so.
 
         Args:
-            statistic: Its name in ``weighted.STATISTICS``.
             level: Confidence level, 0 to 1.
 
         Raises:
@@ -190,7 +182,6 @@ def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Inter
     """Return Student's t interval of a mean over independent groups, or over cluster means.
 
     Args:
-        values: One number for each independent unit.
         level: Confidence level, 0 to 1.
 
     Raises:
@@ -223,10 +214,7 @@ def weighted_ends(
 
     Args:
         values: The statistic in each resample; anything where it is undefined.
-        defined: Where the statistic exists.
         weights: Probability of each resample; together 1.
-        tail: Probability that is left on each side.
-        statistic: What the values are, as the refusal names it.
 
     Raises:
         UndefinedStatisticError: When more than 5 % are undefined.
@@ -283,7 +271,6 @@ class Remeasured:
         found; on Fisher's scale for correlations and shares, on the logarithm for errors.
 
         Args:
-            statistic: Its name in ``weighted.STATISTICS``.
             level: Share of repeated measurements that are to fall inside, 0 to 1.
 
         Raises:
@@ -326,8 +313,6 @@ def remeasure_paired(
 
     Args:
         tables: For each group the trials in which both succeed, only sim, only recorded, neither.
-        rng: Draws the tables.
-        num_draws: How often each group is measured anew.
 
     Raises:
         UndefinedStatisticError: When a group has no trial.
@@ -361,8 +346,6 @@ def remeasure_counts(
     Args:
         recorded: Successes and trials of each group as recorded; 1 trial or more.
         sim: The twin's, of the same groups in the same order.
-        rng: Draws the counts.
-        num_draws: How often each group is measured anew.
     """
     found, drawn = [], []
     for side in (recorded, sim):

@@ -64,7 +64,6 @@ def brier_interval(predicted: Sequence[float], happened: Sequence[bool]) -> Inte
 
     Args:
         predicted: Stated probability of success of each trial, 0 to 1.
-        happened: Whether that trial succeeded.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -91,7 +90,6 @@ def calibration_error_interval(predicted: Sequence[float], happened: Sequence[bo
 
     Args:
         predicted: Stated probability of success of each trial, 0 to 1.
-        happened: Whether that trial succeeded.
 
     Raises:
         UndefinedStatisticError: Without trials.

@@ -69,7 +69,6 @@ def vouch(
     Only 95 % intervals were looked at; those of other levels pass unmarked.
 
     Args:
-        interval: What a method gave.
         n: What the method's coverage depends on: trials, pairs, groups, policies; of a difference
             the trials of both groups.
         key: Name in ``HOLDS_FROM``, where one method serves several statistics; its own without.
@@ -129,7 +128,6 @@ def newcombe_coverage(n_first: int, n_second: int) -> Coverage:
 
     Args:
         n_first: Trials of one group, at least 1.
-        n_second: Trials of the other.
     """
     sizes = min(n_first, MOST), min(n_second, MOST)
     (p_first, low_first, high_first), (p_second, low_second, high_second) = (

@@ -60,12 +60,7 @@ def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
 
 
 def sign_test(improved: int, worsened: int) -> tuple[float, float]:
-    """Return the two-sided exact p and mid-p of Binomial(improved + worsened, 1/2).
-
-    Args:
-        improved: Pairs that failed before and succeeded after.
-        worsened: Pairs that succeeded before and failed after.
-    """
+    """Return the two-sided exact p and mid-p of Binomial(improved + worsened, 1/2)."""
     discordant, smaller = improved + worsened, min(improved, worsened)
     # Whole numbers as long as possible: exact for any count.
     below, here = 0, 1
@@ -82,12 +77,6 @@ def tango_difference(improved: int, worsened: int, n: int, *, level: float = LEV
     All differences d that the score test with the variance under d does not reject, found by
     bisection; the restricted estimate of the worsened probability is the larger root of
     Tango's quadratic (his equations 4 and 5).
-
-    Args:
-        improved: Pairs that failed before and succeeded after.
-        worsened: Pairs that succeeded before and failed after.
-        n: All pairs, those without a change included.
-        level: Confidence level.
 
     Raises:
         UndefinedStatisticError: Without pairs.
@@ -106,11 +95,6 @@ def tango_difference(improved: int, worsened: int, n: int, *, level: float = LEV
 
 def tango_points(improved: int, worsened: int, n: int) -> tuple[float, Interval]:
     """Return the paired difference and its ``tango_difference``, both in percentage points.
-
-    Args:
-        improved: Pairs that failed before and succeeded after.
-        worsened: Pairs that succeeded before and failed after.
-        n: All pairs, those without a change included.
 
     Raises:
         UndefinedStatisticError: Without pairs.
@@ -167,10 +151,6 @@ def newcombe_difference(
     The result is a fraction: 0.2 is a gain of 20 percentage points.
 
     Args:
-        k_first: Successes of the first group.
-        n_first: Trials of the first group.
-        k_second: Successes of the second group.
-        n_second: Trials of the second group.
         level: Confidence level, 0 to 1.
     """
     first = wilson(k_first, n_first, level=level)
@@ -193,10 +173,6 @@ def guaranteed_difference(
     hold together with at least ``level``. Wide; for where Newcombe's is refused.
 
     Args:
-        k_first: Successes of the first group.
-        n_first: Trials of the first group.
-        k_second: Successes of the second group.
-        n_second: Trials of the second group.
         level: Confidence level that is kept for every pair of true rates, 0 to 1.
     """
     each = (1 + level) / 2
@@ -218,12 +194,6 @@ def boschloo(k_first: int, n_first: int, k_second: int, n_second: int) -> float:
     SciPy has it. Given the total s of successes, the probability of the region is fixed, so the
     p-value is a polynomial in the rate with s = 0..N as terms; it is searched on a grid and
     polished.
-
-    Args:
-        k_first: Successes of the first group.
-        n_first: Trials of the first group.
-        k_second: Successes of the second group.
-        n_second: Trials of the second group.
 
     Raises:
         UndefinedStatisticError: Without trials, or for groups whose tables cannot be counted out.
@@ -343,7 +313,6 @@ def mean_of_intervals(values: Sequence[float], intervals: Sequence[Interval]) ->
     differences with Wilson's ends Newcombe's method carried on (Zou and Donner 2008, equation 2).
 
     Args:
-        values: The estimates.
         intervals: Of each; together they give the method its name, which must be one.
 
     Raises:

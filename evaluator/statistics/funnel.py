@@ -28,7 +28,6 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
 
     Args:
         trials: How each stage ended, one sequence per trial; None is unknown.
-        names: The stages, in order.
 
     Raises:
         UndefinedStatisticError: Without trials or stages.

@@ -34,7 +34,6 @@ def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
 
     Args:
         predicted: Predicted probability of success of each trial, 0 to 1.
-        happened: Whether that trial succeeded.
 
     Raises:
         UndefinedStatisticError: Without trials.
@@ -68,7 +67,6 @@ def expected_calibration_error(
 
     Args:
         predicted: Predicted probability of success of each trial, 0 to 1.
-        happened: Whether that trial succeeded.
         num_bins: Bins of equal width over 0..1.
 
     Raises:
@@ -86,7 +84,6 @@ def reliability_bins(
 
     Args:
         predicted: Predicted probability of success of each trial, 0 to 1.
-        happened: Whether that trial succeeded.
         num_bins: Bins of equal width over 0..1; the last one holds 1 too.
 
     Raises:
@@ -244,7 +241,6 @@ def cost_curve(confusion: Confusion, refusal_prices: Iterable[float]) -> list[Co
     Only trials in which the answer was not obeyed can show false refusals; give only those.
 
     Args:
-        confusion: What the gate said against what happened, over trials that were executed anyway.
         refusal_prices: What refusing a good plan costs, in units of one bad execution.
 
     Raises:

@@ -110,9 +110,6 @@ def common_log_odds(groups: Sequence[GroupCounts]) -> float:
     """Return the log odds ratio of paired outcomes within groups (Mantel and Haenszel 1959).
 
     Half a pair is added to each cell in all; 0 without pairs.
-
-    Args:
-        groups: Their ``pairs`` are looked at.
     """
     tables = [group.pairs for group in groups if sum(group.pairs)]
     if not tables:
@@ -186,12 +183,7 @@ class Likelihood:
         return np.asarray(found)
 
     def window(self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread) -> Window:
-        """Return the part of the grid in which any of some normal densities lies.
-
-        Args:
-            mean: Of each.
-            spread: Of each.
-        """
+        """Return the part of the grid in which any of some normal densities lies."""
         first, second, _ = spread.entries((self.step / 2) ** 2)
         found = []
         for side, variance in enumerate((first, second)):
@@ -204,13 +196,7 @@ class Likelihood:
     def weights(
         self, mean: Float64[np.ndarray, "nodes 2"], spread: Spread, window: Window = WHOLE
     ) -> Float32[np.ndarray, "nodes cells"]:
-        """Return the normal density of a pair of log-odds on the grid, up to a factor for each.
-
-        Args:
-            mean: Of each node.
-            spread: Of each node.
-            window: Part of the grid that is asked for.
-        """
+        """Return the normal density of a pair of log-odds on the grid, up to a factor for each."""
         first, second, shared = spread.entries((self.step / 2) ** 2)
         det = first * second - shared**2
         x, y = (self.grid[part][None, :] - mean[:, [side]] for side, part in enumerate(window))
@@ -252,13 +238,7 @@ class Likelihood:
     def of_task(
         self, nodes: Nodes, members: Int64[np.ndarray, " groups"], *, with_rates: bool = False
     ) -> "OfTask":
-        """Return each centre's share in a task's probability.
-
-        Args:
-            nodes: Parameters.
-            members: Places of the task's groups.
-            with_rates: Whether mean rates are asked for.
-        """
+        """Return each centre's share in a task's probability."""
         count = len(nodes.mean)
         centres, log_shares = self.centres(nodes, members)
         each = centres.shape[1]

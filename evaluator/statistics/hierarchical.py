@@ -70,7 +70,6 @@ def estimate(
     """Sum up a posterior that is given by values and their weights.
 
     Args:
-        values: One for each node or draw.
         weights: Together 1; all alike without.
     """
     weights = np.full(len(values), 1 / len(values)) if weights is None else weights
@@ -267,11 +266,7 @@ class AgreementModel:
         """Place Sobol nodes as Student's t, and return them with the log of their weights.
 
         Args:
-            centre: Of the distribution.
-            chol: Root of its covariance.
-            num_nodes: Nodes to place.
             turn: Scrambles them otherwise in every round.
-            with_rates: Whether mean rates of the groups are returned too, for each node.
         """
         dim = len(centre)
         rng = np.random.default_rng([self._seed, turn])
@@ -460,9 +455,7 @@ def chosen_is_best(
     """Return the probability that the twin's choice has the highest recorded rate.
 
     Args:
-        draws: True rates of the groups.
         picked: Places of the candidates that the twin calls best; of several the mean counts.
-        over: Averages the groups of every candidate.
     """
     rates = over(draws.recorded)
     top = (rates == rates.max(axis=1, keepdims=True)).astype(np.float64)

@@ -31,8 +31,6 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the score interval of a proportion k/n (Wilson 1927), the default for rates.
 
     Args:
-        k: Successes.
-        n: Trials.
         level: Confidence level, 0 to 1.
 
     Raises:
@@ -53,8 +51,6 @@ def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the interval that covers at least ``level`` for every true rate (1934).
 
     Args:
-        k: Successes.
-        n: Trials.
         level: Confidence level, 0 to 1.
 
     Raises:
@@ -75,8 +71,6 @@ def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
     that change it never covers rates near 0 and 1.
 
     Args:
-        k: Successes.
-        n: Trials.
         level: Probability of the posterior that lies between the ends, 0 to 1.
 
     Raises:
@@ -118,10 +112,6 @@ def relative_gain(before: float, after: float) -> float:
 def check_count(k: int, n: int) -> None:
     """Refuse what cannot be counted.
 
-    Args:
-        k: Successes.
-        n: Trials.
-
     Raises:
         UndefinedStatisticError: Without trials.
         ImpossibleCountError: When k is not in 0..n.
@@ -147,7 +137,6 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
     binomial(n, 1/2); the largest l that keeps the level (Thompson 1936).
 
     Args:
-        values: Independent values in any order.
         level: Confidence level, 0 to 1.
 
     Raises:
@@ -173,7 +162,6 @@ def median_rank(n: int, level: float = LEVEL) -> int:
     """Return l, counted from 1; 0 where no two values keep the level.
 
     Args:
-        n: How many values there are.
         level: Confidence level, 0 to 1.
     """
     if not n:
@@ -183,12 +171,7 @@ def median_rank(n: int, level: float = LEVEL) -> int:
 
 
 def cluster_means(values: Sequence[float], clusters: Sequence[Hashable]) -> list[float]:
-    """Return the mean of each cluster, in the order in which clusters first appear.
-
-    Args:
-        values: What is averaged.
-        clusters: What each value belongs to, for example its episode.
-    """
+    """Return the mean of each cluster, in the order in which clusters first appear."""
     of_cluster: dict[Hashable, list[float]] = {}
     for value, cluster in zip(values, clusters, strict=True):
         of_cluster.setdefault(cluster, []).append(value)

@@ -27,7 +27,6 @@ def paired_chances(p_first: float, p_second: float, correlation: float) -> tuple
 
     Args:
         p_first: Rate before, 0 to 1.
-        p_second: Rate after.
         correlation: Phi of both outcomes of a start; 0 where nobody knows, which asks for more
             starts than what is usual, above 0. Cut to what the rates allow.
     """
@@ -42,12 +41,6 @@ def pairs_for_power(
 ) -> int:
     """Return the pairs with which McNemar's mid-p test shows a difference.
 
-    Args:
-        p_improved: Chance of a pair to fail before and succeed after.
-        p_worsened: Chance of a pair to succeed before and fail after.
-        power: Chance with which the difference is to be shown.
-        alpha: Chance of a false alarm that the test allows.
-
     Raises:
         UndefinedStatisticError: Without a difference, or when 4,000 pairs are not enough.
     """
@@ -60,13 +53,7 @@ def pairs_for_power(
 
 
 def paired_width(p_improved: float, p_worsened: float, num_pairs: int) -> float:
-    """Return the expected width of Tango's interval of the difference, a fraction.
-
-    Args:
-        p_improved: Chance of a pair to fail before and succeed after.
-        p_worsened: Chance of a pair to succeed before and fail after.
-        num_pairs: Pairs, those without a change included.
-    """
+    """Return the expected width of Tango's interval of the difference, a fraction."""
     differ = p_improved + p_worsened
     widths = []
     for discordant in _quantiles(num_pairs, min(differ, 1.0)):
@@ -85,11 +72,6 @@ def _tango_width(improved: int, worsened: int, num_pairs: int) -> float:
 def pairs_for_width(p_improved: float, p_worsened: float, width: float) -> int:
     """Return the pairs with which Tango's interval is expected to be no wider than ``width``.
 
-    Args:
-        p_improved: Chance of a pair to fail before and succeed after.
-        p_worsened: Chance of a pair to succeed before and fail after.
-        width: From end to end, a fraction.
-
     Raises:
         UndefinedStatisticError: When 4,000 pairs are not enough.
     """
@@ -101,7 +83,6 @@ def rate_width(rate: float, num_trials: int, *, method: str = "wilson") -> float
 
     Args:
         rate: True rate, 0 to 1.
-        num_trials: Trials.
         method: wilson, clopper-pearson or jeffreys.
     """
     ends = [RATE_INTERVALS[method](k, num_trials) for k in range(num_trials + 1)]
@@ -114,7 +95,6 @@ def trials_for_width(rate: float, width: float, *, method: str = "wilson") -> in
 
     Args:
         rate: True rate, 0 to 1.
-        width: From end to end, a fraction.
         method: wilson, clopper-pearson or jeffreys.
 
     Raises:
@@ -130,9 +110,6 @@ def power_above(
 
     Args:
         rate: True rate, 0 to 1.
-        limit: What the lower end has to exceed.
-        num_trials: Trials.
-        alpha: One minus the interval's level.
         method: wilson, clopper-pearson or jeffreys.
     """
     make = RATE_INTERVALS[method]
@@ -155,9 +132,6 @@ def trials_above(
 
     Args:
         rate: True rate, 0 to 1.
-        limit: What the lower end has to exceed.
-        power: Chance with which it is to do so.
-        alpha: One minus the interval's level.
         method: wilson, clopper-pearson or jeffreys.
 
     Raises:

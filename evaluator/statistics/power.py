@@ -31,9 +31,6 @@ def trials_needed(
 
     Args:
         p_first: True rate of the first arm, 0 to 1.
-        p_second: True rate of the second arm.
-        power: Chance with which the difference is to be found.
-        alpha: Chance of a false alarm that the test allows.
         sides: 2 for a difference in either direction, 1 where only one direction counts.
 
     Raises:
@@ -53,9 +50,6 @@ def detectable_rate(
 
     Args:
         p_first: True rate of the first arm, 0 to 1.
-        n_per_arm: Trials in each arm.
-        power: Chance with which the difference is to be found.
-        alpha: Chance of a false alarm that the two-sided test allows.
 
     Raises:
         UndefinedStatisticError: When even a rate of 1 would not show.
@@ -91,11 +85,7 @@ def power_paired(
     By counting out: sum over the number of pairs that differ, and over how many of them improved.
 
     Args:
-        p_improved: Chance of a pair to fail before and succeed after.
-        p_worsened: Chance of a pair to succeed before and fail after.
         num_pairs: Pairs, those without a change included; 1 to 4,000.
-        alpha: Chance of a false alarm that the test allows.
-        mid: Whether the test has the mid-p correction.
 
     Raises:
         UndefinedStatisticError: Beyond 4,000 pairs, or without pairs that can differ.

@@ -139,9 +139,6 @@ def post_stratified(pairs: Confusion, sim_k: int, sim_n: int, *, level: float = 
 
     Args:
         pairs: Twin's answer against the real outcome, over the robot trials.
-        sim_k: Sim successes over further starts without a robot trial.
-        sim_n: Those starts.
-        level: Credibility.
 
     Raises:
         UndefinedStatisticError: Without robot trials.
@@ -183,12 +180,6 @@ def applicability(paired_k: int, paired_n: int, alone_k: int, alone_n: int) -> f
     Compares the twin's success rate on the starts that were tried on the robot with its rate on
     the others. A small p forbids the estimates above; a large one does not prove them.
 
-    Args:
-        paired_k: Successes in the twin, on starts that were tried on the robot.
-        paired_n: Such starts.
-        alone_k: Successes in the twin, on further starts.
-        alone_n: Further starts.
-
     Raises:
         UndefinedStatisticError: Without trials in one part.
     """
@@ -209,9 +200,6 @@ def trials_saved(pairs: Confusion, sim_k: int, sim_n: int, *, level: float = LEV
 
     Args:
         pairs: Twin's answer against the real outcome, over the robot trials.
-        sim_k: Sim successes over further starts without a robot trial.
-        sim_n: Those starts.
-        level: Credibility.
 
     Raises:
         UndefinedStatisticError: Without robot trials, or when it would be more than 10,000.

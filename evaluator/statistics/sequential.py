@@ -37,7 +37,6 @@ def capital_log(k: int, n: int, rate: float) -> float:
     Robbins 1970; Waudby-Smith and Ramdas 2024, section 4).
 
     Args:
-        k: Successes.
         n: Trials; without any the bettor still owns 1, so the log is 0.
         rate: The rate that is bet against, 0 to 1; one that excludes what has happened gives
             infinity.
@@ -62,8 +61,6 @@ def betting_interval(k: int, n: int, *, level: float = LEVEL) -> Interval:
     """Return the rates a bettor has not yet refuted; valid however often one looked before.
 
     Args:
-        k: Successes until now.
-        n: Trials until now.
         level: Confidence level that is kept over all looks together, 0 to 1.
 
     Raises:
@@ -183,7 +180,6 @@ def stop_or_continue(sequence: ConfidenceSequence, goal: float) -> Advice:
     """Say whether the rate is above or below a goal, or how many more trials it may take.
 
     Args:
-        sequence: What is known after the trials until now.
         goal: The success rate that is asked about, 0 to 1.
 
     Raises:
@@ -213,7 +209,6 @@ def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
 
     Args:
         decided: Says whether so many decide it; true for all larger numbers once it is true.
-        at_least: Where the answer starts.
     """
     high = max(1, at_least)
     while not decided(high):
@@ -236,9 +231,6 @@ def pairs_capital_log(improved: int, worsened: int, n: int, difference: float) -
     alpha (Ville 1939). The chances that fit best under d solve a quadratic.
 
     Args:
-        improved: Pairs that failed before and succeeded after.
-        worsened: Pairs that succeeded before and failed after.
-        n: All pairs, those without a change included.
         difference: P(improved) - P(worsened) that is bet against, -1 to 1.
 
     Raises:

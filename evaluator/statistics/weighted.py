@@ -24,14 +24,7 @@ Statistic = Callable[[Counts, Side, Side], Values]
 
 
 def values_of(statistic: str, counts: Counts, recorded: Side, sim: Side) -> Values:
-    """Compute one statistic of every set.
-
-    Args:
-        statistic: A name in ``STATISTICS``.
-        counts: How often each group is in each set.
-        recorded: Recorded rates.
-        sim: The twin's.
-    """
+    """Compute one statistic of every set."""
     compute = STATISTICS[statistic]
     if recorded.ndim == 1:
         return compute(counts, recorded, sim)
@@ -53,7 +46,6 @@ def ratio(
     Args:
         shared: What both sides have in common in each set: their covariance, or their concordance.
         first: The same of the first side with itself: its variance, or its untied pairs.
-        second: The same of the second side with itself.
     """
     defined = (first > EPSILON) & (second > EPSILON)
     scale = np.sqrt(np.where(defined, first * second, 1.0))

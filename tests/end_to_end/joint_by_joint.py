@@ -36,9 +36,7 @@ def move_by_hand(cell: StandinCell, poses: Mapping[str, np.ndarray], beside_m: f
     """Carry the cube into the box, posture by posture, as a person at a pendant would.
 
     Args:
-        cell: At home, its gripper open.
         poses: Where cube and box stand, ``T_base_object``.
-        beside_m: Grasp so far from the cube.
     """
     cube, box = (poses[name] for name in ("cube", "box"))
     yaw = float(np.arctan2(cube[1, 0], cube[0, 0]))

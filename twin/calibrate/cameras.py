@@ -99,11 +99,6 @@ def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int)
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
 
-    Args:
-        episodes: Whose joints and depth images are used.
-        camera_id: The camera, by its name in the topics.
-        seed: Of the alignment's random draws.
-
     Raises:
         RobotNotAlignedError: The images do not determine it, or none shows a robot that stands
             still.
@@ -205,9 +200,7 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     still, from the robot in its depth images.
 
     Args:
-        run: Whose episodes are read, and in whose scene folder the calibration goes.
         config: Which camera (empty: all), which pose pairs and mounting.
-        output: Told why a camera was not found.
 
     Raises:
         NothingToCalibrateError: No camera could be found for want of data; says what is missing.
@@ -296,9 +289,7 @@ def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -
     """Say what pose pairs gave.
 
     Args:
-        found: The solution, and how the camera is mounted.
         pairs: What it was found from; its source is recorded.
-        link: Robot link that carries the camera, or the target of a fixed camera.
         base: The robot's base frame.
     """
     solution = found.solution

@@ -32,7 +32,6 @@ def motions(
 
     Args:
         Ts_a: Poses A of the pairs; see the module.
-        Ts_b: Poses B of the same pairs.
     """
     first, second = np.triu_indices(len(Ts_a), 1)
     if len(first) > MAX_MOTIONS:
@@ -52,10 +51,6 @@ def solve_hand_eye(
     the rotation that lays the rotation vectors of Q over those of P, then linear least squares
     for the translation. The rotation is found by singular values, which unlike their square root
     of a matrix also refuses mirror images.
-
-    Args:
-        Ts_a: Poses A of the pairs, from the robot; see the module.
-        Ts_b: Poses B of the same pairs, from the camera.
     """
     P, Q = motions(Ts_a, Ts_b)
     alpha, beta = se3.vector_from_rotation(P[:, :3, :3]), se3.vector_from_rotation(Q[:, :3, :3])
@@ -141,11 +136,6 @@ def solve(
     misfits by Gauss-Newton. Intervals come from resampled pairs (Efron, 1979), each solved by one
     more step.
 
-    Args:
-        Ts_a: Poses from the robot.
-        Ts_b: Poses from the camera; see the module.
-        seed: Of the resampling.
-
     Raises:
         UndeterminedCameraError: Too few pairs, or rotations about one axis only.
     """
@@ -206,8 +196,6 @@ def misfits(
     """Translation [m] and rotation vector [rad] of E = (Z B)^-1 A X for each pair.
 
     Args:
-        Ts_a: Poses A of the pairs, from the robot; see the module.
-        Ts_b: Poses B of the same pairs, from the camera.
         X: The transform behind A, such as ``T_hand_camera``.
         Z: The transform before B, such as ``T_base_target``.
     """
@@ -347,10 +335,8 @@ def find_camera(pairs: PosePairs, mount: Mount, *, seed: int = 0) -> TargetCamer
     camera X is ``T_effector_target`` and Z is ``T_base_camera``.
 
     Args:
-        pairs: Poses of hand and target at the same instants.
         mount: Where the camera is said to be: ``hand``, ``fixed``, or ``auto`` to take what fits
             clearly better.
-        seed: Of the resampling that gives the intervals.
 
     Raises:
         UndeterminedCameraError: Too few pairs, rotations about one axis only, pairs that fit

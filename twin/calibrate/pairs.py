@@ -101,7 +101,6 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
 
     Args:
         episodes: Those without poses of a target from this camera are passed over.
-        camera_id: The camera, by its name in the topics.
         link: Robot link whose pose in the base is the other half of a pair.
 
     Raises:

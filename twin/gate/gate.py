@@ -52,13 +52,7 @@ SIGMAS = 4.0
 
 
 def who_moved(before: Mapping[str, Any], after: Mapping[str, Any], task: Task) -> list[str]:
-    """Name the objects that lie elsewhere than before, with how far.
-
-    Args:
-        before: Objects as localised for the verdict.
-        after: As localised just now.
-        task: Knows which turns look the same.
-    """
+    """Name the objects that lie elsewhere than before, with how far."""
     told = []
     for name, old in before.items():
         new = after[name]
@@ -78,8 +72,6 @@ def of_another_scene(plan: Plan, found: Mapping[str, Any], task: Task) -> str:
 
     Args:
         plan: Its ``entities`` are where its planner expected the objects to be.
-        found: Where they were localised.
-        task: Knows which look alike.
     """
     for name, entity in plan.entities.items():
         p_m = entity.get("p_m") if isinstance(entity, Mapping) else None

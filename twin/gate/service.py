@@ -51,11 +51,7 @@ def make_gate(
     """Put the real localisation and replay behind the gate.
 
     Args:
-        tasks: What plans are judged by.
-        config: Limits and deadline.
-        perception: What the cell shows now.
         now_ns: The clock on which messages arrive; says how long the cell has been silent.
-        twin: The process that localises and replays.
     """
     return Gate(
         tasks=tasks,
@@ -74,13 +70,6 @@ def serve_gate(
 
     A published verdict carries the time of the newest thing seen, on the cell's own clock, so
     that it lies before the execution it allows.
-
-    Args:
-        session: An open ``bridge.wire.session``.
-        gate: Judges one plan.
-        perception: Says what time it is in the cell.
-        config: Cell, and how many plans may wait.
-        output: Told each verdict in a line.
     """
     publisher = session.publisher(cell_topic(config.cell, VERDICT), schema.VERDICT)
     publishing = threading.Lock()
@@ -109,13 +98,6 @@ def serve_localisation(
     """Answer on ``<cell>/gate/localise`` where the objects are, and publish each record.
 
     A planner that plans from these records shares the gate's perception, with its errors.
-
-    Args:
-        session: An open ``bridge.wire.session``.
-        gate: Looks for the objects.
-        perception: Says what time it is in the cell.
-        config: Names the cell.
-        output: Told each answer in a line.
     """
     publisher = session.publisher(cell_topic(config.cell, LOCALISATION), schema.LOCALISATION)
 
@@ -154,8 +136,6 @@ def watch_cell(
     """Hand the cell's images, joints, transforms, description and events to ``take``.
 
     Args:
-        session: An open ``bridge.wire.session``.
-        cell: Its name, the first part of its topics.
         take: Called with topic, payload, time of arrival [ns] and type name, from the session's
             threads.
     """
@@ -177,7 +157,6 @@ def claim_gate(session: Any, cell: str) -> None:
 
     Args:
         session: An open ``bridge.wire.session``; the claim lasts as long as it.
-        cell: Name of the cell.
 
     Raises:
         GateError: When there is one already.
@@ -192,13 +171,7 @@ def claim_gate(session: Any, cell: str) -> None:
 
 
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
-    """Judge plans until SIGINT or SIGTERM; both end with exit code 0.
-
-    Args:
-        path: The run whose scene and calibration are used.
-        config: Cell, task, connection and limits.
-        output: Told when the gate is ready, and each verdict.
-    """
+    """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
     from twin.scene.localise.live import LiveView  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415

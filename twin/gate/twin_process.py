@@ -240,7 +240,6 @@ class TwinProcess:
 
         Args:
             frames: What the cameras saw at rest, as ``LiveView.frames`` gives them.
-            task: Whose objects are looked for.
             ends_s: When to be done, on the monotonic clock.
 
         Raises:
@@ -262,11 +261,7 @@ class TwinProcess:
         """Replay a plan from where its objects were found and the arm stands.
 
         Args:
-            plan: What is to be judged.
-            task: What it is judged by.
             found: The task's objects as localised, by name.
-            urdf: Description of the robot.
-            start_rad: Joints as the robot reports them.
             ends_s: When to be done, on the monotonic clock.
 
         Raises:

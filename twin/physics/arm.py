@@ -31,10 +31,8 @@ def write_description(urdf: str, mesh_hulls_m: Hulls, folder: Path) -> Path:
     """Write ``robot.urdf`` and its hull meshes into a folder.
 
     Args:
-        urdf: Description without package URIs.
         mesh_hulls_m: Per link, the hulls that stand for its mesh collision elements, in the
             link's frame [m].
-        folder: Where the files go.
 
     Returns:
         The path of the URDF file.
@@ -137,12 +135,6 @@ class Arm:
 
     def __init__(self, client: int, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
         """Load it.
-
-        Args:
-            client: PyBullet's number of the world.
-            urdf: Description without package URIs.
-            mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
-            config: Frictions and forces.
 
         Raises:
             PhysicsError: When PyBullet does not load the description or joints are missing.
@@ -306,7 +298,6 @@ class Arm:
 
         Args:
             joints_rad: Where the arm is to be, from base to hand.
-            velocity_rad_s: How fast its joints are to move there.
             width_m: Distance between the finger pads; beyond what the gripper can, the nearest it
                 can.
         """
@@ -378,9 +369,6 @@ class Arm:
 
         The line of a geared motor: the speed falls with the load and is zero at the grip force.
         Why not a force: docs/decisions/0017-contact-physics.md.
-
-        Args:
-            reaction_N: Mean over both fingers of what pushes them apart.
         """
         top, here = FINGER_SPEED_M_S, self.width_m()
         speed = top * (1.0 - reaction_N / self._config.grip_force_N)
@@ -437,7 +425,6 @@ class Arm:
         Args:
             link: What it acts on; None: what carries the fingers.
             force_N: The force, base frame.
-            point_m: Where it acts.
         """
         pybullet.applyExternalForce(
             self.id,
@@ -476,11 +463,7 @@ class Press:
     """Watches the fingers of an arm."""
 
     def __init__(self, arm: Arm) -> None:
-        """Start with fingers at their usual speed.
-
-        Args:
-            arm: Whose fingers.
-        """
+        """Start with fingers at their usual speed."""
         self._arm = arm
         self._steps = 0
         self._found = 0

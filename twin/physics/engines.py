@@ -105,12 +105,6 @@ def open_world(
 ) -> PhysicsWorld:
     """Make an empty world with the robot in it.
 
-    Args:
-        engine: What moves it.
-        urdf: Description without package URIs.
-        mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
-        config: Rates, frictions and forces.
-
     Raises:
         MissingDependencyError: When the engine is not installed.
         PhysicsError: When it does not load the description, or joints are missing.

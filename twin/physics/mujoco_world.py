@@ -84,11 +84,6 @@ class MujocoArm:
     def __init__(self, spec: Any, record: Robot, config: PhysicsConfig) -> None:
         """Give the joints motors.
 
-        Args:
-            spec: Of the world, with the robot in it.
-            record: Which joints and links are whose.
-            config: Frictions and forces.
-
         Raises:
             PhysicsError: When joints or links are missing.
         """
@@ -252,11 +247,6 @@ class MujocoWorld:
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
         """Load the robot with its base at the origin.
-
-        Args:
-            urdf: Description without package URIs.
-            mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
-            config: Rates, frictions and forces.
 
         Raises:
             PhysicsError: When MuJoCo does not load the description or joints are missing.

@@ -38,10 +38,6 @@ class PushWorld:
         Args:
             config: Rates and frictions; the fingers' is the hand's.
             hulls_m: Convex pieces of the hand, in its frame [m].
-            size_m: Edges of the box [m].
-            mass_kg: Of the box.
-            T_world_box: Where it starts, at rest.
-            table_height_m: Of the table's top [m].
         """
         self._config = config
         self._client = open_client(config)
@@ -110,9 +106,6 @@ class PushWorld:
         """Advance by one step from a pose of the hand; returns the box: position [m], wxyz.
 
         Args:
-            p_hand_m: Where the hand is at the beginning of the step.
-            q_hand_wxyz: How it is turned then.
-            velocity_m_s: Of its origin during the step.
             turning_rad_s: Its angular velocity, world axes.
         """
         w, x, y, z = q_hand_wxyz.tolist()

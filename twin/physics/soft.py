@@ -30,7 +30,6 @@ def rigid_fit(
     Args:
         rest_m: Where the nodes are at rest, in the body's own frame.
         nodes_m: Where they are now, in the frame the pose is wanted in.
-        mass_fraction: What each node weighs.
     """
     if not np.isfinite(nodes_m).all():
         T = np.eye(4)
@@ -79,8 +78,6 @@ def bind_points(
 
     Args:
         points_m: Points at rest, in the frame of the nodes.
-        nodes_m: The lattice at rest.
-        tets: Node indices of each tetrahedron.
     """
     corner = nodes_m[tets[:, 0]]
     to_weights = np.linalg.inv(np.swapaxes(nodes_m[tets[:, 1:]] - corner[:, None], 1, 2))
@@ -119,11 +116,6 @@ def coarse_lattice(
     cell_m: float,
 ) -> tuple[Lattice, float] | None:
     """Fill the solid that a lattice fills with larger cells.
-
-    Args:
-        nodes_m: Nodes of the fine lattice at rest [m].
-        tets: Its tetrahedra.
-        cell_m: What the distance of neighbouring nodes should be [m].
 
     Returns:
         The coarse lattice in one piece and its spacing [m]; None where the fine one is the
@@ -303,7 +295,6 @@ class SoftModel:
         Args:
             arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``
                 and ``spacing_m`` (``twin.scene.shape.lattice``).
-            model: Mass and material.
 
         Raises:
             SoftBodyError: Arrays are missing or unusable, or the object is rigid.
@@ -389,7 +380,6 @@ def health_of(model: SoftModel, nodes_m: Float[np.ndarray, "num_nodes 3"]) -> So
     """Compare a body's nodes with its rest state.
 
     Args:
-        model: The body at rest.
         nodes_m: Where its nodes are now, in any frame.
     """
     if not np.isfinite(nodes_m).all():

@@ -42,12 +42,7 @@ def hull_piece(points_m: Float[np.ndarray, "num_points 3"]) -> ConvexPiece:
 
 
 def box_piece(size_m: Float[np.ndarray, "3"], T_owner_box: Float[np.ndarray, "4 4"]) -> ConvexPiece:
-    """Return a box of these extents, in its owner's frame.
-
-    Args:
-        size_m: Whole lengths of the edges.
-        T_owner_box: Pose of the box, its centre the origin, in the owner's frame.
-    """
+    """Return a box of these extents, in its owner's frame."""
     normals = np.concatenate([np.eye(3), -np.eye(3)]) @ T_owner_box[:3, :3].T
     offsets = np.tile(np.asarray(size_m) / 2, 2) + normals @ T_owner_box[:3, 3]
     return ConvexPiece(
@@ -125,11 +120,8 @@ def add_body(
     """Hand a body at rest to a solver.
 
     Args:
-        solver: Takes it.
         model: Shape and mass.
         T_base_object: Where its object frame is.
-        young_pa: Young's modulus.
-        friction: Its own coefficient.
 
     Returns:
         The solver's number for it, and the masses of its nodes [kg].

@@ -31,13 +31,7 @@ class Reaction:
     """Carries what the soft bodies did in one step into the next step of the rigid world."""
 
     def __init__(self, arm: Arm, link_of: Mapping[int, str], period_s: float) -> None:
-        """Remember who is who.
-
-        Args:
-            arm: The robot.
-            link_of: Links by the numbers of their pieces.
-            period_s: Length of a step.
-        """
+        """Remember who is who."""
         self._arm, self._link_of, self._period_s = arm, link_of, period_s
         self._yields = False
 
@@ -52,7 +46,6 @@ class Reaction:
         Args:
             pushed: Pieces that anything pushed.
             pushes: Momentum and its moment about the frame, per piece, of the last step.
-            poses: Where the links are.
         """
         opening = 0.0
         wrenches: dict[str | None, list[float]] = {}
@@ -139,11 +132,7 @@ class SoftWorld:
         """Remember what soft bodies will meet.
 
         Args:
-            client: PyBullet's number of the world.
-            arm: The robot.
-            urdf: Its description.
             mesh_hulls_m: Per link, hulls that stand for its collision meshes [m].
-            config: Rates and frictions.
         """
         self.names: dict[str, _SoftBody] = {}
         self._client, self._arm, self._config = client, arm, config
@@ -165,12 +154,7 @@ class SoftWorld:
     def add_static(
         self, size_m: Float[np.ndarray, "3"], T_base_box: Float[np.ndarray, "4 4"]
     ) -> None:
-        """Add a box that never moves.
-
-        Args:
-            size_m: Whole lengths of the edges.
-            T_base_box: Pose of the box's centre.
-        """
+        """Add a box that never moves."""
         self._add(
             _Placed(
                 piece=box_piece(size_m, np.eye(4)),
@@ -187,15 +171,7 @@ class SoftWorld:
         T_base_box: Float[np.ndarray, "4 4"],
         unseen: Unseen = EVEN,
     ) -> None:
-        """Add a box that PyBullet moves; soft bodies meet it with full edges.
-
-        Args:
-            body: PyBullet's number of it.
-            size_m: Whole lengths of the edges.
-            mass_kg: Of the box.
-            T_base_box: Pose of the box's middle.
-            unseen: Where its weight lies.
-        """
+        """Add a box that PyBullet moves; soft bodies meet it with full edges."""
         T_base_body, T_body_box = T_base_box.copy(), np.eye(4)
         T_base_body[:3, 3] = se3.apply(T_base_box, np.array(unseen.centre_of_mass_m))
         T_body_box[:3, 3] = -np.array(unseen.centre_of_mass_m)
@@ -274,8 +250,6 @@ class SoftWorld:
         """Add a soft body at rest.
 
         Args:
-            object_id: What the task calls it.
-            model: Lattice, skin and material.
             T_base_object: Where its own frame begins; the lattice is laid there undeformed.
         """
         rest = model.nodes_m.astype(np.float64)

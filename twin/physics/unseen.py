@@ -47,7 +47,6 @@ def box_inertia(size_m: Float[np.ndarray, "3"], mass_kg: float) -> tuple[float, 
     """Principal moments of inertia of an even box about its middle [kg m^2].
 
     Args:
-        size_m: Whole lengths of the edges.
         mass_kg: Spread evenly over the box.
     """
     x, y, z = (np.asarray(size_m) ** 2).tolist()

@@ -41,11 +41,7 @@ class FrictionAnchors:
     """The anchors of the rigid bodies that move freely in one PyBullet client."""
 
     def __init__(self, client: int) -> None:
-        """Start without bodies.
-
-        Args:
-            client: PyBullet's number of the world.
-        """
+        """Start without bodies."""
         self._client = client
         self._held: dict[int, tuple[float, ...]] = {}
         self._steps = 0
@@ -90,11 +86,6 @@ class World:
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
         """Load the robot with its base at the origin.
 
-        Args:
-            urdf: Description without package URIs.
-            mesh_hulls_m: Per link, hulls that replace its collision meshes [m].
-            config: Rates, frictions and forces.
-
         Raises:
             PhysicsError: When PyBullet does not load the description or joints are missing.
         """
@@ -117,7 +108,6 @@ class World:
 
         Args:
             boxes: Centre and whole edge lengths of each [m], in the owner's frame.
-            T_base_owner: Where the owner is.
         """
         ids = []
         for centre, extents in boxes:
@@ -135,7 +125,6 @@ class World:
         Args:
             height_m: Of the top, over the robot's base.
             size_m: Length of the slab's sides; the robot stands at their middle.
-            thickness_m: How far the slab reaches down.
         """
         centre = np.array([0.0, 0.0, height_m - thickness_m / 2])
         extents = np.array([size_m, size_m, thickness_m])
@@ -161,11 +150,7 @@ class World:
         """Add a solid box that moves.
 
         Args:
-            object_id: What the task calls it.
-            size_m: Whole lengths of the edges.
             mass_kg: Spread evenly over the box, but for where its centre is said to be.
-            T_base_object: Pose of the box's middle.
-            unseen: Its edges, and where its weight lies.
         """
         if unseen == EVEN:
             body = self._box(size_m, mass_kg, T_base_object)

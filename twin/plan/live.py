@@ -66,10 +66,7 @@ class LivePlanner:
         """Prepare.
 
         Args:
-            run: Its scene, calibration and task files are used.
-            config: How many candidates are made.
             urdf: The robot's description, None before any.
-            proposers: How a plan is made, by the policy it is called.
             words: Name the model that adds to plans of policy ``model``; None, or without a model:
                 that policy has none.
         """
@@ -207,7 +204,6 @@ def claim_planner(session: Any, cell: str) -> None:
 
     Args:
         session: An open ``bridge.wire.session``; the claim lasts as long as it.
-        cell: Name of the cell.
 
     Raises:
         PlannerError: When there is one already.
@@ -222,14 +218,7 @@ def claim_planner(session: Any, cell: str) -> None:
 
 
 def serve_planner(session: Any, planner: LivePlanner, cell: str, output: Output) -> None:
-    """Answer on ``<cell>/plan``.
-
-    Args:
-        session: An open ``bridge.wire.session``.
-        planner: Makes the plans.
-        cell: Name of the cell.
-        output: Told each answer in a line.
-    """
+    """Answer on ``<cell>/plan``."""
 
     def answer(payload: bytes) -> bytes:
         found = planner.answer(payload)
@@ -255,9 +244,6 @@ def run_planner(
     """Answer a cell's requests until SIGINT or SIGTERM; both end with exit code 0.
 
     Args:
-        path: The run whose scene, calibration and task files are used.
-        config: Cell, connection and how many candidates are made.
-        output: Told when the planner is ready, and each answer.
         words: May name the model that is asked for policy ``model``.
 
     Raises:

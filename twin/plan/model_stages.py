@@ -79,12 +79,7 @@ class Asked:
         return f"stages: answered by {self.answered_by}; asked {self.model} at {self.address}"
 
     def left_out(self, problem: Problem, why: Exception) -> "Asked":
-        """The same without what the model added.
-
-        Args:
-            problem: Whose task is as it was.
-            why: What no plan keeps.
-        """
+        """The same without what the model added."""
         remark = f"no plan keeps what the model added, so its constraints were left out: {why}"
         who = BY_GRAMMAR if self.understood is None else self.answered_by
         return replace(self, problem=problem, answered_by=who, remarks=(*self.remarks, remark))
@@ -106,8 +101,6 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
         run: Its scene says what the objects look like; replies that were taken are kept in it.
         episode: Shows the start; None: no image of it is there, and what came of asking is kept
             even where every reply was refused.
-        problem: Whose task is planned.
-        config: Names the model and says whether an image may leave.
     """
     task = problem.scene.task
     vocabulary = Vocabulary.of_task(
@@ -128,12 +121,7 @@ def ask_for_goals(
     """Ask the model of the settings what an instruction wants; ``understood`` is the task of it.
 
     Args:
-        run: See ``ask_about``.
-        episode: Shows the start.
-        words: The instruction.
-        base: The task file of the objects that the episode shows.
         problem: The start; of its task only the objects count.
-        config: Names the model and says whether an image may leave.
     """
     vocabulary = Vocabulary.of_task(
         problem.scene.task,
@@ -170,12 +158,6 @@ def goals_in(
     stages: Sequence[Stage], words: str, vocabulary: Things, explanation: str
 ) -> Grounding:
     """The goals in a model's stages: where each object ends that is let go, in that order.
-
-    Args:
-        stages: Judged by ``twin.plan.constrain.reply``.
-        words: The instruction.
-        vocabulary: Says what can move and what is open.
-        explanation: Who says so.
 
     Raises:
         GroundingError: When it is not said where an object ends, or it cannot end there.
@@ -248,10 +230,6 @@ def _asked(
 def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
     """Whom the settings ask.
 
-    Args:
-        run: Where replies are kept.
-        config: Names the model.
-
     Raises:
         UsageError: The address is none.
     """
@@ -267,13 +245,7 @@ def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
 def marked_view(
     run: RunFolder, episode: str, problem: Problem
 ) -> tuple[UInt8[np.ndarray, "height width 3"] | None, dict[str, int]]:
-    """The recorded image that shows most objects, with a number on each; None where there is none.
-
-    Args:
-        run: With the episode.
-        episode: Its name.
-        problem: Says where the objects are.
-    """
+    """The recorded image that shows most objects, a number on each; None where there is none."""
     path = next((path for path in run.episodes() if path.stem == episode), None)
     if path is None:
         return None, {}
@@ -312,10 +284,6 @@ def stages_in(task: Task) -> tuple[Stage, ...]:
 
 def with_added(problem: Problem, stages: tuple[Stage, ...]) -> tuple[Problem, tuple[str, ...]]:
     """Add the constraints of a model's stages to those of the task's.
-
-    Args:
-        problem: Its task keeps its objects, contacts and success predicates.
-        stages: Judged by ``twin.plan.constrain.reply``.
 
     Returns:
         The problem with them, and what was left out.

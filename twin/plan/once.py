@@ -110,9 +110,6 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
     """Localise a task's objects at the start of the newest episode that shows them all.
 
     Args:
-        run: With the episodes.
-        task: Whose objects are looked for.
-        config: May name the episode.
         robot: Robot file that takes the place of the recorded description; none: that one.
 
     Raises:
@@ -206,9 +203,6 @@ def cameras_at(
     the arm's posture, and one that stands still in a recording in which the arm does, too.
 
     Args:
-        run: Its calibration goes before what was recorded.
-        episode: With the cameras.
-        stamp_ns: The instant.
         T_base_tcp: Of the tool then; None: not known.
     """
     try:
@@ -272,12 +266,6 @@ class Begun:
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
     """Find out what is to be done and from where; a model is asked first where one is given.
-
-    Args:
-        run: With the episodes.
-        words: The instruction, or the name or file of a task.
-        config: May name the episode and the model.
-        robot: See ``start_of``.
 
     Raises:
         GroundingError: When neither a model nor the grammar understands the instruction.
@@ -377,9 +365,6 @@ def plan_once(
 
     Args:
         run: The accepted plan goes into its ``plans/``, those refused before beside it.
-        begun: The task, and from where.
-        judge: The twin, as a gate asks it.
-        config: Policy, rounds and seed.
 
     Raises:
         NoPlanError: There is no candidate at all, not even without what a model added.

@@ -46,9 +46,7 @@ def problem_of(
 
     Args:
         run: Its scene and calibration are used; None: there is none, the task file says all.
-        task: Whose objects they are.
         localised: Where they were found; those that were not keep the reason.
-        urdf: The robot's description.
         start_rad: Where the arm stands, base to hand; None: not known.
 
     Raises:
@@ -87,11 +85,7 @@ MOST_KEYPOINTS = 256
 
 
 def keypoints_of(shapes: Mapping[str, Shape]) -> tuple[Keypoint, ...]:
-    """Number the keypoints of all objects, in the order of the objects and of their names.
-
-    Args:
-        shapes: Of the objects of a task, in its order.
-    """
+    """Number the keypoints of all objects, in the order of the objects and of their names."""
     found = [
         Keypoint(p_m=shape.keypoints_m[name], object_id=key, name=name)
         for key, shape in shapes.items()
@@ -105,7 +99,6 @@ def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
 
     Args:
         scene_dir: The rebuilt scene; None, or no such folder: there is none.
-        task: Its nominal shapes stand in for what the scene lacks.
     """
     if scene_dir is None or not scene_dir.is_dir():
         return {

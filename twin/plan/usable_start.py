@@ -36,9 +36,6 @@ _LIMIT_RAD = 0.01
 def refuse_unusable(problem: Problem) -> None:
     """Refuse poses and postures that nothing can be planned from.
 
-    Args:
-        problem: Objects, covariances and arm as they were found.
-
     Raises:
         NoPlanError: What was found, where, and what to do.
     """
@@ -72,8 +69,6 @@ def start_posture(
     """Where the arm was recorded to stand at the start [rad], or why nobody knows.
 
     Args:
-        episode: Shows the start.
-        stamp_ns: When that was [ns].
         joints: The arm's, base to hand.
 
     Returns:
@@ -104,7 +99,6 @@ def refuse_other_robot(run: RunFolder, robot: Robot) -> None:
 
     Args:
         run: Its ``scene.json`` names the episodes that it was made of.
-        robot: Who recorded the start.
 
     Raises:
         NoPlanError: They differ.

@@ -16,11 +16,6 @@ def in_each_engine(
 ) -> list[Verdict]:
     """Judge in each engine that is asked for; each verdict says where another one differs.
 
-    Args:
-        task: What is replayed.
-        config: Which engines.
-        judge: Replays with settings that name one engine.
-
     Returns:
         Verdicts in the order of ``config.engines()``: the first decides.
 

@@ -114,10 +114,7 @@ def audit(
     """Say whether python-fcl finds nowhere less distance than a replay's clearance.
 
     Args:
-        result: States and clearance of the replay.
         plan: Its stages, with no more contacts than the task allows (``limited_to_task``).
-        scene: Where it happened.
-        config: The clearance that was asked for.
         max_queries: Pairs asked at most; a replay that needs more is not decided.
 
     Returns:

@@ -32,14 +32,7 @@ def start_failures(
     measured_rad: Float[np.ndarray, " num_joints"],
     robot: RobotModel,
 ) -> list[Failure]:
-    """Say how far a plan's first waypoint is from where the robot stands.
-
-    Args:
-        plan: Its first pose counts for the tool.
-        path: Its first posture counts for the joints.
-        measured_rad: What the encoders say.
-        robot: Whose they are.
-    """
+    """Say how far a plan's first waypoint is from where the robot stands."""
     off_rad = np.abs(path.joints_rad[0] - measured_rad)
     joint = int(np.argmax(off_rad))
     place_m = robot.T_base_tcp(measured_rad)[:3, 3]
@@ -222,13 +215,7 @@ def _accelerations(
 
 
 def simulated_limit_failures(path: JointPath, states: States, robot: RobotModel) -> list[Failure]:
-    """Find where the arm would stop by itself: pressed too hard, or too far from its command.
-
-    Args:
-        path: What was commanded.
-        states: What physics made of it.
-        robot: Whose limits count.
-    """
+    """Find where the arm would stop by itself: pressed too hard, or too far from its command."""
     failures, record = [], robot.record
     limit_rad, limit_N = record.tracking_error_rad, record.contact_force_N
     if limit_rad is not None:

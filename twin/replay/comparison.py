@@ -30,12 +30,7 @@ Findings = dict[tuple[str, str], bool | None]
 
 
 def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[str, Any], ...]:
-    """What the success predicates, and the one on contacts, say of the recording itself.
-
-    Args:
-        recording: What was measured during one execution.
-        config: Limits that contacts are inferred with.
-    """
+    """What the success predicates, and the one on contacts, say of the recording itself."""
     robot = load_robot(recording.scene.urdf)
     rollout = rollout_of_recording(recording, robot, hulls_of(robot), config)
     task = recording.scene.task
@@ -49,10 +44,6 @@ def compare(
 
     Args:
         job: The executed replay's; names the planned replay's file.
-        engine: What both were replayed in.
-        result: The executed replay.
-        recording: What was measured.
-        end_ns: When the execution ended, from its start.
     """
     robot = load_robot(recording.scene.urdf)
     executed = trace_of_result(result, "executed", end_ns)

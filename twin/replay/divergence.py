@@ -50,7 +50,6 @@ def lag_s(first: Trace, second: Trace) -> float:
     """By how much the second tool comes later than the first: least mean distance [s].
 
     Args:
-        first: The trace that is taken for punctual.
         second: The one that may come later; negative answers mean that it comes earlier.
     """
     end = min(first.end_ns, second.end_ns)
@@ -74,7 +73,6 @@ def without_lag(trace: Trace, lag: float) -> Trace:
     """The same trace with a lag [s] taken out.
 
     Args:
-        trace: The one that comes late.
         lag: By how much [s]; negative where it comes early.
     """
     shift = round(lag * 1e9)
@@ -161,8 +159,6 @@ def diverge(
     """Compare every two trajectories of one execution.
 
     Args:
-        plan_id: Whose.
-        traces: Two or three of planned, executed and recorded.
         findings: Per side what each predicate (its kind and object) said; compared where nothing
             else diverges.
         not_compared: Why a side is missing.

@@ -54,8 +54,6 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]
 
     Args:
         world: An empty one.
-        scene: Where they are.
-        soft: The bodies of ``soft_models``.
     """
     world.add_table(scene.table_height_m)
     for name, T in scene.containers().items():
@@ -74,7 +72,6 @@ def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "
     """Points whose convex hull holds the object, in its own frame [m].
 
     Args:
-        model: The object of the task.
         soft: Its lattice; None: it is rigid, and its box is taken.
     """
     if soft is not None:
@@ -134,10 +131,6 @@ def num_steps(end_ns: int, config: ReplayConfig) -> int:
     """Physics steps of a replay whose trajectory ends then, settling before and after included.
 
     Each engine takes them.
-
-    Args:
-        end_ns: Last time of the trajectory, from its start.
-        config: Rate of the physics and times to settle.
     """
     settling = round(config.settle_before_s * config.physics.rate_hz)
     return len(config.engines()) * (settling + _steps_kept(end_ns, config))
@@ -159,12 +152,6 @@ def simulate(
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
     that bursts ends it: what comes after would be noise. Of several engines the first moves it;
     ``twin.replay.agreement`` asks the others.
-
-    Args:
-        path: Joints and gripper widths over time.
-        scene: Where the objects are at the start.
-        hulls: The robot's convex pieces, which stand for its meshes.
-        config: Physics, rates and times to settle.
 
     Raises:
         UsageError: For soft bodies in an engine that has none.
@@ -319,10 +306,6 @@ def free_start(scene: ReplayScene, soft: Mapping[str, SoftModel]) -> ReplayScene
 
     The object that can move is moved, along the direction of least depth; of two, each by half.
     Objects are their convex hulls. The table is left to ``spawn``, which lifts what reaches in.
-
-    Args:
-        scene: Where the objects were localised.
-        soft: The soft ones' bodies.
 
     Raises:
         NotEvaluatedError: Naming both objects and the depth.

@@ -23,10 +23,6 @@ LARGEST_GAP_NS = 500_000_000
 def check_length(length_ns: int, plan_id: str) -> None:
     """Refuse an execution that took longer than any trajectory that is replayed.
 
-    Args:
-        length_ns: Of the execution.
-        plan_id: What was executed; named in the message.
-
     Raises:
         UnusablePlanError: Saying how long.
     """
@@ -42,10 +38,7 @@ def check_covers(track: JointTrack, what: str, end_ns: int, plan_id: str) -> Non
     """Refuse a track that stops well before the execution ended.
 
     Args:
-        track: Cut to the execution.
         what: What it holds, as it is said: joints, gripper widths.
-        end_ns: When the execution ended.
-        plan_id: What was executed.
 
     Raises:
         UnusablePlanError: Saying how much is missing.
@@ -57,11 +50,6 @@ def check_covers(track: JointTrack, what: str, end_ns: int, plan_id: str) -> Non
 
 def check_track(track: JointTrack, what: str, plan_id: str) -> None:
     """Refuse numbers that are none, and gaps.
-
-    Args:
-        track: Cut to the execution.
-        what: What it holds, as it is said.
-        plan_id: What was executed.
 
     Raises:
         UnusablePlanError: Saying where.
@@ -82,11 +70,6 @@ def check_track(track: JointTrack, what: str, plan_id: str) -> None:
 
 def gripper_widths(widths: JointTrack, plan: Plan, robot: Robot) -> JointTrack:
     """The recorded distances between the finger pads [m] alone, if that is what they are.
-
-    Args:
-        widths: The gripper's joints as they were recorded.
-        plan: What was executed; named in messages.
-        robot: Says how wide its gripper opens.
 
     Raises:
         UnusablePlanError: For several joints of which none has the name, for what ``check_track``
@@ -148,8 +131,6 @@ def path_of_execution(
         track: Recorded joints; the first sample is time 0 of the path.
         widths: Recorded widths of the gripper, on the same clock.
         plan: What was executed: says when the gripper was to be closed.
-        config: Its mode counts.
-        robot: Whose joints are wanted.
 
     Raises:
         UnusablePlanError: When a track is empty, has gaps, names other joints, or holds what is no
@@ -195,7 +176,6 @@ def cut_track(track: JointTrack, start_ns: int, end_ns: int) -> JointTrack:
     A sample at the end is not made up: where the recording stops early, so does the track.
 
     Args:
-        track: A recording of joints.
         start_ns: First instant, on the track's clock; the track's value there is interpolated.
         end_ns: Last instant, same clock.
     """
@@ -213,8 +193,6 @@ def stages_as_executed(
     """The plan's stages at the times at which the recording says they began and ended.
 
     Args:
-        plan: What was executed.
-        events: Recorded gst events, any plan's.
         start_ns: Source time of the execution's start, which becomes time 0.
     """
     spans: dict[tuple[str, str], int] = {}
@@ -242,7 +220,6 @@ def closed_mask(
     Args:
         times_ns: When the widths were recorded, ascending, from the start of the execution.
         width_m: Distance between the finger pads.
-        plan: Says when the gripper was to be closed.
     """
     closed = np.zeros(len(times_ns), dtype=bool)
     for start_ns, end_ns in _closed_intervals(plan):

@@ -34,7 +34,6 @@ def factor_from(failures: Sequence[Failure], *, undecided: str | None = None) ->
     """Report the earliest failure; without one True, or None when something is undecided.
 
     Args:
-        failures: All that were found, in any order.
         undecided: What could not be decided; None: everything could.
     """
     if failures:

@@ -14,13 +14,7 @@ LEAVES_M = 0.002
 
 
 def grasps_seen(plan: Plan, path: JointPath, result: ReplayResult) -> tuple[dict[str, object], ...]:
-    """What became of each grasp of a plan, for whoever plans again; as verdicts keep it.
-
-    Args:
-        plan: Which object each stage grasps, and when the gripper is to be closed.
-        path: The plan's, with the gripper as late as it is replayed.
-        result: Where hand and objects were.
-    """
+    """What became of each grasp of a plan, for whoever plans again; as verdicts keep it."""
     stretches = []
     for first, end in _closed(plan, path, result.stamps_ns):
         name = _grasped(plan, int(result.stamps_ns[first]))

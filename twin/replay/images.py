@@ -82,14 +82,8 @@ def render_replay(
     """Yield camera ids with JPEG images, stamped with source times.
 
     Args:
-        run: Whose rebuilt scene is drawn.
-        episode: The recording, for the cameras.
-        result: The replay.
-        scene: Where it happened.
         start_ns: Source time that is the replay's time 0.
         executed: Whether the plan was executed then, so that there are instants to compare with.
-        planned: Whether the hand moves as planned, and cameras in it with it.
-        correction: What moved localised objects into the replay's scene.
 
     Raises:
         PathNotFoundError: When the run was not rebuilt.

@@ -65,11 +65,7 @@ class MotionReplay:
         return (self.run_path,)
 
     def path(self, sha256: str) -> Path:
-        """Of the derived episode.
-
-        Args:
-            sha256: Of the recording.
-        """
+        """Of the derived episode."""
         key = hash_settings({**self.settings(), "source": sha256, "id": self.calibration_id})
         name = f"{self.episode_id}.replay.{self.trajectory}.dynamic.{ENGINE}.{key}.mcap"
         return RunFolder(self.run_path).derived_dir / name
@@ -78,14 +74,7 @@ class MotionReplay:
 def motion_replays(
     run: RunFolder, names: list[str], config: ReplayConfig, *, force: bool
 ) -> tuple[list[MotionReplay], dict[str, str]]:
-    """List what can be replayed of imported recordings, and why others cannot.
-
-    Args:
-        run: With or without a calibration.
-        names: Episodes that are asked for.
-        config: Physics; what was calibrated replaces nominal values.
-        force: Redo what is there.
-    """
+    """List what can be replayed of imported recordings, and why others cannot."""
     calibration = read_calibration(run)
     fit = _fit_of(calibration)
     with_boxes = calibrated(config, calibration, None).physics

@@ -40,12 +40,7 @@ def divergence_of(episode: Episode) -> dict[str, Any] | None:
 
 
 def row_of_failure(job: ReplayJob, message: str) -> dict[str, Any]:
-    """Return the row of a trajectory that was not evaluated, with the reason.
-
-    Args:
-        job: The replay that was asked for.
-        message: Why it was not made.
-    """
+    """Return the row of a trajectory that was not evaluated, with the reason."""
     why = message.removeprefix(NOT_EVALUATED)
     return {**_row(job), "error": f"{NOT_EVALUATED}{why}", "reason": f"{NOT_EVALUATED}{why}"}
 
@@ -83,10 +78,7 @@ def judged(
     """Return the row of a trajectory with its verdict, and where it diverges from the others.
 
     Args:
-        job: The replay that was asked for.
-        verdict: What came out.
         divergence: Where planned, executed and recorded part; None: they were not compared.
-        skipped: The verdict was there from an earlier run.
     """
     return {
         **_row(job),

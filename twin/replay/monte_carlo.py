@@ -87,9 +87,7 @@ def sample_rng(seed: int, identity: str, index: int) -> np.random.Generator:
     """The generator of one sample: the same for the same seed, start and index, anywhere.
 
     Args:
-        seed: Of the whole evaluation.
         identity: Of the start; the same one draws the same variations.
-        index: Number of the sample.
     """
     digest = hashlib.sha256(f"{seed}/{identity}/{index}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype="<u4").astype(np.uint32))
@@ -106,7 +104,6 @@ def with_draw(
         draw: What is not known.
         scene: Its movable objects get other masses, edges and centres of mass; all of its objects
             are shifted.
-        config: With the force that the gripper is said to have.
     """
     own = config.physics.object_friction
     physics = replace(
@@ -159,9 +156,6 @@ def draw_variation(
     given those. Turns that look the same are the same.
 
     Args:
-        rng: Of this sample; see ``sample_rng``.
-        scene: Nominal poses, their covariances and the task's objects.
-        config: Nominal physics, and how far to vary around it.
         index: Number of the sample; says which draw of a posterior is its.
     """
     settings = config.variation
@@ -299,10 +293,6 @@ def replay_samples(
     """Run ``config.samples`` varied replays.
 
     Args:
-        replay: Replays one varied start; its verdict counts.
-        scene: The nominal start, with covariances.
-        config: The nominal settings.
-        plan_id: Written into the records.
         identity: Of the start; the same one draws the same variations.
 
     Raises:
@@ -352,10 +342,6 @@ def with_probability(verdict: Verdict, samples: Sequence[Sample]) -> Verdict:
 
     A sample that could not be decided counts among those that were not accepted. Where there is a
     posterior, each sample counts with the chance that its answer is right in this session.
-
-    Args:
-        verdict: Of the nominal replay.
-        samples: What came out of the varied ones.
     """
     if not samples:
         return verdict

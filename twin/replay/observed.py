@@ -32,15 +32,7 @@ Grip = tuple[int, int, int]
 def observed_plan(
     arm: JointTrack, widths: JointTrack, robot: RobotModel, task: Task, info: EpisodeInfo
 ) -> Plan:
-    """Describe an execution that nobody planned; times count from the tracks' first sample.
-
-    Args:
-        arm: Joints in the robot's order, cut to the execution.
-        widths: Distance between the pads, likewise.
-        robot: Whose they are.
-        task: Its stages are laid over what the fingers did.
-        info: Names instruction, policy and start.
-    """
+    """Describe an execution that nobody planned; times count from the tracks' first sample."""
     start_ns, end_ns = int(arm.stamps_ns[0]), int(arm.stamps_ns[-1])
     times_ns = widths.stamps_ns - start_ns
     grips = find_grips(times_ns, widths.position[:, 0])
@@ -126,9 +118,6 @@ def observed_stages(
     What never happens lasts to the end.
 
     Args:
-        tables: The task's stages, in order.
-        grips: What the fingers did.
-        times_ns: Of the tool, from the start of the execution.
         p_tool_m: Tool positions, base frame.
     """
     end_ns, begun_ns = int(times_ns[-1]), 0

@@ -77,9 +77,6 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
     """Write one replay; the writer replaces a part file that an interrupted run left.
 
     Args:
-        path: Where the derived episode goes.
-        result: States and verdict.
-        plan: What was replayed.
         origin: The recorded episode, and when time 0 of the replay is.
 
     Raises:

@@ -42,7 +42,6 @@ def outside_limits(
     """Say which joints are beyond their limits by more than rounding.
 
     Args:
-        robot: Its ``lower_rad`` and ``upper_rad`` count.
         joints_rad: Postures, joints from base to hand.
     """
     return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
@@ -53,14 +52,7 @@ def outside_limits(
 def limit_failure(
     robot: RobotModel, t_ns: int, joints_rad: Float[np.ndarray, " num_joints"], joint: int
 ) -> Failure:
-    """Name a joint that is beyond its limits.
-
-    Args:
-        robot: Whose limits.
-        t_ns: When, from the start of the trajectory.
-        joints_rad: The posture then.
-        joint: Position of the joint in ``ARM_JOINTS``.
-    """
+    """Name a joint that is beyond its limits."""
     return Failure(
         t_ns=t_ns,
         cause=Cause.JOINT_LIMIT,
@@ -80,7 +72,6 @@ def jumps(
     Args:
         times_ns: Of the postures, ascending.
         joints_rad: Postures, joints from base to hand.
-        robot: Gives the limits of speed.
     """
     if len(times_ns) < 2:
         return []
@@ -129,10 +120,6 @@ class UnusablePlanError(TwinError):
 
 def check_usable(plan: Plan, robot: RobotModel) -> None:
     """Refuse what no robot, or not this one, could follow.
-
-    Args:
-        plan: As it was sent.
-        robot: Who would follow it.
 
     Raises:
         UnusablePlanError: Naming the first thing that is wrong.
@@ -276,9 +263,6 @@ def path_of_plan(
     reaches the waypoint. Waypoints without joints are joined by straight tool motion.
 
     Args:
-        plan: What is commanded.
-        robot: What is to follow it.
-        clearance: Says which postures touch something, where the plan leaves the choice.
         start_rad: Where the robot stands: a plan that begins without joints goes on from there.
 
     Returns:
@@ -461,8 +445,6 @@ def check_path(path: JointPath, robot: RobotModel, hulls: RobotHulls) -> list[Fa
     """Find joint limits, jumps, excess speed and self-collision along an interpolated path.
 
     Args:
-        path: Joints and gripper widths over time.
-        robot: Gives limits of angle and speed.
         hulls: The same robot's convex pieces; they are moved along the path.
     """
     failures = []

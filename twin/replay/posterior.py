@@ -134,7 +134,6 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
-        count: A power of two covers best.
         movers: Rigid objects that move, each with edges and a centre of mass of its own.
     """
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
@@ -173,10 +172,6 @@ def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tu
 
 def read_trials(run: RunFolder, output: Output) -> Trials:
     """Read every trial of a run that was executed and judged; missing localisations are made.
-
-    Args:
-        run: Its episodes, and its scene and calibration.
-        output: Shows progress.
 
     Raises:
         NoTrialsError: When there is none.
@@ -252,7 +247,6 @@ def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
     """Replay a trial's plan as a draw would have it.
 
     Args:
-        trial: Begins where its objects were localised, moved by the draw's bias.
         draw: What is not known.
     """
     scene, config = with_draw(draw, trial.scene, trial.config)
@@ -275,12 +269,7 @@ def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
 
 
 def log_nearness(trial: Trial, ended: Ended) -> float:
-    """How well the places agree in which objects end.
-
-    Args:
-        trial: What happened.
-        ended: What a draw says.
-    """
+    """How well the places agree in which objects end."""
     total = 0.0
     for name, seen_m in trial.ends_m.items():
         off_m = float(np.linalg.norm(ended.ends_m.get(name, np.full(2, np.inf)) - seen_m))
@@ -326,10 +315,7 @@ def weighed(
     """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
 
     Args:
-        draws: From ``draw_beforehand``.
-        trials: Executed ones, of one task.
         workers: Processes that replay side by side; 1: this one alone.
-        output: Shows progress.
     """
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
@@ -374,12 +360,6 @@ def calibrate_posterior(
 ) -> tuple[dict[str, Any], str]:
     """Weigh draws by a run's trials, task by task, and write them to ``calibration.json``.
 
-    Args:
-        run: Whose trials are read, and in whose scene folder the posterior goes.
-        num_draws: From the priors, for each task.
-        workers: Processes.
-        output: Shows progress.
-
     Returns:
         The record, and the id of the calibration that holds now.
 
@@ -405,12 +385,7 @@ def calibrate_posterior(
 
 
 def describe_posterior(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say what the trials left of the priors.
-
-    Args:
-        record: As ``calibrate_posterior`` makes it.
-        calibration_id: Of the calibration that holds now.
-    """
+    """Say what the trials left of the priors."""
     lines = [f"posterior: {len(record['tasks'])} tasks; calibration {calibration_id}"]
     for name, found in record["tasks"].items():
         draws, trials = found["draws"], found["sources"]

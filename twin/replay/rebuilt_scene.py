@@ -145,7 +145,6 @@ def calibrated(
     Samples then vary what was identified by as much as the calibration leaves open.
 
     Args:
-        config: As the user set it.
         calibration: Of the run; None: there is none, and nothing changes.
         task: Its own draws of a posterior are taken; None: a recording without one takes none.
     """
@@ -207,9 +206,7 @@ def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) 
     A force that holds a wooden cube crushes a toy. What user or calibration said of it counts.
 
     Args:
-        config: As the user set it.
         calibration: Of the run; None: there is none.
-        task: May say how hard the gripper presses.
     """
     known = calibrated(config, calibration, task)
     if task.grip_force_N is None or known.physics.grip_force_N != PhysicsConfig().grip_force_N:
@@ -303,11 +300,8 @@ class RebuiltScene:
         """Put objects into the scene: where a replay happens.
 
         Args:
-            task: Whose objects they are.
-            urdf: The robot's description.
             Ts_base_object: Where the objects were localised; moved as the calibration says.
             reasons: Why others are not.
-            covariances: How sure the poses are.
         """
         return ReplayScene(
             task=with_heights(self.correction.task(task), self.rim_heights_m),
@@ -328,7 +322,6 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
 
     Args:
         run: Whose scene folder is read; without ``scene.json`` only the calibration is.
-        task: Says which objects are looked up.
 
     Raises:
         UnreadableSceneError: When ``scene.json`` cannot be understood.
@@ -377,7 +370,6 @@ def scene_of_other_robot(run: RunFolder, robot: str) -> str:
 
     Args:
         run: Its ``scene.json`` names the episodes that the scene was made of.
-        robot: Name of the one that is to act.
     """
     sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
     names = {str(source.get("id", "")) for source in sources}

@@ -54,6 +54,5 @@ def stretches_ns(
 
     Args:
         stamps_ns: Of the steps, ascending.
-        flags: What held at each of them.
     """
     return [(int(stamps_ns[first]), int(stamps_ns[end - 1])) for first, end in runs_of_true(flags)]

@@ -49,7 +49,6 @@ def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution
 
     Args:
         events: All of an episode, in their order.
-        plan_id: Whose.
     """
     whose = "motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
     mine = [event for event in events if event.get("plan_id") == plan_id]
@@ -226,12 +225,7 @@ def _nothing_to_replay(
 def there_already(
     jobs: Sequence[ReplayJob], *, force: bool
 ) -> tuple[list[dict[str, Any]], list[ReplayJob]]:
-    """Rows of the replays that were made before, and the jobs that are still to do.
-
-    Args:
-        jobs: What is asked for.
-        force: All of it is to do.
-    """
+    """Rows of the replays that were made before, and the jobs that are still to do."""
     rows, todo, kept = [], [], []
     for job in jobs:
         row = None if force else row_of_existing(job)
@@ -282,9 +276,6 @@ def replay_trajectories(
 
     Args:
         run: Whose episodes are replayed, and whose ``derived`` folder gets the replays.
-        config: Settings.
-        output: How to talk.
-        runner: What does the work.
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
@@ -448,12 +439,7 @@ def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator
 
 
 def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[Task]) -> list[str]:
-    """Name what the rebuilt scene has no Gaussians of.
-
-    Args:
-        record: The content of ``scene.json``.
-        tasks: Tasks whose objects the replays move.
-    """
+    """Name what the rebuilt scene has no Gaussians of."""
     found = []
     for task in tasks:
         missing = [key for key in task.objects if key not in record.get("objects", {})]

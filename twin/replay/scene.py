@@ -130,9 +130,6 @@ def localised_starts(
     An episode that cannot be localised gives states without poses, with the reason.
 
     Args:
-        run: Where the derived episode is kept.
-        episode: What was recorded.
-        task: Whose objects are looked for.
         scene_hash: Of the scene the poses are meant for; None: there is none.
     """
     phases = quiet_phases(episode)

@@ -47,7 +47,6 @@ def recorded_labels(run: RunFolder, episode_ids: Sequence[str]) -> dict[str, str
     """What the operator said of each episode: success, failure or unknown.
 
     Args:
-        run: Whose episodes they are.
         episode_ids: Which are asked for; one that cannot be read counts as unknown.
     """
     labels = {}
@@ -70,12 +69,7 @@ def _label(run: RunFolder, episode_id: str) -> str:
 
 
 def executions_of(rows: Rows, labels: Mapping[str, str]) -> list[dict[str, Any]]:
-    """One entry per executed plan: what each side says, and where they diverge first.
-
-    Args:
-        rows: One for each replayed trajectory and mode.
-        labels: What the operator said, by episode.
-    """
+    """One entry per executed plan: what each side says, and where they diverge first."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         if not row["executed"]:

@@ -54,7 +54,6 @@ def trace_of_result(result: ReplayResult, side: str, end_ns: int) -> Trace:
     """The trace of a replay in memory.
 
     Args:
-        result: The replay.
         side: What it is called beside the others: planned or executed.
         end_ns: When the trajectory ends, from its start; what settles after it is not part of the
             trace.
@@ -81,8 +80,6 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
     """The trace of a replay that was written before.
 
     Args:
-        path: The derived episode.
-        side: What it replays.
         start_ns: Source time that is time 0.
         end_ns: When the trajectory ended, from time 0.
 
@@ -122,7 +119,6 @@ def poses_over(
 
     Args:
         stamps_ns: When, ascending.
-        Ts: Poses at these instants, in any one frame.
     """
     q, p = se3.split(Ts)
     return PoseTrajectory(stamps_ns, p, q)
@@ -198,13 +194,7 @@ class Recording:
 
 
 def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) -> Trace:
-    """The recorded trace; objects only at the instants at which they were localised.
-
-    Args:
-        recording: What was measured during one execution.
-        robot: Gives the tool's pose from the joints.
-        rate_hz: How often the tool is sampled.
-    """
+    """The recorded trace; objects only at the instants at which they were localised."""
     times = _times(recording.path, rate_hz)
     movable = recording.scene.movable()
     seen = np.array([0, max(recording.end_seen_ns, recording.path.end_ns() + 1)])
@@ -226,14 +216,7 @@ def trace_of_recording(recording: Recording, robot: RobotModel, rate_hz: int) ->
 def rollout_of_recording(
     recording: Recording, robot: RobotModel, hulls: RobotHulls, config: ReplayConfig
 ) -> Rollout:
-    """The recorded states with the contacts that follow from joints and carried objects.
-
-    Args:
-        recording: What was measured during one execution.
-        robot: The robot that was recorded.
-        hulls: Its convex pieces.
-        config: Limits that contacts are inferred with.
-    """
+    """The recorded states with the contacts that follow from joints and carried objects."""
     monitor = _watched(recording, robot, hulls, config)
     states = states_of_recording(recording, robot)
     return replace(states, contacts=monitor.contacts(), contacts_inferred=True)
@@ -243,10 +226,6 @@ def states_of_recording(recording: Recording, robot: RobotModel) -> Rollout:
     """The recorded states that success predicates read: localised before and after.
 
     One look afterwards does not say whether anything still moves: ``settled`` stays undecided.
-
-    Args:
-        recording: What was measured during one execution.
-        robot: Says where the tool was at the end.
     """
     scene, end = recording.scene, recording.end
     fixed = scene.containers()

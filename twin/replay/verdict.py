@@ -64,8 +64,6 @@ def terminal_factor(
     middle of a burst body may well lie in the basket.
 
     Args:
-        result: States, contacts and shapes over time.
-        scene: Its task has the success predicates.
         config: Only its mode counts.
         unreachable_ns: From when on waypoints cannot be reached; None: all can.
         burst: The soft body that burst first; None: none did.
@@ -131,9 +129,6 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
     The predicate on contacts is asked whether or not the task lists it.
 
     Args:
-        task: Its predicates.
-        rollout: Recorded or replayed states.
-        side: ``recorded`` or ``replayed``.
         tolerance_m: Depth up to which contacts do not count, where the task does not say.
     """
     findings = evaluate_success(task, rollout)
@@ -152,12 +147,7 @@ def findings_of(task: Task, rollout: Rollout, side: str, *, tolerance_m: float =
 
 
 def warnings_of(scene: ReplayScene, result: ReplayResult) -> tuple[str, ...]:
-    """What does not change the verdict but should be known.
-
-    Args:
-        scene: Its task has the success predicates.
-        result: What was replayed.
-    """
+    """What does not change the verdict but should be known."""
     warnings = []
     if already_true_at_start(scene.task, result.rollout()):
         warnings.append(HELD_BEFORE)
@@ -191,8 +181,6 @@ def replay_plan(
 
     Args:
         plan: What is commanded; its start is checked where the scene knows where the arm is.
-        scene: Where it happens.
-        config: How it is replayed.
         refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
             path itself must then keep clear, too.
 
@@ -230,8 +218,6 @@ def replay_joints(
     Args:
         track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
         widths: Recorded distance between the finger pads over the same stamps.
-        scene: Where it happens.
-        config: How it is replayed.
         plan: The plan that was executed: its stages and when it wanted the gripper closed.
 
     Raises:
@@ -396,13 +382,7 @@ def _clearance_m(
 
 
 def follow(path: JointPath, scene: ReplayScene, config: ReplayConfig) -> States:
-    """Follow the joints exactly; no physics, so nothing is known of objects that can move.
-
-    Args:
-        path: Joints and gripper widths over time.
-        scene: Its containers stand where they are.
-        config: Gives the rate of the samples.
-    """
+    """Follow the joints exactly; no physics, so nothing is known of objects that can move."""
     count = int(np.ceil(path.end_ns() * 1e-9 * config.sample_rate_hz)) + 1
     stamps: Int[np.ndarray, " num_steps"] = (
         np.linspace(0, path.end_ns(), count).round().astype(np.int64)
@@ -455,12 +435,7 @@ def _undecided(plan: Plan, trajectory: str, config: ReplayConfig, scene: ReplayS
 
 
 def engine_of(task: Task, config: ReplayConfig) -> str:
-    """Name what moved things.
-
-    Args:
-        task: Whether it has soft objects.
-        config: Mode and engine.
-    """
+    """Name what moved things."""
     if config.mode == "kinematic":
         return KINEMATIC_ENGINE
     soft = f"+{SOFT_ENGINE}" if task.soft_objects else ""

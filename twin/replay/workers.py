@@ -72,12 +72,7 @@ class RayRunner:
     """Does pieces of work as Ray tasks; see ``bridge.process_pool.Runner``."""
 
     def __init__(self, address: str, workers: int) -> None:
-        """Connect later.
-
-        Args:
-            address: HOST:PORT of a running cluster, or local.
-            workers: Processors of a cluster started here.
-        """
+        """Connect later."""
         self._address, self._workers = address, workers
         self._ray: Any = None
         self._first: list[Any] = []
@@ -116,7 +111,6 @@ class RayRunner:
         """See ``Runner``; Ray itself begins what lost its node once more.
 
         Args:
-            function: Done with each item, on whichever node is free.
             items: What is to be done; they and the answers travel between nodes.
             cost: How long an item takes, in any unit: the longest are begun first.
         """
@@ -312,11 +306,6 @@ def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[
     """Replay all trial episodes of a run on what the settings ask for.
 
     See ``twin.replay.runner.replay_trajectories``, and what ``runner_for`` raises.
-
-    Args:
-        run: Whose trials are replayed.
-        config: Which trajectories and modes, how many samples, and where they are computed.
-        output: Shows progress.
 
     Raises:
         UsageError: When the folder holds no episode.

@@ -25,9 +25,7 @@ class Hand:
         """Read a description; meshes are looked for beside it.
 
         Args:
-            urdf: The file.
             joints: The arm's, base to hand.
-            hand_link: Link that carries the tool.
 
         Raises:
             RobotDescriptionError: When it cannot be read, or joints, link or meshes are missing.
@@ -78,11 +76,7 @@ class Hand:
         return np.array(self._data.oMf[self._frame].homogeneous)
 
     def hulls_m(self, finger_rad: float = 0.0) -> list[Float[np.ndarray, "num_points 3"]]:
-        """Convex pieces of the hand link and of all links behind it: corners in its frame [m].
-
-        Args:
-            finger_rad: Value of every joint behind the hand.
-        """
+        """Convex pieces of the hand link and of all links behind it: corners in its frame [m]."""
         q = pin.neutral(self._model)
         q[self._finger_ids] = finger_rad
         pin.framesForwardKinematics(self._model, self._data, q)

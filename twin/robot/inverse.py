@@ -47,9 +47,7 @@ def pose_error(
     """Distance [m] and angle [rad] between where joints put the tool and a wanted pose.
 
     Args:
-        robot: Gives the tool's pose.
         joints_rad: Of the arm, from base to hand.
-        T_base_tcp: Where the tool is wanted.
     """
     error = pin.SE3(robot.T_base_tcp(joints_rad)).actInv(pin.SE3(T_base_tcp))
     return float(np.linalg.norm(error.translation)), float(np.linalg.norm(pin.log3(error.rotation)))
@@ -65,9 +63,6 @@ def solve_ik(
     """Find joints within their limits that reach a pose, near the warm start where there is one.
 
     Args:
-        robot: Gives poses and limits.
-        T_base_tcp: Where the tool is wanted.
-        config: Tolerances, steps, restarts and their seed.
         warm_start_rad: Joints to start from; None: ``HOME_RAD``.
 
     Returns:
@@ -493,9 +488,6 @@ class UrInverse:
         Bool[np.ndarray, " num_poses"],
     ]:
         """Solve many poses, on all branches.
-
-        Args:
-            Ts_base_tcp: Rigid poses of the tool centre point.
 
         Returns:
             Joints [rad], one turn of each joint, within the limits; which of them are solutions;

@@ -60,7 +60,6 @@ def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
     """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted.
 
     Args:
-        urdf: Text of the description.
         keep_visuals: Leave what is drawn in; collision elements always stay.
 
     Raises:
@@ -428,7 +427,6 @@ class RobotModel:
         """Pose of any link or frame.
 
         Args:
-            link: Name in the description.
             joints_rad: Of the arm, from base to hand.
             width_m: Distance between the finger pads.
 

@@ -30,11 +30,7 @@ def check_clock(
     """Refuse an execution during which the source's clock went back.
 
     Args:
-        episode: The recording.
-        endings: Joint topics with these endings.
         start_ns: Source time at which the execution started.
-        end_ns: And ended.
-        plan_id: Whose execution it is.
 
     Raises:
         BackwardTimeError: Naming the topic, the instant and by how much; or an execution that took
@@ -125,7 +121,6 @@ def distinct_postures(
 
     Args:
         joints_rad: Postures to choose from; the first is always chosen.
-        count: At most so many.
     """
     chosen = [0]
     far = np.abs(joints_rad - joints_rad[0]).max(axis=1)
@@ -186,11 +181,6 @@ def width_track(episode: Episode, robot: Robot) -> JointTrack:
 
 def check_joints(arm: JointTrack, source: str, robot: Robot) -> None:
     """See that joint states are of the robot that is meant.
-
-    Args:
-        arm: Joint states as they came.
-        source: Who sent them, as the message names it.
-        robot: The one that is meant.
 
     Raises:
         RobotDescriptionError: A joint of the arm is missing in what a source sent.

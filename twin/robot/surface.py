@@ -47,12 +47,7 @@ class Nearest:
 
 
 def link_poses(robot: RobotModel, posture: Posture) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Pose ``T_base_link`` of every frame of the description.
-
-    Args:
-        robot: The description.
-        posture: Joints and gripper width.
-    """
+    """Pose ``T_base_link`` of every frame of the description."""
     q = robot.configuration(posture.joints_rad, posture.width_m)
     pin.framesForwardKinematics(robot.model, robot.data, q)
     return {
@@ -124,7 +119,6 @@ class PosedSurface:
 
         Args:
             p_base: Points in the base frame [m].
-            margin_m: How far the boxes are grown to each side.
         """
         lows, highs = (np.array(ends) for ends in zip(*self._boxes, strict=True))
         around = (p_base > lows.min(axis=0) - margin_m) & (p_base < highs.max(axis=0) + margin_m)
@@ -160,7 +154,6 @@ class PosedSurface:
 
         Args:
             rays_camera: Directions in the camera's frame, such as ``Camera.rays`` gives.
-            T_base_camera: Where the camera is.
         """
         turned = rays_camera @ T_base_camera[:3, :3].T
         origin = np.broadcast_to(T_base_camera[:3, 3], turned.shape)
@@ -171,14 +164,7 @@ class PosedSurface:
 def sample_surface(
     robot: RobotModel, posture: Posture, count: int, seed: int
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points of the posed robot, evenly over its area, in the base frame [m].
-
-    Args:
-        robot: The description.
-        posture: Joints and gripper width.
-        count: How many points.
-        seed: Of the draw.
-    """
+    """Points of the posed robot, evenly over its area, in the base frame [m]."""
     poses = link_poses(robot, posture)
     corners = np.concatenate(
         [

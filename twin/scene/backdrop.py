@@ -57,8 +57,6 @@ class Backdrop:
         """The same view, with the shell where nothing was drawn; depth and alpha do not change.
 
         Args:
-            view: Drawn over black.
-            camera: It was drawn through.
             T_base_camera: Where that was, in the scene's frame.
         """
         weight = (1 - view.alpha) * np.clip((OPAQUE - view.alpha) / FADES, 0.0, 1.0)
@@ -103,9 +101,6 @@ def directions_on_sphere(
 
     Args:
         rays: Directions of any length.
-        eye_m: Where all of them begin.
-        centre_m: Of the sphere.
-        radius_m: Of the sphere.
     """
     d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     from_centre = eye_m - centre_m
@@ -130,13 +125,7 @@ def _places(
 def backdrop_of(
     cloud: GaussianCloud, views: Sequence[TrainingView], rasteriser: Rasteriser
 ) -> Backdrop:
-    """Colour the shell after the training views.
-
-    Args:
-        cloud: What is drawn in front of it.
-        views: At least one.
-        rasteriser: How to draw.
-    """
+    """Colour the shell after the training views."""
     centres = np.array([view.T_base_color[:3, 3] for view in views])
     centre = np.median(centres, axis=0)
     away = np.linalg.norm(cloud.means_m - centre, axis=1)
@@ -187,10 +176,6 @@ def _cell_directions() -> Float[np.ndarray, "num_cells 3"]:
 
 def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:
     """The shell of a scene; None where ``scene.json`` names none, or its picture is gone.
-
-    Args:
-        run: Whose scene folder is read.
-        record: ``scene.json``.
 
     Raises:
         UnreadableSceneError: What ``scene.json`` says of it cannot be understood.

@@ -113,12 +113,7 @@ def concatenate(clouds: list[GaussianCloud]) -> GaussianCloud:
 
 
 def with_harmonics(cloud: GaussianCloud, num_harmonics: int = NUM_FIRST) -> GaussianCloud:
-    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off.
-
-    Args:
-        cloud: The Gaussians before.
-        num_harmonics: How many each Gaussian has afterwards, for each colour.
-    """
+    """The same Gaussians with this many harmonics: zeros added, or those beyond cut off."""
     kept = min(num_harmonics, cloud.num_harmonics)
     harmonics = np.zeros((len(cloud), num_harmonics, 3), dtype=np.float32)
     harmonics[:, :kept] = cloud.harmonics[:, :kept]
@@ -151,7 +146,6 @@ def moved_cloud(cloud: GaussianCloud, T_new_old: Float[np.ndarray, "4 4"]) -> Ga
     """The same Gaussians after a rigid motion; what their colour owes to direction turns along.
 
     Args:
-        cloud: The Gaussians before.
         T_new_old: The motion, or the pose of their frame in another.
     """
     q, _ = se3.split(T_new_old)

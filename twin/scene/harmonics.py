@@ -39,8 +39,6 @@ def harmonic_terms(x: Any, y: Any, z: Any, num_harmonics: int) -> list[Any]:
 
     Args:
         x: First component of the directions; the others alike.
-        y: Second component.
-        z: Third component.
         num_harmonics: 0, 3, 8 or 15.
     """
     terms = [-SH_FIRST * y, SH_FIRST * z, -SH_FIRST * x]
@@ -85,7 +83,6 @@ def turned_harmonics(
 
     Args:
         harmonics: Of all degrees up to one.
-        R_new_old: The turn.
     """
     if harmonics.shape[1] == 0:
         return harmonics

@@ -31,8 +31,6 @@ def part_masks(
     """Which pixels show robot, objects and background, by the first mesh along each ray.
 
     Args:
-        camera: Size of the image and intrinsics.
-        T_base_camera: Where the camera is.
         robot: Its surface as it stands then; None: it is not known.
         meshes: Of objects, each in its own frame.
         Ts_base_object: Where they are; those without a pose are not there.
@@ -80,14 +78,7 @@ class ImageAgreement:
         seen_mask: Bool[np.ndarray, "height width"],
         parts: Mapping[str, Bool[np.ndarray, "height width"]],
     ) -> None:
-        """Compare one more image.
-
-        Args:
-            recorded_u8: What the camera saw.
-            drawn_u8: What the scene shows there.
-            seen_mask: Pixels in which something is drawn that was measured in the scan.
-            parts: Pixels of each part.
-        """
+        """Compare one more image."""
         squared = np.square(as_float(recorded_u8) - as_float(drawn_u8)).mean(axis=-1)
         whole = np.ones_like(seen_mask)
         kinds = {"whole": whole, "seen": seen_mask, "unseen": ~seen_mask, **parts}

@@ -10,7 +10,6 @@ def tukey_weights(
     """Biweights (Beaton and Tukey 1974): 1 at zero, 0 from the bound on.
 
     Args:
-        residuals: In any unit.
         bound: From here on a residual counts nothing, same unit.
     """
     return np.asarray(np.maximum(1.0 - np.square(residuals / bound), 0.0) ** 2)
@@ -24,7 +23,6 @@ def normal_equations(
     """Return J^T W J and the gradient J^T W r; a step solves H x = -gradient.
 
     Args:
-        J: Derivative of each residual by each unknown.
         residuals: What is to become zero.
         weights: Of each squared residual.
     """

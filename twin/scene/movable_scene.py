@@ -42,8 +42,6 @@ class MovableScene:
         """A view of one state, with the backdrop where nothing was drawn.
 
         Args:
-            view: Of a cloud from ``at``.
-            camera: It was drawn through.
             T_base_camera: Where that was, in the scene's frame.
         """
         if self.backdrop is None:
@@ -65,7 +63,6 @@ class MovableScene:
         Args:
             Ts_base_object: Where objects are; the others are where they were scanned.
             posture: Of the robot; None: it is not drawn.
-            urdf: The robot's description.
             bent: Objects that are no rigid bodies, already in the base frame.
         """
         bent = {} if bent is None else bent
@@ -109,10 +106,6 @@ class MovableScene:
 
 def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
     """Load the parts that ``scene.json`` lists.
-
-    Args:
-        run: Whose scene folder is read.
-        scene: The background and the record.
 
     Raises:
         PathNotFoundError: A splat file is gone.

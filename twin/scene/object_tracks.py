@@ -98,11 +98,7 @@ class ObjectTracks:
     """What nobody saw and what was assumed instead."""
 
     def strangers(self, scanned: Iterable[str]) -> list[str]:
-        """Name what the scan had and the episode does not know, and the other way round.
-
-        Args:
-            scanned: Objects of the rebuilt scene.
-        """
+        """Name what the scan had and the episode does not know, and the other way round."""
         known = {*self.spans}
         if not known:
             return []
@@ -144,14 +140,7 @@ def localised_tracks(
     task: Task,
     postures: PostureTrack | None,
 ) -> ObjectTracks:
-    """Where a recorded episode's objects were: localised, and carried in between.
-
-    Args:
-        episode: The recording, for its executions.
-        localised: Its gst localisation v1 records.
-        task: The objects.
-        postures: Joints and fingers, if they were recorded.
-    """
+    """Where a recorded episode's objects were: localised, and carried in between."""
     events = executed_events(episode)
     plan_ids = {
         str(event["plan_id"])
@@ -178,7 +167,6 @@ def carried_tracks(
         localised: The gst localisation v1 records of one episode, each with its ``phase`` and the
             ``plan_id`` after whose execution it grasps.
         executions_ns: When each plan was executed, by its id.
-        task: The objects.
         track: Joints and fingers; None where nobody recorded them: objects then change place at
             the end of an execution.
     """
@@ -206,14 +194,7 @@ def carried_tracks(
 
 
 def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns: int) -> list[Grip]:
-    """When the fingers stood closed around something, by their recorded opening.
-
-    Args:
-        track: Joints and fingers.
-        robot: Says where the tool was.
-        start_ns: Of the execution that is looked at.
-        end_ns: Of it.
-    """
+    """When the fingers stood closed around something, by their recorded opening."""
     widths = track.widths
     if widths is None:
         return []

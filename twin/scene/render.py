@@ -53,13 +53,6 @@ def compose(
 ) -> Composed:
     """Put background, objects and robot together as the settings say.
 
-    Args:
-        run: Whose scene folder is read.
-        scene: The background.
-        episode: Says where the joints were.
-        stamp_ns: When.
-        config: ``joints``, ``width_m`` and ``object``.
-
     Raises:
         UsageError: An object that the scene does not have, a pose that is none, or joints for a
             robot that the scene does not have.
@@ -122,7 +115,6 @@ def object_places(
 
     Args:
         texts: One per object; the last word on an object counts.
-        known: Objects of the scene.
 
     Raises:
         UsageError: Another object, or numbers that are no pose.
@@ -162,9 +154,7 @@ def carried_camera(
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
     Args:
-        episode: Shows whether the camera moves with the hand.
         frame_id: The camera's frame.
-        joints_rad: The posture.
         tree: Says where the camera was; None: ``/tf`` does.
 
     Returns:
@@ -211,10 +201,6 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """Write one image of the scene, and return what was drawn.
-
-    Args:
-        run: Whose scene is drawn.
-        config: Camera, time, joints, places of objects, and where the files go.
 
     Raises:
         UsageError: When the episode, the camera or an object is unknown (lists those that exist),
@@ -263,13 +249,7 @@ def seen_mask(
     alpha: Float32[np.ndarray, "height width"],
     cloud: GaussianCloud,
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels of the image drawn last that show what was measured, and not what was completed.
-
-    Args:
-        rasteriser: Drew the cloud.
-        alpha: Of that image.
-        cloud: Knows which of its Gaussians nobody measured.
-    """
+    """Pixels of the image drawn last that show what was measured, and not what was completed."""
     if not cloud.completed.any():
         return np.asarray(alpha >= SEEN)
     measured = as_float32(~cloud.completed)[:, None]
@@ -286,7 +266,6 @@ def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
     """Open a recorded episode of a run by its id.
 
     Args:
-        run: Whose episodes are looked through.
         scene: Whose first episode is taken where none is wanted.
         wanted: The id, or nothing.
 
@@ -313,7 +292,6 @@ def camera_of(episode: Episode, wanted: str) -> str:
     """The camera of an episode that is wanted, or the first.
 
     Args:
-        episode: Its cameras are looked through.
         wanted: The id, or nothing.
 
     Raises:
@@ -378,7 +356,6 @@ def sized_camera(camera: Camera, size: str) -> Camera:
     """The same view as an image of another size: all of it is seen, more only beside it.
 
     Args:
-        camera: As it was recorded.
         size: ``WIDTHxHEIGHT``; empty: as recorded.
 
     Raises:
@@ -412,11 +389,7 @@ def poses_in_scene(
     """Poses of a camera in the scene's frame, from where the scene has its own.
 
     Args:
-        run: May have a calibration.
         scene: Its record says in which frame it is, and where it has poses from.
-        episode: The recording.
-        camera_id: The camera, by its name in the topics.
-        stamps_ns: When they are asked for.
 
     Raises:
         UsageError: When nothing says where the camera was in that frame.

@@ -86,11 +86,6 @@ def open_episode(run: RunFolder, scene: Scene, wanted: str) -> EpisodeInScene:
 
     A recorded trial is localised before and after its executions if it was not yet.
 
-    Args:
-        run: Whose episodes are looked through.
-        scene: The poses are meant for it.
-        wanted: Id of a recorded episode.
-
     Raises:
         UsageError: There is no such episode; lists those that exist.
     """
@@ -109,14 +104,7 @@ def open_episode(run: RunFolder, scene: Scene, wanted: str) -> EpisodeInScene:
 def recorded_tracks(
     run: RunFolder, scene: Scene, episode: Episode, postures: PostureTrack | None
 ) -> ObjectTracks:
-    """Where a recorded episode's objects were: localised, and carried in between.
-
-    Args:
-        run: Keeps what was localised.
-        scene: Whose objects they are.
-        episode: The recording.
-        postures: Joints and fingers, if they were recorded.
-    """
+    """Where a recorded episode's objects were: localised, and carried in between."""
     try:
         task = streams.task_file(episode).task()
         path = write_localised(run, episode, task, scene_hash=scene.scene_hash)
@@ -132,11 +120,8 @@ def frames_of(
     """Yield the instants to be drawn, in the order of time.
 
     Args:
-        run: May have a calibration of the cameras.
         scene: In whose frame the camera must be known.
-        episode: What is drawn.
         camera_id: From where; ``eye`` and ``target`` of the settings go before.
-        config: Camera.
 
     Raises:
         UsageError: When nothing says where the camera was.
@@ -197,10 +182,6 @@ def _rate_hz(stamps_ns: np.ndarray) -> float:
 
 def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     """Draw a whole episode to a video or to one PNG a frame, and return what was drawn.
-
-    Args:
-        run: Whose scene is drawn.
-        config: Episode, camera, size, and where the files go.
 
     Raises:
         UsageError: When the episode or the camera is unknown, when nothing says where the camera

@@ -47,10 +47,6 @@ def bind(
     A weight falls to zero where the ninth node becomes as near, so that it changes smoothly from
     point to point.
 
-    Args:
-        points_m: What follows the nodes.
-        nodes_m: The lattice that moves it.
-
     Raises:
         SkinError: Fewer than ten nodes.
     """
@@ -84,8 +80,6 @@ def pose_cloud(
 
     Args:
         cloud: At rest, in the frame the binding was made in.
-        binding: From ``bind`` for the same Gaussians.
-        nodes_m: Where the nodes are.
 
     Returns:
         The Gaussians in the nodes' frame.
@@ -131,11 +125,6 @@ def node_rotations(
 
     The nearest rotation in the sense of least squares (Kabsch 1976), with the body's own rotation
     as a weak prior.
-
-    Args:
-        rest_m: Nodes at rest.
-        nodes_m: The same nodes now.
-        neighbours: Indices of the nodes around each.
     """
     arms_rest = rest_m[neighbours] - rest_m[:, None]
     arms = nodes_m[neighbours] - nodes_m[:, None]

@@ -37,7 +37,6 @@ class MessageTemplate:
         """Serialise once and remember where the numbers went.
 
         Args:
-            type_name: As in ``bridge.episode.schema``.
             build: Makes the message from a stamp and ``count`` numbers.
             count: How many doubles are filled in, in the order the message holds them.
         """
@@ -147,7 +146,6 @@ def pose_messages(
     Args:
         stamps_ns: Source time of each message [ns since 1970].
         frame_id: The frame the poses are expressed in.
-        Ts_frame_body: Pose of the body in that frame, one for each message.
     """
     q, p = se3.split(Ts_frame_body)
     numbers = np.concatenate([p, q[:, 1:], q[:, :1]], axis=1)

@@ -382,7 +382,6 @@ def decode(type_name: str, data: Buffer) -> Message:
 
     Args:
         type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-        data: The whole message, its four bytes of encapsulation first.
 
     Raises:
         MalformedMessageError: When the bytes do not fit the type.
@@ -428,9 +427,7 @@ def with_header_stamp(data: Buffer, sec: int, nanosec: int) -> bytes:
     """Put another time into the header a message begins with.
 
     Args:
-        data: A message that ``header_stamp`` can read.
         sec: Whole seconds since 1970.
-        nanosec: The rest.
     """
     out = bytearray(data)
     _STAMPS["<" if data[1] else ">"].pack_into(out, ORIGIN, sec, nanosec)

@@ -115,8 +115,6 @@ def pixel_rows(
     """View the pixels of a message, row padding cut off; nothing is copied.
 
     Args:
-        data: A whole sensor_msgs/Image message.
-        header: What stands before its pixels, with the place of these.
         pixel_bytes: Bytes of one pixel in the header's encoding: 3 for ``rgb8``, 2 for ``16UC1``.
 
     Raises:

@@ -244,7 +244,6 @@ def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColo
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-        data: The serialised message (CDR).
 
     Raises:
         MalformedMessageError: The bytes are no such message.
@@ -257,7 +256,6 @@ def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
-        data: The serialised message (CDR).
 
     Raises:
         MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
@@ -323,7 +321,6 @@ class DepthImage:
 
         Args:
             type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-            data: The serialised message (CDR).
 
         Raises:
             MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
@@ -498,10 +495,7 @@ def joint_trajectory_to_cdr(
     """Serialise as trajectory_msgs/JointTrajectory, for viewers.
 
     Args:
-        stamp_ns: Of the header [ns since 1970].
         names: Joints, in the order of the columns of ``positions_rad``.
-        times_ns: Of each point, counted from the start of the motion.
-        positions_rad: Joint angles of each point.
     """
     points = []
     for t_ns, row in zip(times_ns, positions_rad, strict=True):

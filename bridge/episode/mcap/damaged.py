@@ -144,9 +144,7 @@ class Scratch:
         The memory returned is used again by the next call.
 
         Args:
-            file: The file to read from.
             offset: Where to begin [bytes from the start of the file].
-            size: How many bytes are wanted.
         """
         if len(self._record) < size:
             self._record = bytearray(size)
@@ -159,7 +157,6 @@ class Scratch:
         The memory returned is used again by the next call.
 
         Args:
-            frame: The packed bytes.
             size: What they must unpack to [bytes].
         """
         if len(self._unpacked) < size:
@@ -296,8 +293,6 @@ def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
     """Return a whole chunk's records.
 
     Args:
-        head: What the chunk's record claims of itself.
-        data: Its data, still packed, and whole.
         scratch: Memory that is used again for each chunk; the records may lie in it.
 
     Raises:

@@ -37,7 +37,6 @@ class Summary:
         """Book a chunk that is in the file, with its number of messages by channel.
 
         Args:
-            place: Where the chunk lies and what it spans.
             counts: Messages in it by channel id; empty when it holds definitions only.
         """
         self._chunks.append(mcap_format.chunk_index(place))
@@ -48,7 +47,6 @@ class Summary:
         """Book messages by channel, the first and the last log time among them.
 
         Args:
-            counts: Messages by channel id, added to those booked before.
             start_ns: Earliest log time among them [ns since 1970].
             end_ns: Latest log time among them.
         """
@@ -71,8 +69,6 @@ class Summary:
         """Book an attachment record that is in the file.
 
         Args:
-            name: Of the attachment, such as ``robot.urdf``.
-            media_type: Such as ``application/xml``.
             log_time_ns: When it was recorded [ns since 1970].
             create_time_ns: When it was made; 0 for unknown.
             data_size: Of the attachment alone [bytes].
@@ -96,11 +92,7 @@ class Summary:
         self._metadata.append(mcap_format.metadata_index(name, offset=offset, length=length))
 
     def encode(self, start: int) -> bytes:
-        """Return everything from the summary to the end of the file.
-
-        Args:
-            start: Where it begins in the file, right after the data-end record.
-        """
+        """Return everything from the summary to the end of the file."""
         counts = dict(sorted(self.message_counts.items()))
         statistics = mcap_format.statistics(
             schemas=len(self.schemas),
@@ -210,10 +202,8 @@ class OpenChunk:
         """Append one message whose payload has ``length`` bytes.
 
         Args:
-            channel_id: Of a channel whose definition is in the file or in this chunk.
             sequence: The publisher's number of the message, 0 to 2^32 - 1.
             log_time_ns: When it was received [ns since 1970].
-            publish_time_ns: When it was sent [ns since 1970].
             data: The payload; without ``gather`` it must not change before the chunk is written.
             length: Of the payload, all its pieces together [bytes].
 
@@ -330,7 +320,6 @@ class DataSection:
         """Write the message indexes of a chunk that lies at ``start``, at the end of the file.
 
         Args:
-            chunk: What is at ``start`` already.
             start: Where the chunk begins [bytes from the start of the file].
         """
         indexes, offsets = index_records(chunk.index, self.file.offset)
@@ -343,9 +332,7 @@ class DataSection:
         """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``.
 
         Args:
-            chunk: What was written.
             start: Where the chunk begins [bytes from the start of the file].
-            offsets: Where the message index of each channel begins, by channel id.
             index_length: Of all its message indexes together [bytes].
         """
         place = ChunkPlace(
@@ -368,9 +355,6 @@ class DataSection:
         """Write an attachment.
 
         Args:
-            name: Of the attachment, such as ``robot.urdf``.
-            data: Its contents.
-            media_type: Such as ``application/xml``.
             log_time_ns: When it was recorded [ns since 1970].
             create_time_ns: When it was made; 0 for unknown.
         """

@@ -42,7 +42,6 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
     """Read the whole data section once; every chunk is unpacked and its CRC checked.
 
     Args:
-        stream: The file.
         data_end: Where its data section ends [bytes from the start of the file].
 
     Raises:
@@ -55,12 +54,7 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
 
 
 def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
-    """Make the index entry of a chunk; its message indexes are yet to be added.
-
-    Args:
-        place: Where the chunk's record lies.
-        chunk: What the record says of its contents.
-    """
+    """Make the index entry of a chunk; its message indexes are yet to be added."""
     return records.ChunkIndex(
         chunk_length=place.end - place.offset,
         chunk_start_offset=place.offset,
@@ -87,7 +81,6 @@ def attachment_entry(
     """Make the index entry of an attachment.
 
     Args:
-        place: Where the attachment's record lies.
         record: Its name, type and times; its data may have been left out.
         data_size: Of the data [bytes].
     """
@@ -204,7 +197,6 @@ def damaged(path: Path, error: BaseException) -> EpisodeError:
     """Make one message of what reading a file's bytes raised.
 
     Args:
-        path: The file that was read.
         error: What went wrong; of its text 120 characters are kept.
     """
     return EpisodeError(

@@ -86,10 +86,8 @@ def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
 
     Args:
         schema_id: 1 to 65535, once in a file.
-        name: Of the type, such as ``sensor_msgs/msg/JointState``.
         encoding: How ``data`` is written, such as ``ros2msg`` or ``jsonschema``; "" for no schema
             text.
-        data: The text of the schema.
     """
     size = struct.pack("<I", len(data))
     return record(SCHEMA, struct.pack("<H", schema_id), text(name), text(encoding), size, data)
@@ -107,9 +105,7 @@ def channel(
     Args:
         channel_id: 0 to 65535, once in a file.
         schema_id: Of a schema before it in the file, or 0.
-        topic: With its leading slash.
         message_encoding: Such as ``cdr`` or ``json``.
-        about: Metadata of the channel.
     """
     ids = struct.pack("<HH", channel_id, schema_id)
     return record(CHANNEL, ids, text(topic), text(message_encoding), text_map(about))
@@ -123,10 +119,7 @@ def chunk_head(
     Args:
         start_ns: First log time inside.
         end_ns: Last log time inside.
-        size: Bytes of the records before compression.
-        crc: CRC-32 of those bytes.
         compression: Empty, lz4 or zstd.
-        data_size: Bytes that follow.
     """
     fields = CHUNK_FIELDS.pack(start_ns, end_ns, size, crc) + text(compression)
     fields += struct.pack("<Q", data_size)
@@ -137,7 +130,6 @@ def message_index(channel_id: int, entries: list[int]) -> bytes:
     """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ...
 
     Args:
-        channel_id: Of the channel.
         entries: Log times [ns since 1970] and offsets [bytes into the unpacked chunk] in turn.
     """
     head = struct.pack("<HI", channel_id, 8 * len(entries))
@@ -165,9 +157,7 @@ def attachment(
     """Encode an attachment as buffers to be written one after the other.
 
     Args:
-        name: Of the attachment, such as ``robot.urdf``.
         data: Its contents; not copied.
-        media_type: Such as ``application/xml``.
         log_time_ns: When it was recorded [ns since 1970].
         create_time_ns: When it was made; 0 for unknown.
     """
@@ -191,8 +181,6 @@ def attachment_index(
     """Encode where an attachment record of ``length`` bytes lies.
 
     Args:
-        name: As in the attachment's record, and so are the type and the times.
-        media_type: Such as ``application/xml``.
         log_time_ns: When it was recorded [ns since 1970].
         create_time_ns: When it was made; 0 for unknown.
         data_size: Of the attachment alone [bytes].
@@ -227,11 +215,6 @@ def statistics(
     """Encode the counts of a file; ``message_counts`` is by channel.
 
     Args:
-        schemas: Number of different schemas.
-        attachments: Number of attachment records.
-        metadata_records: Number of metadata records.
-        chunks: Number of chunk records.
-        channels: Number of channels, those without messages too.
         start_ns: Earliest log time [ns since 1970], 0 when there is no message.
         end_ns: Latest log time, 0 when there is no message.
         message_counts: Messages by channel id; their sum is the file's.
@@ -246,7 +229,6 @@ def summary_offset(opcode: int, *, start: int, length: int) -> bytes:
     """Encode where the summary's records of one kind lie.
 
     Args:
-        opcode: Of the kind of record.
         start: Where the first of them begins [bytes from the start of the file].
         length: Of all of them together [bytes].
     """
@@ -263,7 +245,6 @@ def summary_section(groups: Iterable[tuple[int, bytes]], start: int) -> bytes:
 
     Args:
         groups: Opcode and joined records of each kind; empty ones are left out.
-        start: Where the summary begins in the file.
     """
     body, offsets = b"", b""
     for opcode, records in groups:
@@ -336,11 +317,5 @@ def _shift(num_bytes: int) -> int:
 
 
 def joined_crc(first: int, second: int, second_length: int) -> int:
-    """Return the CRC-32 of two pieces from that of each.
-
-    Args:
-        first: CRC of the first piece.
-        second: CRC of the second piece.
-        second_length: Bytes in the second piece.
-    """
+    """Return the CRC-32 of two pieces from that of each."""
     return _times(_shift(second_length), first) ^ second

@@ -61,7 +61,6 @@ def _refuse_strays(
     """Raise BrokenRecordError when a message is of a channel that was never announced.
 
     Args:
-        channel_ids: The channel of each message.
         announced: By channel id: whether the file announced the channel.
     """
     is_known = announced[channel_ids]
@@ -120,12 +119,7 @@ class Selection(NamedTuple):
     """Excluded."""
 
     def overlaps(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a stretch of time, ends included, holds a wanted one.
-
-        Args:
-            start_ns: First instant of the stretch [ns since 1970].
-            end_ns: Last instant of the stretch, part of it.
-        """
+        """Whether a stretch of time, ends included, holds a wanted one."""
         return (self.start_ns is None or end_ns >= self.start_ns) and (
             self.end_ns is None or start_ns < self.end_ns
         )
@@ -247,7 +241,6 @@ def read_chunk(
 
     Args:
         stream: The file; its position is changed.
-        index: Where the chunk lies, as the summary says.
         data_end: Where the data section ends [bytes from the start of the file].
 
     Raises:
@@ -319,7 +312,6 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
 
     Args:
         files: The parts of an episode; their order decides between equal log times.
-        select: Which topics and log times are wanted.
 
     Raises:
         EpisodeError: When a file is damaged or cannot be read.
@@ -354,12 +346,7 @@ def _sources(file: _OpenFile) -> Iterable[_Source]:
 
 
 def may_hold(index: records.ChunkIndex, channel_ids: Set[int]) -> bool:
-    """Whether a chunk may hold messages of some channels; one without an index may hold any.
-
-    Args:
-        index: What the summary says of the chunk.
-        channel_ids: The channels wanted.
-    """
+    """Whether a chunk may hold messages of some channels; one without an index may hold any."""
     listed = index.message_index_offsets
     return not listed or not channel_ids.isdisjoint(listed)
 

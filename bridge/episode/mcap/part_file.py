@@ -50,10 +50,6 @@ class PartFile:
     def append(self, buffers: Sequence[Buffer], *, crc: int | None = None) -> None:
         """Write one record or several, all or nothing.
 
-        Args:
-            buffers: The bytes, in pieces.
-            crc: CRC-32 of the file with them, where the caller has it cheaper.
-
         Raises:
             OSError: When the disk refused; the file ends where it ended before.
         """
@@ -120,7 +116,6 @@ class PartFile:
 
         Args:
             offset: The new length of the file [bytes].
-            crc: CRC-32 of the bytes before ``offset``.
         """
         os.ftruncate(self._descriptor, offset)
         self.offset, self.crc = offset, crc
@@ -200,7 +195,6 @@ def open_part(path: Path, *, replace_dead: bool) -> PartFile:
     """Create ``<path>.part``, locked, for an episode that is not there yet.
 
     Args:
-        path: The final name.
         replace_dead: Remove a part whose writer died, instead of refusing.
 
     Raises:
@@ -252,10 +246,6 @@ def cannot_write(path: Path, error: OSError) -> BridgeError:
 
 def lock_dead(path: Path, *, write: bool = True) -> int | None:
     """Open and lock a file whose writer is gone; None when it is still being written.
-
-    Args:
-        path: The file.
-        write: Open it for writing too.
 
     Raises:
         OSError: When it cannot be opened.

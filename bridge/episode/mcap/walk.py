@@ -81,7 +81,6 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Args:
-        stream: The file, or a data section in memory.
         start: Where the first record begins [bytes from the start of the stream].
         end: Where the last one must end.
 
@@ -98,10 +97,6 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
 
 def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
     """Yield the places of all records of a section of a file that is in memory.
-
-    Args:
-        section: Whole records.
-        start: Where it begins in the file.
 
     Raises:
         BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
@@ -133,7 +128,6 @@ def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
 
     Args:
         stream: The file; its position is changed.
-        place: Where the record lies, as ``walk`` gives it.
     """
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
@@ -195,10 +189,6 @@ _U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
     """Read a record other than messages, chunks and attachments; None for unknown opcodes.
 
-    Args:
-        opcode: Kind of the record.
-        body: Its bytes without opcode and length.
-
     Raises:
         BrokenRecordError: When its fields run past its end.
     """
@@ -225,7 +215,6 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
 
     Args:
         stream: The file; its position is changed.
-        place: Where the attachment's record lies.
         keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
 
     Raises:
@@ -344,10 +333,6 @@ def parse_chunk(body: bytes) -> ChunkHead:
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC.
 
-    Args:
-        chunk: Still packed.
-        whose: What to call the chunk in an error.
-
     Raises:
         BrokenRecordError: When one of them is wrong, or it is too large to be believed.
     """
@@ -403,8 +388,6 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
     """Read the front of the message record at ``at``; ``where`` becomes its ``at``.
 
     Args:
-        data: A chunk's unpacked data, or the front of a message record.
-        at: Where the record begins in ``data``.
         where: Its place as the caller counts it: in the chunk, or in the file [bytes].
     """
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)

@@ -83,8 +83,6 @@ def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
 
     Args:
         episode: Must have joints; gripper and cameras are taken where they are there.
-        fps: Rows per second.
-        depth: Also the depth of the cameras that have it.
 
     Raises:
         EpisodeError: When it has no joints, or its streams never overlap.
@@ -157,8 +155,6 @@ def row_images(
     """Yield the decoded image of each row; ``wanted`` never decreases.
 
     Args:
-        episode: Where the images are.
-        camera: Its id in the topics.
         wanted: Number of the image that each row takes, counted from 0 in log order.
     """
     row = 0
@@ -180,8 +176,6 @@ def row_depths(
     """Yield the depth of each row [mm]; ``wanted`` never decreases.
 
     Args:
-        episode: Where the images are.
-        camera: Its id in the topics.
         wanted: Number of the depth image that each row takes, counted from 0 in log order.
     """
     row = 0
@@ -306,9 +300,7 @@ def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]
     """Return the text; every choice that changes a number is in it.
 
     Args:
-        shape: What all episodes of the data set have in common.
         kind: What the column ``action`` holds: ``plan`` or ``next_state``.
-        table: One record for each episode, as in ``robot_gst_export.json``.
     """
     cameras = ", ".join(shape.cameras) or "none"
     stand_in = sum(bool(row["stand_in"]) for row in table)
@@ -363,7 +355,6 @@ def select_episodes(source: Path, config: LeRobotConfig) -> tuple[list[Path], li
     """Return the files to export and the ids left out because they are no demonstrations.
 
     Args:
-        source: A run folder, or one episode file, which is taken whatever its kind.
         config: Its ``episodes``, where given, are taken whatever their kind.
 
     Raises:
@@ -399,10 +390,6 @@ def export_lerobot(
     """Write the dataset.
 
     Args:
-        source: A run folder, or one episode file.
-        out: The folder to make.
-        config: Rate, actions, which episodes.
-        force: Replace an earlier export.
         advance: Told how many episodes are done; each counts twice, once for looking at it.
 
     Raises:

@@ -105,7 +105,6 @@ def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[Epi
     """Read the wanted rows of ``meta/episodes``, in order.
 
     Args:
-        info: The data set.
         wanted: Ranges of episode indices; None for all.
 
     Raises:
@@ -295,11 +294,7 @@ def import_lerobot(
     """Write ``ep_000123.mcap`` for each wanted episode; those already written are passed over.
 
     Args:
-        folder: The dataset.
-        run: Where the episodes go.
-        cell: Name of the cell in topics.
         wanted: Numbers of episodes; None is all.
-        advance: Told how many episodes are done.
         task: Name of the task they are trials of; "": they are not known to be any.
 
     Raises:

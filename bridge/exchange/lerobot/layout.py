@@ -117,7 +117,6 @@ class DatasetInfo:
         """Return a video file by its camera and indices.
 
         Args:
-            video_key: Feature name of the camera, such as ``observation.images.wrist``.
             chunk_index: Number of the folder, from 0.
             file_index: Number of the file in it, from 0.
         """

@@ -47,12 +47,9 @@ class VideoWriter:
 
         Args:
             path: The file; its folder is made where needed.
-            fps: Frames per second.
             width: Of every frame [px].
             height: Of every frame [px].
-            crf: Quality of colour, lower is better.
             is_depth: Frames are 12-bit codes, kept without loss.
-            keyframe_every: So many frames apart are those that can be decoded alone.
 
         Raises:
             MissingDependencyError: Without PyAV, or with one that has no encoder for this.
@@ -86,7 +83,6 @@ class VideoWriter:
 
         Args:
             pixels: RGB, height x width x 3 of uint8; of depth codes, height x width of uint16.
-            first: It begins an episode, so it is written as a key frame.
         """
         frame = self._frame_class.from_ndarray(pixels, format=self._format)
         if first:
@@ -112,12 +108,6 @@ def read_frames(
     path: Path, times_s: Sequence[float], tolerance_s: float, pixels: str = RGB
 ) -> Iterator[np.ndarray]:
     """Yield the frame nearest to each time; times ascend [s].
-
-    Args:
-        path: The video file.
-        times_s: From the start of the file [s].
-        tolerance_s: How far a frame may be from the time it stands for [s].
-        pixels: ``rgb24``, or ``gray12le`` of depth codes.
 
     Raises:
         LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder

@@ -203,9 +203,6 @@ class DatasetWriter:
         """Append one episode.
 
         Args:
-            task: What was to be done, in words.
-            state: Measured joints.
-            action: Commanded joints.
             success: Only written where all episodes are labelled.
             images: By camera, one per row: RGB, or depth [mm].
         """

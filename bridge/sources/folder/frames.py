@@ -82,9 +82,7 @@ def checked_rotation(
     """Return the rotation nearest to a matrix written with few digits.
 
     Args:
-        path: The file it stands in, for the error.
         R: The matrix as read; each singular value within ``ROTATION_TOLERANCE`` of 1.
-        where: What it is the rotation of, for the error.
 
     Raises:
         FolderError: When the matrix is not close to any rotation.
@@ -131,11 +129,6 @@ def read_color(path: Path) -> StoredColor:
 def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
     """Refuse an image of another size than its camera's.
 
-    Args:
-        path: The image, for the error.
-        shape: Its height and width.
-        camera: What it was taken with.
-
     Raises:
         FolderError: When the sizes differ.
     """
@@ -167,8 +160,6 @@ def require_image(path: Path, *, what: str, named_by: str) -> Path:
     """Return the path if the file is there.
 
     Args:
-        path: Of the image.
-        what: ``color`` or ``depth``, for the error.
         named_by: Who says that it exists, for the error: ``rgb.txt line 3 names it``.
 
     Raises:
@@ -196,9 +187,6 @@ def camera_of(
     Args:
         intrinsics: As given by the user, or None.
         nominal: Documented values, valid for 640 x 480 images only.
-        size: Width and height of the images.
-        option: The option that sets the intrinsics, for the message.
-        path: The folder, for the message.
 
     Raises:
         FolderError: When nothing is known for images of this size.
@@ -214,12 +202,7 @@ def camera_of(
 
 
 def refuse_scale_without_use(config: FolderConfig, path: Path) -> None:
-    """Refuse options that a self-describing index answers itself.
-
-    Args:
-        config: The options given.
-        path: The index that holds the same, for the error.
-    """
+    """Refuse options that a self-describing index answers itself."""
     for name in ("depth_intrinsics", "color_intrinsics", "depth_unit_m"):
         if getattr(config, name) is not None:
             raise FolderError(

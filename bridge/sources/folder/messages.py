@@ -46,10 +46,6 @@ DEFAULTS = FolderConfig()
 def read_index(folder: Path, config: FolderConfig = DEFAULTS) -> FolderIndex:
     """Find out a folder's layout and read it; every image it names must exist.
 
-    Args:
-        folder: The folder.
-        config: Intrinsics and depth unit for layouts that do not hold them.
-
     Raises:
         PathNotFoundError: When the folder or an image is not there.
         FolderError: When the layout is unknown, or something in it makes no sense.
@@ -101,7 +97,6 @@ def num_frames(index: FolderIndex, config: FolderConfig) -> int:
     """How many frames will be sent.
 
     Args:
-        index: What the folder holds.
         config: Its ``max_frames`` bounds the number; None: all.
     """
     return min(len(index.frames), config.max_frames or len(index.frames))
@@ -116,8 +111,6 @@ def frame_times_ns(
     without times gets the configured rate, from ``start_ns`` or 0.
 
     Args:
-        index: What the folder holds.
-        config: The rate of a folder without times, and how many frames are sent.
         start_ns: Time of the first image [ns since 1970]; None: as the folder says, else 0.
 
     Raises:
@@ -142,12 +135,7 @@ def frame_times_ns(
 
 
 def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
-    """What an episode's metadata says about the folder it came from.
-
-    Args:
-        index: What the folder holds.
-        config: The rate of a folder without times.
-    """
+    """What an episode's metadata says about the folder it came from."""
     rate_hz = config.rate_hz or DEFAULT_RATE_HZ
     nominal = f"nominal, {rate_hz:g} Hz from 0; the folder has none"
     return {
@@ -169,8 +157,6 @@ def folder_messages(
     """Yield the messages of one frame after another.
 
     Args:
-        index: The checked index.
-        config: Names and rate.
         start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
 
     Raises:

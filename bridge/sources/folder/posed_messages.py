@@ -64,10 +64,6 @@ def describe_posed(index: PosedIndex, config: PosedConfig) -> dict[str, Any]:
 def posed_messages(index: PosedIndex, config: PosedConfig) -> Iterator[list[StampedMessage]]:
     """Yield the messages of one image after another.
 
-    Args:
-        index: The checked index.
-        config: Names, rate and scale.
-
     Raises:
         FolderError: When an image cannot be read or has another size than its camera.
     """

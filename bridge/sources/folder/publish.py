@@ -48,11 +48,6 @@ class FolderSource:
     def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Send every frame at its time, or as fast as the network takes them.
 
-        Args:
-            session: Where the messages go.
-            stop: Ends it between two frames.
-            output: Shows how many frames are sent.
-
         Returns:
             Frames and messages sent, and messages by topic.
         """

@@ -50,7 +50,6 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a sequence folder.
 
     Args:
-        folder: One sequence.
         config: Its intrinsics and unit of depth go before those of the folder and the data set.
 
     Raises:

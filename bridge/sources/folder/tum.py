@@ -218,7 +218,6 @@ def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
     An association list is followed where there is one, else colour and depth are paired by time.
 
     Args:
-        folder: One sequence of the benchmark.
         config: Its intrinsics and unit of depth go before those of the folder and the benchmark.
 
     Raises:

@@ -48,10 +48,6 @@ class PlaybackConfig:
 def choose_topics(patterns: Sequence[str], there: Sequence[str]) -> list[str]:
     """Return the topics that a pattern names; all without one.
 
-    Args:
-        patterns: Topics or key expressions, with or without the leading slash.
-        there: Topics of the episode.
-
     Raises:
         UsageError: When a pattern names none of them, with those that are there.
     """

@@ -60,8 +60,6 @@ class Pace:
         """Begin with the first message.
 
         Args:
-            rate: Times as fast as recorded.
-            paused: Wait before the first message.
             monotonic: The clock [s].
         """
         self._rate = rate
@@ -101,10 +99,6 @@ class Pace:
 
     def wait(self, at_ns: int, stop: threading.Event) -> float | None:
         """Wait until a message is due.
-
-        Args:
-            at_ns: Its time in the episode [ns].
-            stop: Ends the wait.
 
         Returns:
             How late it is [s], or None when the playback was stopped.
@@ -184,10 +178,6 @@ class EpisodeSource:
 
     def __init__(self, path: Path, config: PlaybackConfig) -> None:
         """Open an episode and choose what is sent.
-
-        Args:
-            path: A finished episode, or any other MCAP file.
-            config: What, how fast, and under which names.
 
         Raises:
             PathNotFoundError: When the file is not there.

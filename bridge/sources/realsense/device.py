@@ -45,11 +45,7 @@ class Rectifier:
     """
 
     def __init__(self, intrinsics: Any) -> None:
-        """Ask the library once where each ideal pixel lies in the distorted image.
-
-        Args:
-            intrinsics: ``rs.intrinsics`` of the colour stream.
-        """
+        """Ask the library once where each ideal pixel lies in the distorted image."""
         u, v = np.moveaxis(_distorted_pixels(intrinsics), -1, 0)
         width, height = intrinsics.width, intrinsics.height
         inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
@@ -132,7 +128,6 @@ class FrameStamps:
         """Return when a frame was taken [ns], or None while that cannot be said yet.
 
         Args:
-            frame: ``rs.frame``.
             received_ns: When it arrived, by the host's clock.
         """
         # A double holds today's time in microseconds exactly, in nanoseconds not.
@@ -179,9 +174,6 @@ class CameraDevice:
         """Open both sensors and start them.
 
         Args:
-            device: ``rs.device``, also an ``rs.software_device``.
-            config: Size and rate; whether depth is aligned.
-            camera: Its name, for errors.
             now_ns: The host's clock.
 
         Raises:

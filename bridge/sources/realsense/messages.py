@@ -34,10 +34,6 @@ Mount = tuple[str, Float[np.ndarray, "4 4"]]
 def read_mounts(path: Path, cameras: list[str]) -> dict[str, Mount]:
     """Read the pose of the colour cameras.
 
-    Args:
-        path: The file named by --mounts.
-        cameras: Names that may occur in it.
-
     Raises:
         MountsError: When an entry is not a pose of a known camera.
     """
@@ -126,7 +122,6 @@ class CameraMessages:
         Args:
             calibration: Intrinsics of both streams, and ``T_color_depth``.
             mount: Parent frame and pose of the colour camera in it; None leaves that out.
-            stamp_ns: Of every message [ns since 1970].
         """
         transforms = [
             FrameTransform(

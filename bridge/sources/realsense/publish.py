@@ -163,10 +163,6 @@ class RealSenseSource:
     def __init__(self, config: RealSenseConfig, list_devices: ListDevices) -> None:
         """Look for every camera asked for.
 
-        Args:
-            config: Which cameras, and how.
-            list_devices: Called whenever a camera is looked for.
-
         Raises:
             CameraNotFoundError: When one of them is not attached.
         """
@@ -192,9 +188,7 @@ class RealSenseSource:
         """Publish every camera until stopped, by the caller or because one failed.
 
         Args:
-            session: Where the messages go.
             stop: Ends all cameras; also set here when one of them fails.
-            output: Says when a camera is lost and when it is back.
 
         Returns:
             Frames sent and lost by camera.
@@ -240,7 +234,6 @@ def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[s
 
     Args:
         config: Names and serial numbers wanted; without any, the only camera is taken.
-        list_devices: Returns the cameras attached now.
 
     Raises:
         CameraNotFoundError: When one is not, or none was named and there is not just one.

@@ -189,7 +189,6 @@ class StandinCell:
 
         Args:
             times_ns: Of each waypoint, ascending; the last says how long the motion takes.
-            joints_rad: Targets of the arm at these times.
         """
         count = round(int(times_ns[-1]) / TICK_NS)
         ticks_ns = np.arange(1, count + 1) * TICK_NS

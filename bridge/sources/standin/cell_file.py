@@ -289,7 +289,6 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
 
     Args:
         cell: Ranges and standard deviations to draw from.
-        seed: Number of the laboratory.
         task: Whose objects are in it; a cell may have other ranges for a task. Not needed for a
             cell without deviations.
     """
@@ -334,7 +333,6 @@ def small_transform(
     """Build a transform from a translation and a rotation vector [rad].
 
     Args:
-        shift_m: Translation [m].
         turn_rad: Axis of the rotation times its angle; zeros for none.
     """
     angle = float(np.linalg.norm(turn_rad))

@@ -116,9 +116,6 @@ class Decider:
         """Prepare; nothing is asked before ``decide``.
 
         Args:
-            cell: The laboratory.
-            session: Where planner and gate answer.
-            config: Who plans, and how often.
             task_sha256: Of the task file; "" where it is not known.
 
         Raises:

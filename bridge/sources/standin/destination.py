@@ -88,8 +88,6 @@ def destination_of(
     """Find where an object belongs by the success predicates, and where that is.
 
     Args:
-        task: Its objects and predicates.
-        object_id: One of its manipulated objects.
         seen: Poses ``T_base_object`` when the object is put there.
 
     Raises:
@@ -149,9 +147,6 @@ def _beside(
 def slots_of(places: Mapping[str, Destination]) -> dict[str, Float[np.ndarray, "2"]]:
     """Share each destination among the objects that belong there.
 
-    Args:
-        places: Where each object belongs.
-
     Returns:
         Where on the area of its destination each object goes [m].
     """
@@ -170,7 +165,6 @@ def release_slots(count: int, area_m: tuple[float, float]) -> list[Float[np.ndar
     An odd last one lies between the rows; a single one goes to the middle.
 
     Args:
-        count: How many objects.
         area_m: Extents of the area along its x and y axes; heights are not decided here.
     """
     x, y = area_m

@@ -128,12 +128,7 @@ class Deviations:
         return T
 
     def lens(self, camera_id: str, camera: Camera) -> Lens:
-        """The true camera behind a published one.
-
-        Args:
-            camera_id: Its name in the cell file.
-            camera: As published, at the resolution wanted.
-        """
+        """The true camera behind a published one."""
         focal, cx, cy, k1, k2 = self.lenses[camera_id]
         return Lens(
             width=camera.width,
@@ -152,7 +147,6 @@ class Deviations:
         """Where things come to lie that are put where they were declared, resting on the table.
 
         Args:
-            task: With the true sizes.
             declared: Poses on the published table, the plane z = 0.
         """
         poses = {}
@@ -191,7 +185,6 @@ def parts_of(model: ObjectModel, deviation: ObjectDeviation | None = None) -> li
     """The boxes a rigid object collides with, and is seen as.
 
     Args:
-        model: With its true size.
         deviation: Steps along its edges, or a lip; None for the shape of the task file.
     """
     if model.mesh == BASKET:
@@ -227,14 +220,7 @@ def draw_deviations(
     cameras: Iterable[str],
     objects: Mapping[str, ObjectModel],
 ) -> Deviations:
-    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another.
-
-    Args:
-        ranges: Low and high of every name in ``RANGES``.
-        seed: Number of the laboratory.
-        cameras: Their names.
-        objects: Of the task.
-    """
+    """Draw one laboratory; each quantity has a stream of its own, so that none shifts another."""
 
     def draw(key: str, whose: str, count: int) -> tuple[float, ...]:
         stream = [DEVIATION_STREAM, seed, zlib.crc32(f"{key} {whose}".encode())]

@@ -54,7 +54,6 @@ class GateSight:
         """Read an answer; one that cannot be read, or lacks an object, is none.
 
         Args:
-            data: What the service answered.
             task: All of whose objects must be in it.
         """
         try:
@@ -83,11 +82,8 @@ def ask_where(
     """Ask a cell's gate where a task's objects are.
 
     Args:
-        session: Where the gate answers.
-        cell: Name the gate was started with.
         task: All of whose objects must be found.
         task_sha256: Of its file; "" where it is not known.
-        timeout_s: How long to wait [s].
     """
     key = cell_topic(cell, LOCALISE)[1:]
     payload = json.dumps({"task": task.name, "task_sha256": task_sha256}).encode()

@@ -66,7 +66,6 @@ class Kinematics:
         """Return where a link is at these joints, gripper closed.
 
         Args:
-            joints_rad: Angles of the arm.
             frame: A frame of the URDF, such as ``tool0``.
         """
         pinocchio.framesForwardKinematics(self._model, self._data, self._full(joints_rad))
@@ -81,7 +80,6 @@ class Kinematics:
         """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3).
 
         Args:
-            T_base_tcp: Where the tool is to be.
             joints_seed_rad: Where the search begins; near the solution wanted.
 
         Raises:
@@ -231,12 +229,7 @@ class Track:
     def at_rest(
         T_base_tcp: Float[np.ndarray, "4 4"], joints_rad: Float[np.ndarray, "6"]
     ) -> "Track":
-        """Start with an open gripper.
-
-        Args:
-            T_base_tcp: Where the tool is at these joints.
-            joints_rad: Angles of the arm.
-        """
+        """Start with an open gripper."""
         return Track(
             tau=(_waypoint(0, T_base_tcp, joints_rad, 0, MAX_WIDTH_M),),
             bounds={},
@@ -252,7 +245,6 @@ def follow_legs(
     Args:
         before: What has been planned; the legs begin where it ends.
         legs: Movements of the tool, one after the other.
-        kinematics: Of the arm.
         max_joint_speed_rad_s: A leg takes longer than it asks for where a joint would be faster.
 
     Raises:

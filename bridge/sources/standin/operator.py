@@ -55,10 +55,7 @@ def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = ""
     A task with several objects is counted by object: k of n are where they belong.
 
     Args:
-        task: Its predicates decide.
-        truth: True states of the whole trial.
         executed: Whether anything was executed.
-        remark: Put in front of the detail.
     """
     rollout = truth.rollout()
     findings = evaluate_success(task, rollout)
@@ -150,12 +147,7 @@ SETTLE_S = 0.8
 
 
 def execute_plan(cell: StandinCell, plan: Plan) -> None:
-    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper.
-
-    Args:
-        cell: Moves, and publishes as it does.
-        plan: Its first waypoint should be where the arm is.
-    """
+    """Move as ``joints_rad`` says; events mark the plan, its stages and the gripper."""
     streams = cell.streams
     times = plan.times_ns()
     joints = np.array([waypoint.joints_rad for waypoint in plan.tau], dtype=np.float64)
@@ -258,15 +250,7 @@ class Operator:
         output: Output | None = None,
         task_file: TaskFile | None = None,
     ) -> None:
-        """Prepare; nothing is published before ``scan`` or ``trials``.
-
-        Args:
-            cell: The laboratory.
-            session: Where recorder and gate answer.
-            config: What to do.
-            output: How to talk.
-            task_file: Sent to the recorder with every start.
-        """
+        """Prepare; nothing is published before ``scan`` or ``trials``."""
         unknown = sorted(set(config.conditions) - set(CONDITIONS))
         if unknown:
             message = f"condition {unknown[0]!r} is unknown. There are: {', '.join(CONDITIONS)}."

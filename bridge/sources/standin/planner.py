@@ -48,10 +48,6 @@ class StageIds:
 def stage_ids(task: Task, object_id: str) -> StageIds:
     """The stages that grasp, carry and release an object; placing may cover the carrying.
 
-    Args:
-        task: Whose stages are searched.
-        object_id: One of its manipulated objects.
-
     Raises:
         UsageError: When none grasps or none releases it.
     """
@@ -79,8 +75,6 @@ def planned_stages(
     """What a plan says of each stage of its task: when it is, and where it leaves its object.
 
     Args:
-        task: Its stages.
-        legs_of: How each object is moved.
         bounds: When each stage begins and ends, from the start of the plan [ns].
         seen: Poses ``T_base_object`` as perceived.
         places: Where each object belongs; None for one that is pushed to its mark.
@@ -181,7 +175,6 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
 
     Args:
         noise: Standard deviations.
-        start_seed: Number of the start.
         round_: Number of the attempt, from 0: one more for each plan that was refused.
         index: Number of the object among those manipulated, from 0.
     """
@@ -205,8 +198,6 @@ def draw_errors(
 
     Args:
         noise: Standard deviations.
-        count: How many objects are manipulated.
-        start_seed: Number of the start.
         round_: Number of the attempt, from 0: one more for each plan that was refused.
     """
     return tuple(
@@ -258,18 +249,9 @@ def plan_pick_and_place(
     """Plan one attempt: each object in turn is put into its slot or pushed to its mark; then home.
 
     Args:
-        task: Objects and stages.
         seen: Poses ``T_base_object`` as perceived.
-        error: How the attempt misses, one for all objects or one per manipulated object.
-        kinematics: The arm's.
-        joints_start_rad: Where it starts and ends.
-        max_joint_speed_rad_s: No joint moves faster.
-        plan_id: Name of the plan.
-        condition: Of the trial.
-        start_id: Of the trial.
         parent_id: The plan that was refused before.
         round_: How many were refused before.
-        grounding: Where ``seen`` is from, in words.
 
     Raises:
         UnreachablePoseError: When the arm cannot follow.
@@ -460,12 +442,7 @@ PUSH_STEP_S = 0.02
 
 
 def pushing_stage(task: Task, object_id: str) -> Mapping[str, Any] | None:
-    """The stage that pushes an object; None when it is not pushed.
-
-    Args:
-        task: Whose stages are searched.
-        object_id: One of its manipulated objects.
-    """
+    """The stage that pushes an object; None when it is not pushed."""
     return next((stage for stage in task.stages if stage.get("push") == object_id), None)
 
 

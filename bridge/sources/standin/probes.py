@@ -108,13 +108,7 @@ def plan_probe(
 
     Args:
         kind: One of ``PROBES``.
-        task: Its first manipulated object is probed.
         seen: Poses ``T_base_object`` as perceived.
-        kinematics: The arm's.
-        joints_start_rad: Where it starts and ends.
-        max_joint_speed_rad_s: No joint moves faster.
-        plan_id: Name of the plan.
-        start_id: Of the episode.
         turn: 1 or -1: to which side a squeeze is askew.
 
     Raises:

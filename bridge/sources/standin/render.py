@@ -80,7 +80,6 @@ class Renderer:
         """See the laboratory without the bodies in it, for ``render`` from the same place.
 
         Args:
-            camera: Intrinsics and size of the picture.
             T_base_camera: Where the camera stands, with OpenCV axes.
         """
         posed = self._pose(T_base_camera, {}, self._unmoving, {})
@@ -98,7 +97,6 @@ class Renderer:
         """Take a picture of the bodies where they are, the soft ones by their skins.
 
         Args:
-            camera: Intrinsics and size of the picture.
             T_base_camera: Where the camera is, with OpenCV axes.
             Ts_base_body: Poses of the moving bodies, by name.
             backdrop: What ``backdrop`` returned for the same place; None draws the laboratory too.
@@ -315,9 +313,6 @@ def measure_depth(
     """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement".
 
     Args:
-        picture: What an ideal camera sees.
-        model: Noise and range of the sensor.
-        hidden: True scale and offset of this laboratory's sensor.
         rng: Drawn from in a fixed order: the same state gives the same image.
     """
     true_m = np.where(np.isfinite(picture.depth_m), picture.depth_m, 0.0)
@@ -349,14 +344,7 @@ def measure_color(
     hidden: HiddenParameters,
     rng: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour with the exposure's gain and noise.
-
-    Args:
-        picture: What an ideal camera sees.
-        model: Noise of the sensor.
-        hidden: Gain of this laboratory's exposure.
-        rng: The same state gives the same image.
-    """
+    """Colour with the exposure's gain and noise."""
     noise = rng.standard_normal(picture.image.shape, dtype=np.float32)
     levels = picture.image * np.float32(255.0 * hidden.image_gain)
     return np.clip(levels + np.float32(model.image_noise) * noise + 0.5, 0, 255).astype(np.uint8)

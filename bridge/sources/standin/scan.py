@@ -49,12 +49,6 @@ def scan_joints(
     """Find joints for each viewpoint that can be reached safely from the one before.
 
     Viewpoints behind the reach of the arm are left out.
-
-    Args:
-        mount: The wrist camera on the arm.
-        kinematics: Of the arm.
-        joints_start_rad: Where the arm is before the first viewpoint.
-        config: Rings of viewpoints.
     """
     T_parent_tcp = se3.invert(
         kinematics.T_base_frame(joints_start_rad, mount.parent)
@@ -134,8 +128,6 @@ def joint_move(
 
     Args:
         start_rad: At rest at the first time, 0.
-        end_rad: At rest at the last time.
-        max_speed_rad_s: No joint is faster at any time.
     """
     largest = float(np.max(np.abs(end_rad - start_rad)))
     # The minimum-jerk law peaks at 15/8 of its mean speed.

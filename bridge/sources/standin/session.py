@@ -34,9 +34,6 @@ def run_session(
     """Record a scan, trials and probes as the configuration says.
 
     Args:
-        session: Where to publish, and where recorder and gate answer.
-        config: What to do.
-        output: How to talk.
         should_stop: Asked every 8 ms of the cell's time; the open episode is then finished.
         start_ns: The cell's time at the start; the wall clock's when not given.
 
@@ -122,9 +119,7 @@ class StandinSource:
         """Record as the configuration says, or until stopped; see ``run_session``.
 
         Args:
-            session: Where the cell publishes and the recorder is asked.
             stop: Looked at every 8 ms of the cell's time; the open episode is then finished.
-            output: For progress and remarks.
         """
         # Without an answer to @clock: the stamps are simulated time, not that of this host.
         session.declare_alive(f"{self.config.cell}/alive")

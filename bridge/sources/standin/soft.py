@@ -26,7 +26,6 @@ def soft_model_xml(task: Task, hidden: HiddenParameters) -> str:
 
     Args:
         task: Its soft objects become flexes named by their ids.
-        hidden: Friction, mass and stiffness.
     """
     bodies = "".join(
         _flex_xml(model, hidden) for model in task.objects.values() if model.soft is not None
@@ -92,12 +91,7 @@ class SoftBody:
 
 
 def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
-    """Find the nodes of a soft object in a compiled model.
-
-    Args:
-        model: A soft object of the task.
-        mujoco_model: The compiled ``mjModel`` it is part of.
-    """
+    """Find the nodes of a soft object in a compiled model."""
     if model.soft is None:
         message = f"{model.id} is not soft"
         raise ValueError(message)

@@ -64,22 +64,10 @@ class Session(Protocol):
     """The part of ``bridge.wire.session.WireSession`` that the cell uses."""
 
     def publisher(self, topic: str, type_name: str, *, qos: Qos = Qos.RELIABLE) -> Publisher:
-        """Announce a topic.
-
-        Args:
-            topic: With its leading slash.
-            type_name: Type of all its messages.
-            qos: How its messages travel when the network is behind.
-        """
+        """Announce a topic."""
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """Ask and wait.
-
-        Args:
-            key: Whom to ask, as a zenoh key.
-            payload: The request.
-            timeout_s: How long to wait for the answer [s].
-        """
+        """Ask and wait."""
 
 
 def color_frame(camera_id: str) -> str:
@@ -121,7 +109,6 @@ class Streams:
 
         Args:
             poses: ``T_base_camera`` by camera id, believed, not true.
-            stamp_ns: The cell's time [ns].
             static: They hold from now on (``/tf_static``); else at this instant (``/tf``).
         """
         items = [
@@ -164,10 +151,7 @@ class Streams:
         """Publish colour and depth of one instant.
 
         Args:
-            camera_id: Name of the camera.
-            image_u8: RGB; sent as JPEG.
             depth_mm: Aligned with the colour; 0 is "no measurement".
-            stamp_ns: The cell's time of both [ns].
         """
         color = CompressedColor(
             stamp_ns=stamp_ns,
@@ -193,7 +177,6 @@ class Streams:
             position: Measured angles [rad].
             velocity: Measured [rad/s].
             effort: Torques [N m].
-            stamp_ns: The cell's time [ns].
         """
         sample = JointSample(
             stamp_ns=stamp_ns,
@@ -230,26 +213,14 @@ class Streams:
     def truth_object(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"], stamp_ns: int
     ) -> None:
-        """Publish a true pose, for tests and the evaluator's perception metrics only.
-
-        Args:
-            object_id: Id of the object in the task.
-            T_base_object: Where it really is.
-            stamp_ns: The cell's time [ns].
-        """
+        """Publish a true pose, for tests and the evaluator's perception metrics only."""
         sample = PoseSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, T_frame_body=T_base_object)
         self._put(object_topic(TRUTH, object_id, "pose"), sample.to_cdr(), stamp_ns)
 
     def truth_nodes(
         self, object_id: str, points_m: Float[np.ndarray, "num_points 3"], stamp_ns: int
     ) -> None:
-        """Publish where the points of a soft object really are, in ``base_link``.
-
-        Args:
-            object_id: Id of a soft object in the task.
-            points_m: In ``base_link``.
-            stamp_ns: The cell's time [ns].
-        """
+        """Publish where the points of a soft object really are, in ``base_link``."""
         sample = PointCloudSample(stamp_ns=stamp_ns, frame_id=BASE_FRAME, points_m=points_m)
         self._put(object_topic(TRUTH, object_id, "nodes"), sample.to_cdr(), stamp_ns)
 
@@ -272,8 +243,6 @@ class Streams:
         """Publish one event; the schema lists the kinds and the fields.
 
         Args:
-            kind: One of the types of the event schema.
-            stamp_ns: The cell's time [ns].
             **fields: Further fields of the event, such as ``plan_id``; checked against the schema.
         """
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}

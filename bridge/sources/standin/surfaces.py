@@ -54,9 +54,7 @@ def table_texture(size_m: tuple[float, float], centre_m: tuple[float, float], se
     """Wooden boards along y with grain, and patches of coloured tape and checkers.
 
     Args:
-        size_m: Extents along x and y [m].
         centre_m: Its middle in the base frame, x and y [m].
-        seed: Of the laboratory.
     """
     rng = np.random.default_rng([7, seed])
     columns, rows = (round(extent / TABLE_RESOLUTION_M) for extent in size_m)
@@ -118,9 +116,7 @@ def lab_texture(
     """Floor or wall: large soft blotches and tile lines, low contrast.
 
     Args:
-        size_m: Extents of the rectangle [m].
         base: Mean colour, sRGB in 0..1.
-        seed: Of the laboratory, plus the number of the surface.
     """
     rng = np.random.default_rng([8, seed])
     columns, rows = (round(extent / ROOM_RESOLUTION_M) for extent in size_m)
@@ -174,7 +170,6 @@ def box_surface(
     Args:
         body: Name of the body it moves with; "" for the laboratory.
         centre_m: Of the box, in the frame of the body [m].
-        size_m: Edges of the box [m].
         color: sRGB in 0..1.
     """
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -196,7 +191,6 @@ def make_surface(
     Args:
         body: Name of the body it moves with; "" for the laboratory.
         vertices_m: In the frame of the body.
-        triangles: Indices of vertices, counterclockwise seen from outside.
         color: sRGB in 0..1.
     """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
@@ -263,7 +257,6 @@ def object_surfaces(task: Task, deviations: Deviations | None = None) -> list[Su
     """The task's objects in their declared colours.
 
     Args:
-        task: With the objects' true sizes.
         deviations: Steps and lips of their shapes; None where they are as declared.
     """
     surfaces = []
@@ -304,8 +297,6 @@ def smooth_normals(
 
     Args:
         vertices_m: In any frame; the normals are in the same.
-        triangles: Indices of vertices, counterclockwise seen from outside, one row of three for
-            each.
     """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
@@ -351,7 +342,6 @@ def lab_surfaces(seed: int, deviations: Deviations | None = None) -> list[Surfac
     """Table top with its texture, floor and four walls.
 
     Args:
-        seed: Of the laboratory.
         deviations: Where the table really stands; None for where it is published.
     """
     x, y, z = TABLE_SIZE_M

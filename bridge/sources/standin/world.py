@@ -203,13 +203,7 @@ def step_s_of(task: Task) -> float:
 
 
 def build_model(task: Task, hidden: HiddenParameters, clutter: Sequence[Clutter] = ()) -> Any:
-    """Compile the laboratory with its true parameters into an ``mjModel``.
-
-    Args:
-        task: Its objects, with their true sizes, are put into the laboratory.
-        hidden: True masses, frictions and offsets.
-        clutter: What stands about and is no object of the task.
-    """
+    """Compile the laboratory with its true parameters into an ``mjModel``."""
     if task.soft_objects:
         spec = mujoco.MjSpec.from_string(soft_model_xml(task, hidden))
         # The only integrator that takes the elasticity of flexes.
@@ -367,7 +361,6 @@ def standing_clutter(clutter: Sequence[Clutter], hidden: HiddenParameters) -> tu
 
     Args:
         clutter: As published, on the plane z = 0.
-        hidden: Knows the table.
     """
     if hidden.deviations is None:
         return tuple(clutter)
@@ -456,7 +449,6 @@ class World:
         """Put the arm and the objects somewhere, at rest, gripper open.
 
         Args:
-            joints_rad: Angles of the arm.
             Ts_base_object: Pose of each object by id.
         """
         mujoco.mj_resetData(self._model, self._data)
@@ -487,12 +479,7 @@ class World:
         mujoco.mj_forward(self._model, self._data)
 
     def command(self, joints_rad: Float[np.ndarray, "6"], width_m: float) -> None:
-        """Send targets to the servos; they act after the cell's latency.
-
-        Args:
-            joints_rad: Targets of the arm.
-            width_m: Target of the gripper, the distance between the pads.
-        """
+        """Send targets to the servos; they act after the cell's latency."""
         if self._play_rad.any():  # a link follows where its motor reaches the end of the play
             last_rad = self._pending[-1][:-1] if self._pending else joints_rad
             half_rad = self._play_rad / 2
@@ -566,7 +553,6 @@ class World:
         """Outer extents of a soft object along the axes of its pose.
 
         Args:
-            object_id: A soft object of the task.
             T_base_object: Its pose, whose axes are measured along.
         """
         return self._soft[object_id].extents_m(self.nodes_m(object_id), T_base_object)

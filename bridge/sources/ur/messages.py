@@ -110,7 +110,6 @@ def mode_event(
     """What the controller says of itself, as an event (type note).
 
     Args:
-        cell: Name of the cell, without slashes.
         robot_mode: The controller's number of it; None when it does not say.
         safety_mode: The controller's number of it; None when it does not say.
         stamp_ns: Source time of the sample that says so [ns since 1970].

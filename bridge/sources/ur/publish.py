@@ -217,11 +217,6 @@ class UrSource:
     def run(self, session: WireSession, stop: threading.Event, output: Output) -> dict[str, Any]:
         """Publish until stopped.
 
-        Args:
-            session: Where the messages go.
-            stop: Ends it, also while it waits for the controller to come back.
-            output: Says when the controller is lost and when it is back.
-
         Returns:
             Samples sent, samples that did not reach us, and connections made.
 

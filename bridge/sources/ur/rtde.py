@@ -64,7 +64,6 @@ def encode_package(kind: int, payload: bytes = b"") -> bytes:
 
     Args:
         kind: Code of the kind of package, 0 to 255.
-        payload: What follows the header.
     """
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
@@ -159,11 +158,6 @@ class RtdeLink:
     def __init__(self, host: str, port: int, *, on_text: Callable[[str], None]) -> None:
         """Connect.
 
-        Args:
-            host: Name or address of the controller.
-            port: Its RTDE port.
-            on_text: Told what the controller says in words.
-
         Raises:
             ControllerError: When nobody answers.
         """
@@ -184,10 +178,6 @@ class RtdeLink:
 
     def ask(self, kind: Kind, payload: bytes = b"") -> bytes:
         """Send a request and return the payload of its answer.
-
-        Args:
-            kind: Of the request, and of its answer.
-            payload: What follows the header of the request.
 
         Raises:
             ControllerError: When the controller goes away or takes too long.
@@ -295,11 +285,8 @@ class RtdeClient:
         """Connect, agree on what is sent, and start it.
 
         Args:
-            host: Name or address of the controller.
             port: 30004, unless forwarded.
-            wish: What it shall send; ``timestamp`` is always read.
             now_ns: The host's clock.
-            on_text: Told what the controller says in words.
 
         Raises:
             ControllerError: When nobody answers, a required variable is unknown, or the

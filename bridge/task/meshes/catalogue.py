@@ -69,12 +69,7 @@ def toy_mesh(name: str, size_m: tuple[float, float, float]) -> ToyMesh:
 
 @cache
 def basket_mesh(inner_m: tuple[float, float, float], wall_m: float) -> ToyMesh:
-    """Make a basket around a cavity; the origin is under the middle of the floor.
-
-    Args:
-        inner_m: Extents of the cavity [m].
-        wall_m: Thickness of walls and floor [m].
-    """
+    """Make a basket around a cavity; the origin is under the middle of the floor."""
     design = basket_design(inner_m, wall_m)
     vertices, triangles = mesh_of(design.solid, design.low_m, design.high_m, design.spacing_m)
     return ToyMesh(vertices_m=vertices, triangles=triangles, paint=design.paint, solid=design.solid)

@@ -40,7 +40,6 @@ def make_lattice(mesh: ToyMesh, cell_m: float) -> Lattice:
     """Fill a body with cells of about this size whose outer corners lie on its surface.
 
     Args:
-        mesh: The body.
         cell_m: Edge of a cell [m]; the box around the body is divided evenly.
 
     Raises:
@@ -57,8 +56,6 @@ def fill(
     Args:
         solid: Its signed distance.
         low: Lower corner of the box [m].
-        high: Upper corner.
-        cell_m: Edge of a cell [m].
 
     Raises:
         UsageError: No cell lies inside.
@@ -103,12 +100,7 @@ def volumes_m3(
 def cage_nodes(
     low_m: Float[np.ndarray, "3"], high_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "8 3"]:
-    """Corners of a box in the order of ``CORNERS``: z runs fastest.
-
-    Args:
-        low_m: Corner of the box with the smallest coordinates.
-        high_m: Corner with the largest.
-    """
+    """Corners of a box in the order of ``CORNERS``: z runs fastest."""
     return np.asarray(low_m + np.array(CORNERS, dtype=np.float64) * (high_m - low_m))
 
 
@@ -121,7 +113,6 @@ def cage_weights(
 
     Args:
         points_m: In the frame of the box; outside it the weights extrapolate.
-        low_m: Corner of the box with the smallest coordinates.
         high_m: Corner with the largest; larger along every axis.
     """
     s = (points_m - low_m) / (high_m - low_m)

@@ -166,7 +166,6 @@ def cut(
     Args:
         solid: Signed distances to what is cut [m].
         tool: Of the same points to what is taken away [m].
-        width: As in ``blend``.
     """
     return np.asarray(-blend(-solid, tool, width))
 
@@ -215,10 +214,7 @@ def mesh_of(
     is not a surface: then the grid is shifted by part of a cell.
 
     Args:
-        solid: Signed distance, negative inside.
         low_m: Lower corner of the grid; at least two cells outside the solid.
-        high_m: Upper corner.
-        spacing_m: Edge of a grid cell.
 
     Raises:
         OpenSurfaceError: The solid reaches the border of the grid, or is finer than its cells.
@@ -274,7 +270,6 @@ def project(
     """Move points onto the surface along the gradient of the distance.
 
     Args:
-        solid: Signed distance, negative inside.
         points: Near the surface [m].
         largest_step_m: No point moves farther than this in one of ``PROJECTIONS`` steps.
     """
@@ -294,7 +289,6 @@ def gradient_of(
     """Central differences of a signed distance.
 
     Args:
-        solid: Signed distance, negative inside.
         points: Where the gradient is wanted [m].
     """
     columns = []

@@ -193,12 +193,7 @@ class BoxPart:
 
 
 def basket_design(inner_m: tuple[float, float, float], wall_m: float) -> Design:
-    """Draw a basket around a cavity.
-
-    Args:
-        inner_m: Extents of the cavity [m].
-        wall_m: Thickness of walls and floor [m].
-    """
+    """Draw a basket around a cavity."""
     half_x, half_y, top = inner_m[0] / 2 + wall_m, inner_m[1] / 2 + wall_m, inner_m[2] + wall_m
     middle = half_x - wall_m / 2
 
@@ -255,10 +250,6 @@ def basket_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[Box
     """Boxes the basket collides with: floor, walls, round corners, handles.
 
     The walls' inner faces are those of the cavity, so that what the predicate calls inside is free.
-
-    Args:
-        inner_m: Extents of the cavity [m].
-        wall_m: Thickness of walls and floor [m].
     """
     x, y = inner_m[0] / 2, inner_m[1] / 2
     top = inner_m[2] + wall_m
@@ -282,12 +273,7 @@ def basket_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[Box
 
 
 def basket_rim_parts(inner_m: tuple[float, float, float], wall_m: float) -> list[BoxPart]:
-    """Boxes around the bead on the walls, which a basket has beyond what it collides with.
-
-    Args:
-        inner_m: Extents of the cavity [m].
-        wall_m: Thickness of walls and floor [m].
-    """
+    """Boxes around the bead on the walls, which a basket has beyond what it collides with."""
     top = inner_m[2] + wall_m
     walls = (part for part in basket_parts(inner_m, wall_m)[1:] if part.centre_m[2] == top / 2)
     parts = []

@@ -86,7 +86,6 @@ def folder_set(name: str, folder: Path) -> ImageSet:
     """List the images of a folder and its subfolders.
 
     Args:
-        name: What the method is called in tables and ids.
         folder: Where its images are; a path below it without its ending names the view.
 
     Raises:
@@ -121,12 +120,7 @@ def folder_set(name: str, folder: Path) -> ImageSet:
 
 
 def list_files(folder: Path, endings: tuple[str, ...] = READ) -> dict[str, list[Path]]:
-    """Return the files with certain endings by view; hidden ones are nobody's images.
-
-    Args:
-        folder: Searched with all its subfolders.
-        endings: File endings that count, in lower case with their point.
-    """
+    """Return the files with certain endings by view; hidden ones are nobody's images."""
     found: dict[str, list[Path]] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
@@ -294,8 +288,6 @@ def compare_methods(
     """Score every method on every view of the reference.
 
     Args:
-        reference: The recorded images.
-        methods: Their renders.
         nets: For LPIPS; none leaves it out.
 
     Raises:

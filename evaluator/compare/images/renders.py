@@ -55,12 +55,7 @@ _NOTE = (
 
 
 def method_tables(report: MethodReport, origin: str) -> tuple[Table, ...]:
-    """Return the headline table, and every view of every method.
-
-    Args:
-        report: What was found.
-        origin: Where the images came from, for the note.
-    """
+    """Return the headline table, and every view of every method."""
     return _headline(report.numbers, origin), _per_view(report)
 
 
@@ -145,7 +140,6 @@ def compare_renders(
 
     Args:
         options: Whose folders; without any the report is empty.
-        files: Every derived episode of the run.
         sources: Every recorded episode by its id.
         nets: For LPIPS; none leaves it out.
 
@@ -236,11 +230,7 @@ def _given_masks(options: ImageOptions) -> dict[str, ImageSet]:
 
 
 def other_names(views: Iterable[str]) -> dict[str, str]:
-    """Return what else a view of the run may be called, where only one view is called so.
-
-    Args:
-        views: As results name them: ``camera/stamp_ns``.
-    """
+    """Return what else a view of the run may be called, where only one view is called so."""
     found: dict[str, list[str]] = {}
     for view in views:
         camera, stamp = view.rsplit("/", 1)

@@ -205,7 +205,6 @@ def spread(
 
     Args:
         work: Must not share anything that changes.
-        items: What to work on.
         threads: How many at once; as many as there are cores without it.
     """
     count = min(MAX_THREADS, os.cpu_count() or 1) if threads is None else threads
@@ -276,7 +275,6 @@ def score_views(
     """Score every rendered image of a views episode; what cannot be scored is a reason.
 
     Args:
-        images: As ``images_of`` collects them.
         nets: For LPIPS; none leaves it out.
     """
     rendered = sorted(images.color[RENDERED])
@@ -293,7 +291,6 @@ def images_of(views: Episode, source: Episode | None) -> Images:
     """Collect the images of a views episode.
 
     Args:
-        views: The derived episode.
         source: What it was made from; recorded images are looked for there if it has none.
     """
     images = read_images(views)

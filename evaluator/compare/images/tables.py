@@ -65,11 +65,6 @@ def stamped_measurements(
     """Measure the mean of every metric that a variant can have.
 
     Args:
-        quantities: ``VIEWS`` or ``RENDERS``.
-        variant: How the images were scored.
-        scores: One for each image.
-        protocol: What goes onto every stamp.
-        episodes: The recorded episodes the numbers rest on.
         part: Of the ids: which views, or whose renders.
     """
     metrics = [*PLAIN_METRICS, *(LPIPS_METRICS if protocol.nets and variant.learned else ())]
@@ -165,14 +160,6 @@ def stamped_table(
 ) -> Table:
     """Lay out rows of stamped values, with n and protocol behind the values.
 
-    Args:
-        table_id: Its name in files.
-        title: Above it.
-        heads: Names of the columns before the values.
-        columns: Names of the columns of values.
-        rows: What stands in front, and the values.
-        note: Below it.
-
     Raises:
         ValueError: When a row has another number of cells than columns.
     """
@@ -216,8 +203,6 @@ def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> T
     """List every view with its raw scores, and PSNR after each alignment.
 
     Args:
-        table_id: Id of the table, its file name too.
-        title: What a reader sees above it.
         scores: One for each view, in the order of the rows.
     """
     others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]

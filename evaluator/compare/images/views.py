@@ -71,9 +71,6 @@ def scored_views(
     """Score the views of one episode as ``score_views`` does, or take what is kept of them.
 
     Args:
-        images: Of the episode.
-        key: Names every file the scores follow from by its content.
-        cache: Of this evaluation.
         nets: For LPIPS; their weights belong to the key, which names them here.
     """
     key = " ".join([key, *(net.weights for net in nets)])
@@ -142,7 +139,6 @@ def compare_views(
     """Compute every image metric of every rendered view, per image and mean.
 
     Args:
-        files: Every derived episode of the run.
         sources: Every recorded episode by its id; views made from other bytes are left out.
         nets: For LPIPS; none leaves it out.
         cache: What earlier evaluations scored; without one every view is.
@@ -191,7 +187,6 @@ def newest_views(
     """Find the newest views of each recorded episode; stale and older ones are left out by name.
 
     Args:
-        files: Derived episodes of any kind.
         sources: Recorded episodes by id; views of another version of one are stale.
     """
     views, stale = _current([file for file in files if file.derived.kind == "views"], sources)
@@ -325,7 +320,6 @@ def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
     """Return what all views say of one setting, or nothing.
 
     Args:
-        settings: What each derived episode says of how it was made.
         name: The setting; the answer is empty where one lacks it or says something else.
     """
     values = [each.get(name) for each in settings]

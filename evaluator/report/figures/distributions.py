@@ -119,7 +119,6 @@ def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDra
     """Draw for each panel which share of the values is at most as large.
 
     Args:
-        subject: Words of the figure.
         panels: Distributions that share one axis each, from top to bottom; empty ones are left out.
     """
     panels = [panel for panel in panels if panel.groups]

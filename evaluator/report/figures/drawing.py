@@ -108,7 +108,6 @@ def grid(axes: "Axes", which: str = "both") -> None:
     """Draw hairlines behind the data.
 
     Args:
-        axes: Gets the lines.
         which: The axis whose ticks get lines: ``x``, ``y`` or ``both``.
     """
     axes.grid(visible=True, axis=which, color=LIGHT["line"], linewidth=0.6)  # type: ignore[arg-type]
@@ -119,7 +118,6 @@ def percent_axis(axes: "Axes", which: str, label: str) -> None:
 
     Args:
         axes: Axes whose data are in percent.
-        which: ``x`` or ``y``.
         label: What the axis shows, without its unit.
     """
     name = f"{label} (%)"
@@ -147,7 +145,6 @@ def legend(axes: "Axes", *, above_in: float = 0.05, columns: int = 2) -> None:
     Args:
         axes: Axes whose artists have labels.
         above_in: Distance from the upper edge of the axes [in].
-        columns: Columns of the legend.
     """
     height = axes.get_position().height * float(axes.figure.get_size_inches()[1])  # type: ignore[union-attr]
     axes.legend(
@@ -182,7 +179,6 @@ def listed(names: Sequence[str], *, at_most: int = 6) -> str:
     """Name a few and count the rest.
 
     Args:
-        names: Texts to name, in order.
         at_most: How many are named; the rest is only counted.
     """
     shown = "; ".join(names[:at_most])

@@ -100,7 +100,6 @@ def commands_of(episode: Episode, plan: Plan, start_ns: int) -> Series:
     """What the gripper was told and when [s, m]: from events, else from the plan.
 
     Args:
-        episode: Whose gripper events are read.
         plan: Only events of this plan count; its waypoints stand in where there are none.
         start_ns: Time 0 of the answer, on the recording's clock.
     """
@@ -124,7 +123,6 @@ def widths_of(episode: Episode, start_ns: int) -> Series:
     """Recorded opening [s, m]; empty where it was not recorded.
 
     Args:
-        episode: Whose gripper states are read.
         start_ns: Time 0 of the answer, on the recording's clock.
 
     Raises:
@@ -145,7 +143,6 @@ def is_holding(
     """When the fingers stand still on something; never where no width was recorded.
 
     Args:
-        times_s: When to say it, from the start of the execution.
         commands: Widths that the gripper was told; each holds until the next.
         widths: Widths that were recorded; empty: none were.
     """
@@ -246,7 +243,6 @@ def read_case(run: RunFolder, episode: Episode) -> Case:
 
     Args:
         run: Keeps the localisations; its scene folder says what they were made with.
-        episode: A recorded probe or trial.
 
     Raises:
         UnusableCaseError: Nothing executed, objects not found, soft objects, gaps.

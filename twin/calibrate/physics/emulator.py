@@ -83,7 +83,6 @@ def cloud(
         width: Standard deviation along each parameter, same units.
         bounds: Lowest and highest value of each parameter; points beyond are moved onto them.
         count: Points around the centre; one more when it is odd.
-        seed: Of the draw.
     """
     rng = np.random.default_rng([707, seed])
     half = rng.standard_normal((-(-count // 2), len(centre)))
@@ -110,9 +109,6 @@ def fit_emulator(
     Args:
         points: Where cases were simulated, in units of the prior.
         features: What was predicted there, in the order of ``Features.flat``.
-        centre: Where the quadratics are about.
-        width: Divides what is away from the centre, for each parameter.
-        bounds: Lowest and highest value of each parameter that may be asked for.
         observed: What was seen in reality; gives the scales of the features.
     """
     basis = _basis((points - centre) / width)
@@ -169,7 +165,6 @@ def maximise(
     """The emulator's best point, some parameters held where they are told to be.
 
     Args:
-        emulator: Gives the posterior.
         start: Where the search begins, in units of the prior; moved into what the emulator is
             trusted with.
         fixed: Values of parameters that are held, by their position; None: all are free.
@@ -208,7 +203,6 @@ def spread(
     """Posterior covariance from the curvature at the best point (Laplace), at most the prior's.
 
     Args:
-        emulator: Gives the posterior.
         x: The best point, in units of the prior.
     """
     size = len(x)
@@ -237,9 +231,6 @@ def profile(
     """95 % interval of one parameter by its profile: all others are fitted again at every value.
 
     Args:
-        emulator: Around the best point.
-        best: Its best point.
-        index: Of the parameter.
         covariance: Of ``spread``; it says where to begin fitting the others.
     """
     sigma = float(np.sqrt(covariance[index, index]))

@@ -43,12 +43,7 @@ class Split:
 
 
 def split_cases(cases: Sequence[Case], seed: int) -> Split:
-    """Hold out a share of each kind of episode; of a kind with one episode nothing.
-
-    Args:
-        cases: All that can be used.
-        seed: Of the draw of what is held out.
-    """
+    """Hold out a share of each kind of episode; of a kind with one episode nothing."""
     rng = np.random.default_rng([SPLIT_STREAM, seed])
     held: list[int] = []
     for kind in sorted({case.kind for case in cases}):
@@ -86,13 +81,7 @@ def judge(
     predictions: Sequence[Prediction],
     posterior: DiscrepancyPosterior,
 ) -> HeldOut:
-    """Compare predictions of held-out cases with what was seen.
-
-    Args:
-        cases: The held-out ones.
-        predictions: Theirs.
-        posterior: Of errors, as the training episodes left them for the same parameters.
-    """
+    """Compare predictions of held-out cases with what was seen."""
     observed = observations_of(cases)
     predicted = features_of(cases, predictions)
     found = score(observed, predicted, prior=posterior)
@@ -146,13 +135,9 @@ def search(
     """Maximise from the nominal point.
 
     Args:
-        objective: The log-posterior.
-        bounds: Limits of each parameter.
         evaluations: At most so many points; a generation that was begun is finished.
-        seed: Of the points that are drawn.
         has_time: Asked before each generation. A last resort: what is found without time depends
             on the machine's speed.
-        advance: Told how many points were tried.
     """
     start = np.zeros(len(bounds))
     best, highest, out_of_time = start, objective(start[None])[0], False
@@ -203,7 +188,6 @@ class Predictor(Protocol):
 
         Args:
             points: Parameters, in units of the prior.
-            chosen: Positions in ``cases``.
         """
 
 
@@ -247,14 +231,7 @@ def fit(
     config: CalibrateConfig,
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> Fit:
-    """Find parameters from the training cases and judge them on the held-out ones.
-
-    Args:
-        predictor: With all cases.
-        parameters: What is looked for.
-        config: How hard.
-        advance: Told how many points were tried.
-    """
+    """Find parameters from the training cases and judge them on the held-out ones."""
     started = time.monotonic()
     cases = predictor.cases
     split = split_cases(cases, config.seed)

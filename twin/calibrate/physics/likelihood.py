@@ -82,7 +82,6 @@ class DiscrepancyPosterior:
 
         Args:
             poses: Per kind of episode, for every share and size.
-            widths: For every size.
 
         Returns:
             The posterior, and the log-likelihood of everything under the prior.
@@ -176,11 +175,7 @@ class Score:
 
 
 def observations_of(cases: Sequence[Case]) -> Observations:
-    """Put the observations of cases into flat arrays; objects not found again are left out.
-
-    Args:
-        cases: What was recorded.
-    """
+    """Put the observations of cases into flat arrays; objects not found again are left out."""
     seen = [np.isfinite(case.settled).all(axis=1) for case in cases]
     rows = list(zip(cases, seen, strict=True))
     none = np.zeros(0)
@@ -238,12 +233,7 @@ def features_of(cases: Sequence[Case], predictions: Sequence[Prediction]) -> Fea
 
 
 def unflatten(row: Float[np.ndarray, " num_features"], like: Observations) -> Features:
-    """The inverse of ``Features.flat``.
-
-    Args:
-        row: Settled poses and held widths, one after another.
-        like: Says how many of each there are.
-    """
+    """The inverse of ``Features.flat``."""
     poses, holds = 3 * len(like.settled), len(like.widths_m)
     return Features(
         settled=row[:poses].reshape(-1, 3),
@@ -268,7 +258,6 @@ def scales_of(
     """Add localisation's noise and the twin's discrepancy.
 
     Args:
-        observed: What was seen.
         extra: Variance of each feature that the prediction has of its own (an emulator's).
     """
     poses = observed.settled.size
@@ -297,8 +286,6 @@ def score(
     """Log-likelihood of observations, whatever the sizes of the errors are.
 
     Args:
-        observed: What was seen.
-        predicted: What a point says.
         prior: Of errors, from other episodes; None: the one before any.
         scales: Of the same observations; None: without any variance of the prediction's own.
     """

@@ -104,7 +104,6 @@ def values_of(
     """Name the quantities of a point in units of the prior.
 
     Args:
-        parameters: What each number of the point means.
         x: The point, 0 at the nominal value and 1 a standard deviation of the prior away.
     """
     return {item.name: item.value(float(u)) for item, u in zip(parameters, x, strict=True)}

@@ -51,10 +51,6 @@ def _hand(urdf: Path, joints: tuple[str, ...], hand_link: str) -> Hand:
 def load_push(run_path: Path, episode_id: str) -> Push | None:
     """Read an imported recording once per process; None for any other episode.
 
-    Args:
-        run_path: Of the run folder.
-        episode_id: Of the recording.
-
     Raises:
         GstError: When it, its record or its robot cannot be used.
     """
@@ -82,8 +78,6 @@ def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConf
     """Set effective frictions; the engine multiplies both partners'.
 
     Args:
-        surface: Of box on table.
-        hand: Of hand on box.
         config: Everything else, the object's own coefficient among it.
     """
     own = config.object_friction
@@ -93,13 +87,7 @@ def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConf
 def end_point_error_m(
     push: Push, config: PhysicsConfig, finger_rad: float
 ) -> tuple[float, Float[np.ndarray, "3"]]:
-    """Distance of recorded and replayed end of the box, and the replayed end [m].
-
-    Args:
-        push: With a box.
-        config: Rates and frictions.
-        finger_rad: Angle of the fingers.
-    """
+    """Distance of recorded and replayed end of the box, and the replayed end [m]."""
     result = replay_push(push, "executed", config, finger_rad)
     if result.Ts_world_box is None or push.box_track is None:
         message = f"{push.episode} has no box."
@@ -154,7 +142,6 @@ def least(grid: Grid, runs: Sequence[int]) -> tuple[int, int, int]:
 
     Args:
         grid: End point errors [m].
-        runs: Which runs count; one may count twice.
     """
     cost = (grid[list(runs)] ** 2).mean(axis=0)
     a, b, c = np.unravel_index(int(cost.argmin()), cost.shape)
@@ -166,7 +153,6 @@ def resampled(grid: Grid, seed: int) -> np.ndarray:
 
     Args:
         grid: End point errors [m].
-        seed: Of the resampling.
     """
     rng = np.random.default_rng(seed)
     draws = rng.integers(0, len(grid), size=(RESAMPLES, len(grid)))
@@ -177,11 +163,6 @@ def calibrate_pushes(
     run: RunFolder, config: CalibrateConfig, output: Output
 ) -> tuple[Mapping[str, Any], str]:
     """Identify friction on half of a run's pushes, score it on the others, write the calibration.
-
-    Args:
-        run: With imported recordings.
-        config: Workers and seed.
-        output: Shows progress.
 
     Returns:
         The physics record, and the id of the calibration that holds now.
@@ -340,12 +321,7 @@ def _record(
 
 
 def describe_pushes(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say in a line per parameter what was found, and how far off held-out boxes end.
-
-    Args:
-        record: As ``calibrate_pushes`` makes it.
-        calibration_id: Of the calibration that holds now.
-    """
+    """Say in a line per parameter what was found, and how far off held-out boxes end."""
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
     for name, item in record["parameters"].items():
         word = "identified" if item["identified"] else "not identified"

@@ -94,12 +94,6 @@ def motion_of(episode: Episode) -> ScriptedMotion | None:
 def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Hand) -> Push:
     """Read one recording.
 
-    Args:
-        run: Run folder, for messages.
-        episode: The recording.
-        motion: Its record.
-        hand: The robot that the record names.
-
     Raises:
         UnusablePushError: When the tool is missing or lost for long, or a box was not recorded.
     """
@@ -171,10 +165,7 @@ def replay_push(
     """Let the hand follow a trajectory and the box go where it is pushed.
 
     Args:
-        push: What was recorded.
         trajectory: ``executed``: the measured tool; ``planned``: the joint schedule.
-        config: Rates and frictions.
-        finger_rad: Angle of all fingers, which nobody recorded.
     """
     stamps_ns, Ts_world_hand = hand_path(push, trajectory, config.rate_hz)
     Ts_world_box = None
@@ -191,13 +182,7 @@ def replay_push(
 def hand_path(
     push: Push, trajectory: Trajectory, rate_hz: int
 ) -> tuple[Int[np.ndarray, " num_steps"], Float[np.ndarray, "num_steps 4 4"]]:
-    """Where the hand link is at every physics step, world frame.
-
-    Args:
-        push: What was recorded.
-        trajectory: ``executed`` or ``planned``.
-        rate_hz: Steps per second.
-    """
+    """Where the hand link is at every physics step, world frame."""
     first_ns = int(push.tool.stamps_ns[0])
     if trajectory == "planned":
         times_s, joints_rad = push.motion.joint_path_rad()

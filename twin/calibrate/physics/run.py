@@ -53,7 +53,6 @@ def physics_record(
     was promoted.
 
     Args:
-        found: What the fit gave.
         cases: What it was fitted to, in the order its split refers to.
         config: Nominal physics; identified frictions are shares of its ``object_friction``.
         skipped: Why episodes were not used, by id.
@@ -125,12 +124,7 @@ def _parameter(item: Estimate) -> dict[str, Any]:
 
 
 def describe_physics(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say in a line per parameter what was found.
-
-    Args:
-        record: As ``physics_record`` makes it.
-        calibration_id: Of the calibration that holds now.
-    """
+    """Say in a line per parameter what was found."""
     if record.get("method") == METHOD:
         return describe_pushes(record, calibration_id)
     lines = [f"physics: {record['why']}; calibration {calibration_id}, {record['engine']}"]
@@ -172,8 +166,6 @@ def calibrate_physics(
 
     Args:
         run: Whose probes and trials are read, and in whose scene folder the calibration goes.
-        config: Evaluations, time budget, workers and seed.
-        output: Shows progress.
 
     Returns:
         The physics record that was made now, and the id of the calibration that holds now.

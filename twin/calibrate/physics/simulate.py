@@ -38,7 +38,6 @@ def predict(case: Case, values: Mapping[str, float], config: PhysicsConfig) -> P
     """Say what a case would have shown if the parameters were these: settled poses and widths.
 
     Args:
-        case: What the robot did, and where the objects were.
         values: By name; what is missing counts as nominal.
         config: Everything that is not a parameter.
     """
@@ -145,10 +144,7 @@ class Evaluator:
         """Have processes ready, where there is more than one.
 
         Args:
-            cases: Everything that will be asked for.
-            parameters: What the numbers of a point mean.
             config: Everything that is not a parameter.
-            workers: Processes.
         """
         self.cases = list(cases)
         self._parameters = list(parameters)
@@ -162,7 +158,6 @@ class Evaluator:
 
         Args:
             points: Parameters, in units of the prior.
-            chosen: Positions in ``cases``.
 
         Raises:
             LostPieceError: When a case was begun again and its process died again.

@@ -35,7 +35,6 @@ def angle(a: Array, b: Array, *, undirected: bool = False) -> Array:
 
     Args:
         a: Directions along the last axis, of any length but 0.
-        b: Likewise.
         undirected: Directions that are opposite count as the same.
     """
     along = (a * b).sum(-1)
@@ -109,7 +108,6 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
     Args:
         T_a: Poses of the one box's middle, ``(num_states, 4, 4)``.
         half_a: Half its extents, ``(3,)``.
-        T_b: Poses of the other one's middle.
         half_b: Half its extents.
     """
     T_a, T_b = np.broadcast_arrays(T_a, T_b)

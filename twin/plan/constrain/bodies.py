@@ -152,7 +152,6 @@ def surface_points(
 
     Args:
         problem: With the object's shape.
-        object_id: Of the object.
         count: How many points; at most half of them are corners.
     """
     shape = problem.shapes[object_id]

@@ -126,11 +126,7 @@ def worst_along(constraint: Constraint, states: State, *, times_s: Array | None 
 
 
 def flattened(states: State) -> State:
-    """All steps of all paths as one batch of states, path by path.
-
-    Args:
-        states: As ``worst_along`` takes them.
-    """
+    """All steps of all paths as one batch of states, path by path."""
     num_states, num_steps = states.T_base_tcp.shape[:2]
 
     def flat(Ts: Array) -> Array:
@@ -144,10 +140,5 @@ def flattened(states: State) -> State:
 
 
 def violated(constraints: Sequence[Constraint], state: State) -> list[str]:
-    """Explain those that the first state violates; of a best compromise, what contradicts itself.
-
-    Args:
-        constraints: Of one stage.
-        state: Where the weighted violations are least.
-    """
+    """Explain what the first state violates; of a best compromise, what contradicts itself."""
     return [c.explain(state) for c in constraints if bool(c.violation(state)[0] > 0)]

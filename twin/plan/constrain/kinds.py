@@ -51,7 +51,6 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
     Args:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
-        problem: Where the objects are, how large, and what the robot is.
 
     Raises:
         ConstraintError: When it does not fit, or names what is not there.

@@ -360,7 +360,6 @@ def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
     """Write a success predicate as the constraint that decides the same; None: about no pose.
 
     Args:
-        predicate: One of the task's ``success``.
         task: Says of which objects all axes are alike.
     """
     kind = predicate["kind"]
@@ -387,9 +386,6 @@ def predicate_of(record: Record) -> dict[str, Any] | None:
     """Write a constraint about where an object ends as the success predicate that decides the same.
 
     The other way round of ``constraint_of``; None: no predicate says it.
-
-    Args:
-        record: That fits the schema of constraints.
     """
     if record["kind"] not in PLACES or "obj" not in record or "frac" in record:
         return None

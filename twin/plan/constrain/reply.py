@@ -51,7 +51,6 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
 
     Args:
         text: The whole reply: one JSON object, see ``reply`` in the schema of constraints.
-        vocabulary: What may be named in the scene.
         task: The instruction that was asked about; a reply to another one is refused.
 
     Returns:

@@ -56,9 +56,6 @@ class Vocabulary:
         """Read off a task file what may be named.
 
         Args:
-            task: Its stages say which bodies may touch.
-            num_keypoints: How many points have numbers.
-            cameras: Their names.
             objects_alone: What the task does with its objects is not asked for: whatever is not
                 fixed may be moved, and contacts are not known yet.
         """
@@ -117,10 +114,6 @@ class ConstraintError(UsageError):
 def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:
     """Refuse a constraint that does not fit the schema or names what is not there.
 
-    Args:
-        record: As parsed from JSON or made by a grammar.
-        vocabulary: Of the scene.
-
     Raises:
         ConstraintError: With everything that is wrong, each with its place.
     """
@@ -135,9 +128,7 @@ def find_problems(value: Any, name: str, schema: Schema) -> tuple[str, ...]:
     """List what does not fit a part of the schema, at most ``MOST_PROBLEMS``.
 
     Args:
-        value: As parsed from JSON.
         name: Of the part in ``$defs``, such as ``constraint`` or ``reply``.
-        schema: Of constraints, filled in for a scene or not.
 
     Returns:
         One line each: the place, what was found, what is allowed.
@@ -151,10 +142,6 @@ def portable_schema(schema: Schema, name: str) -> dict[str, Any]:
     Servers differ in what else they understand, and some refuse a request for an enum or a bound.
     Kinds are laid over each other, so that each key of any of them may be there. What comes back is
     judged by the whole schema in any case.
-
-    Args:
-        schema: Of constraints, filled in or not.
-        name: Of the part in ``$defs``.
     """
     return _portable({"$ref": f"#/$defs/{name}"}, schema["$defs"])
 

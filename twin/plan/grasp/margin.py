@@ -74,11 +74,7 @@ def reaches_along(
     """How far a closing line may be shifted until the surface there leaves the friction cone [m].
 
     Args:
-        surface: The object's.
-        lines: With their hands.
         axis: Of the tool frame, along which they are shifted.
-        sign: To which side.
-        cone_rad: Half the opening of the friction cone.
     """
     y = lines.Ts_object_tcp[:, :3, 1]
     along = sign * lines.Ts_object_tcp[:, :3, axis]
@@ -116,12 +112,8 @@ def slacks(
     """How far the object may be off in each of ``WAYS`` [m, for the angle rad].
 
     Args:
-        surface: The object's.
-        lines: The grasps.
-        hand: As it comes.
         points_m: Of the surface, in the tool frame of each grasp; x, y and z one after the other.
         over_table_m: Height of the lowest point of each hand over the table.
-        cone_rad: Half the opening of the friction cone.
         lever_m: At what distance from the closing line the weight still cannot turn the object.
     """
     x, y, z = points_m
@@ -151,14 +143,7 @@ def margins(
     T_base_object: Float[np.ndarray, "4 4"],
     doubt: Doubt,
 ) -> Float[np.ndarray, " num_grasps"]:
-    """Standard deviations that grasps bear, all ways of missing together.
-
-    Args:
-        slack: From ``slacks``.
-        lines: The grasps.
-        T_base_object: Where the object was localised.
-        doubt: How sure that is.
-    """
+    """Standard deviations that grasps bear, all ways of missing together."""
     R = T_base_object[:3, :3] @ lines.Ts_object_tcp[:, :3, :3]
     arm = lines.middles_m @ T_base_object[:3, :3].T
     x, y, z = (

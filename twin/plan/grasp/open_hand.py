@@ -64,7 +64,6 @@ class OpenHand:
         Args:
             centres_m: Its middle, in the tool frame of each hand.
             radius_m: And its radius.
-            margin_m: As for ``hits``.
         """
         reach_m = radius_m + np.sqrt(3.0) * margin_m
         near: Bool[np.ndarray, " num_poses"] = np.zeros(len(centres_m), dtype=bool)
@@ -118,13 +117,7 @@ def has_fingers(robot: RobotModel) -> bool:
 
 @lru_cache(maxsize=64)
 def open_hand(robot: RobotModel, open_m: float, pregrasp_m: float) -> OpenHand:
-    """Lay out a robot's hand at one opening.
-
-    Args:
-        robot: With fingers.
-        open_m: Distance between the pads.
-        pregrasp_m: Length of the straight approach.
-    """
+    """Lay out a robot's hand at one opening."""
     hulls, gripper = hulls_of(robot), robot.record.gripper
     hulls.place(robot.home_rad, open_m)
     placed = [

@@ -83,12 +83,7 @@ class SampledSurface:
     def samples(
         self, count: int, seed: int
     ) -> tuple[Float[np.ndarray, "num_samples 3"], Float[np.ndarray, "num_samples 3"]]:
-        """Points spread evenly over the surface, and their normals.
-
-        Args:
-            count: How many.
-            seed: Of their places within the triangles.
-        """
+        """Points spread evenly over the surface, and their normals."""
         points, chosen = self._sampled(count, seed)
         return points, self._normals[chosen]
 
@@ -164,12 +159,8 @@ def antipodal_pairs(
     cone. Which pairs hold, and which are too wide, is for the caller to say.
 
     Args:
-        surface: The object's.
-        count: Points rays start from.
-        cone_rad: Half the opening of the friction cone.
         hint_m: A line through this point along the object's y axis is tried too, whatever was
             drawn; None: there is no such point.
-        seed: Of all that is drawn.
     """
     points, normals = surface.samples(count, seed)
     rng = np.random.default_rng([seed, 1])
@@ -215,9 +206,6 @@ def pairs_along(
     """Follow rays from points of the surface through the material to its other side.
 
     Args:
-        surface: The object's.
-        points_m: Where they start.
-        normals: Of the surface there.
         directions: Unit vectors into the material.
     """
     away, others = surface.leave(points_m + directions * _INSIDE_M, directions)
@@ -239,13 +227,7 @@ def pairs_along(
 
 
 def thinned(pairs: Pairs, *, cell_m: float, cell_rad: float) -> Int[np.ndarray, " num_kept"]:
-    """Number the pairs that differ: the best of each cell of middles and directions.
-
-    Args:
-        pairs: A line and its reverse are the same.
-        cell_m: Size of a cell for the middles.
-        cell_rad: And for the directions.
-    """
+    """Number the pairs that differ: the best of each cell of middles and directions."""
     axes = pairs.axes * np.where(_first_sign(pairs.axes) < 0, -1.0, 1.0)[:, None]
     cells = np.concatenate(
         [np.rint(pairs.middles_m / cell_m), np.rint(axes / cell_rad)], axis=1

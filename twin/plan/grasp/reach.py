@@ -46,13 +46,7 @@ class ArmReach:
     def prepared(
         self, Ts_base_tcp: Float[np.ndarray, "num_grasps 4 4"], hand: OpenHand, pregrasp_m: float
     ) -> "_Reaches":
-        """Solve many grasps at once, where the arm has a closed form.
-
-        Args:
-            Ts_base_tcp: Tools at the grasps.
-            hand: As it comes.
-            pregrasp_m: Length of the straight approach.
-        """
+        """Solve many grasps at once, where the arm has a closed form."""
         return _Reaches(self, Ts_base_tcp, hand, pregrasp_m)
 
     def is_clear(self, joints_rad: Float[np.ndarray, " num_joints"], open_m: float) -> bool:
@@ -60,7 +54,6 @@ class ArmReach:
 
         Args:
             joints_rad: Base to hand.
-            open_m: Distance between the pads.
         """
         self.hulls.place(joints_rad, open_m)
         if self._links.touch():

@@ -161,7 +161,6 @@ class GraspSearcher:
         """Lay out what all searches share.
 
         Args:
-            problem: Where everything is.
             config: How grasps are searched; the defaults when None.
 
         Raises:
@@ -188,7 +187,6 @@ class GraspSearcher:
         """Find grasps of an object.
 
         Args:
-            object_id: Of the task.
             part_points_m: Points of a part, in the object's frame: both contacts are to be on it;
                 None: it may be taken anywhere.
 

@@ -29,11 +29,6 @@ NAME_CHARACTERS = 48
 def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "grammar") -> TaskFile:
     """Write the task file that an instruction asks for.
 
-    Args:
-        grounding: The instruction, understood.
-        base: Files whose objects, starts and cell are taken over.
-        by: Who understood it, ``grammar`` or ``model``.
-
     Raises:
         UsageError: When two of the files define one object differently.
         TaskFileError: When the result is no task; a bug here, or goals from elsewhere.
@@ -85,12 +80,7 @@ def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "gr
 
 
 def task_name(instruction: str, base: Sequence[TaskFile]) -> str:
-    """Name a derived task by its words and by what decides it.
-
-    Args:
-        instruction: What was asked.
-        base: Whose objects it is about.
-    """
+    """Name a derived task by its words and by what decides it."""
     words = re.sub(r"[^a-z0-9]+", "_", instruction.lower())[:NAME_CHARACTERS].strip("_")
     what = "\n".join([instruction, str(RULES_VERSION), *(file.sha256 for file in base)])
     digits = hashlib.sha256(what.encode()).hexdigest()[:8]
@@ -193,7 +183,6 @@ def success_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[st
     """The goals; and of each object that it lies still, let go, and as it was if it is soft.
 
     Args:
-        grounding: Its goals.
         objects: Tables of the task file, by id.
     """
     specs: list[dict[str, Any]] = []

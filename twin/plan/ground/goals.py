@@ -164,10 +164,6 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
     What something is put on or beside is moved first; then what the instruction says; then the
     order in which the objects were named.
 
-    Args:
-        goals: The clauses, and which comes before which.
-        found: All goals.
-
     Raises:
         GroundingError: When there is no such order.
     """

@@ -40,8 +40,6 @@ def draw_marks(
 
     Args:
         image_u8: As it was recorded; it is not changed.
-        camera: That took it.
-        T_base_camera: Where it stood.
         middles_m: Of the things, in the base frame.
 
     Returns:

@@ -142,8 +142,6 @@ def ask_model(
     """Get stages from a model, from its second try, or else from the grammar.
 
     Args:
-        question: The instruction and what there is.
-        config: Whom to ask.
         fallback: Plans without a model; its errors are not caught.
     """
     remarks = [_told(question, config)]

@@ -195,7 +195,6 @@ class Nouns:
         """Say which things a phrase means.
 
         Args:
-            phrase: As it was read.
             slot: ``theme``, ``container``, ``support`` or ``reference``: what moves, what it goes
                 into or onto, or what is named beside it.
             besides: What moves, where the phrase says where to: meant only if nothing else is.

@@ -61,10 +61,6 @@ def names_task(words: str) -> bool:
 def understand(run: RunFolder, words: str) -> UnderstoodTask:
     """Find the task a person names, or make one of their instruction; nothing is written.
 
-    Args:
-        run: Its episodes say which objects there are, its scene what they are called.
-        words: The name of a task, its file, or an instruction.
-
     Raises:
         GroundingError: When the instruction is not understood or cannot be done.
         UsageError: When there is no such task, or nothing says what the scene holds.
@@ -91,12 +87,7 @@ def _shown(grounding: Grounding, base: Sequence[TaskFile]) -> Sequence[TaskFile]
 
 
 def keep(run: RunFolder, understood: UnderstoodTask) -> Path | None:
-    """Write a derived task into the run's ``tasks/``; return where it lies, None for a named one.
-
-    Args:
-        run: Where it goes.
-        understood: What to keep.
-    """
+    """Write a derived task into the run's ``tasks/``; return its path, None for a named one."""
     if understood.grounding is None:
         return None
     return keep_task_file(run.tasks_dir, understood.file.task().name, understood.file.data)
@@ -137,7 +128,6 @@ def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
     """The task file whose objects an episode shows.
 
     Args:
-        run: With the episodes.
         episode: Its name; empty: the newest that was recorded with a task.
 
     Raises:
@@ -159,7 +149,6 @@ def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
 
     Args:
         run: Whose ``scene.json`` holds labels and colours; without one, the files' own.
-        base: At least one.
 
     Raises:
         UsageError: When two files define one object differently.

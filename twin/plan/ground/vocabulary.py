@@ -118,7 +118,6 @@ def vocabulary_of(task: Task, instances: Sequence[Mapping[str, Any]] = ()) -> Vo
     """Make a vocabulary of a task's objects, called as the rebuilt scene calls them.
 
     Args:
-        task: Says which objects there are, their colours, and what can be moved.
         instances: ``semantics.instances`` of ``scene.json``; an object that is not among them
             keeps its name and the colour of the task file.
     """

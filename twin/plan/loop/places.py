@@ -22,12 +22,7 @@ _SPACING_M = 0.03
 
 
 def lying_there(problem: Problem, release: Release) -> Float[np.ndarray, "4 4"]:
-    """Where an object comes to lie that is let go a little above: straight below.
-
-    Args:
-        problem: With what it is put into or onto.
-        release: Where it is let go.
-    """
+    """Where an object comes to lie that is let go a little above: straight below."""
     T = release.T_base_object.copy()
     points = se3.apply(T, surface_points(problem, release.object_id))
     T[2, 3] -= float(points[:, 2].min()) - _support_m(problem, release.object_id)
@@ -48,9 +43,6 @@ def places_on_table(
 
     Args:
         problem: Everything else keeps its place.
-        key: Of the object.
-        goals: What is asked of where it lies.
-        seed: Of the grid's offset.
 
     Raises:
         NoFinalStateError: No free place satisfies all goals; says which one is farthest off.

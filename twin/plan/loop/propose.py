@@ -40,10 +40,7 @@ class Proposer(Protocol):
         Asked for fewer, it offers the first of them.
 
         Args:
-            problem: What is to be done, and where.
             plan_id: Name of the plans; whoever publishes one gives it its own.
-            seed: Of everything that is drawn.
-            count: At most so many.
             steer: What a refusal asks to change; None: nothing was refused.
 
         Raises:
@@ -53,9 +50,6 @@ class Proposer(Protocol):
 
 def refuse_lost(scene: ReplayScene) -> None:
     """Refuse to plan around objects that nobody knows the place of.
-
-    Args:
-        scene: With the reasons, where they are known.
 
     Raises:
         NoPlanError: Naming them.
@@ -82,11 +76,7 @@ def choose(
     """Return the candidate of a round: by rank, or steered by what was refused.
 
     Args:
-        proposer: Makes the candidates.
-        problem: What is to be done, and where.
-        plan_id: Name of the plan.
         seed: Of the start; rounds that are steered draw from their own.
-        round_: How many candidates were not executed.
         refused: Those of them that were judged, with their verdicts; none: candidates go by rank.
         most: Candidates that are asked for at once where the first was refused before.
 
@@ -137,9 +127,6 @@ def named(
     """Write into a plan which candidate it is, what steered it and in which scene it was made.
 
     Args:
-        candidate: As proposed.
-        problem: Its scene names itself by its hash.
-        seed: What it was drawn with.
         steer: What changed it; None: nothing.
     """
     plan = replace(
@@ -182,12 +169,6 @@ def plan_and_verify(
     left, or after so many rounds.
 
     Args:
-        proposer: Makes the candidates.
-        problem: What is to be done, and where.
-        judge: The twin, here or behind a gate.
-        plan_id: Plans are called this, a dot and their round.
-        seed: Of everything that is drawn.
-        rounds: Candidates that may be judged.
         task_sha256: Of the task file; empty: not known.
         grounding_source: Who said what is to be kept; empty: the task file alone.
 

@@ -72,19 +72,13 @@ class Steer:
         """Whether a grasp was refused that is the same within 1 cm and 10 degrees.
 
         Args:
-            object_id: What is grasped.
             T_object_tcp: Tool at the grasp, in the object's frame.
         """
         mine = [tried for tried in self.refused if tried.object_id == object_id]
         return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
 
     def has_release_like(self, object_id: str, T_base_tcp: Float[np.ndarray, "4 4"]) -> bool:
-        """Whether a release was refused that is the same within 1 cm and 10 degrees.
-
-        Args:
-            object_id: What is let go.
-            T_base_tcp: Tool at the release.
-        """
+        """Whether a release was refused that is the same within 1 cm and 10 degrees."""
         mine = [tried.T_base_release for tried in self.refused if tried.object_id == object_id]
         return any(T is not None and alike(T, T_base_tcp) for T in mine)
 
@@ -101,7 +95,6 @@ def steer_by(refusals: Sequence[Refusal], task: Task, fingers: Collection[str]) 
 
     Args:
         refusals: Refused plans with their verdicts, oldest first; at least one.
-        task: Which objects are moved, and where they belong.
         fingers: Names by which failures call the hand: the gripper's and those of its links.
     """
     verdict = refusals[-1].verdict

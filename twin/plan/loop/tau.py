@@ -39,8 +39,6 @@ class Trajectory:
         """Append a pick and place.
 
         Args:
-            legs: From ``plan_transfer``.
-            grasp: Says how far the hand opens.
             stages: Ids of the stages that grasp, carry and release; the last may cover the carry.
             closed_m: Commanded width while it holds; the force of the gripper limits how hard.
         """
@@ -58,13 +56,7 @@ class Trajectory:
                 self._pause(stage, OPEN_S, g=0, width_m=grasp.open_m)
 
     def add(self, leg: Leg, stage: str, width_m: float) -> None:
-        """Append one movement.
-
-        Args:
-            leg: It begins where the last one ended.
-            stage: Which it belongs to.
-            width_m: Commanded all the way.
-        """
+        """Append one movement."""
         begin_s = self.end_s
         points = waypoints_of(
             self.robot, leg.movement.path, g=leg.g, width_m=width_m, begin_s=begin_s
@@ -107,9 +99,6 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
 def refuse_without_stages(task: Task) -> None:
     """Refuse a task that moves something without saying in which stages.
 
-    Args:
-        task: Each object that it moves is pushed, or grasped and released.
-
     Raises:
         NoPlanError: Naming the object and what is missing.
     """
@@ -133,9 +122,6 @@ def plan_stage(
 
     Args:
         task: What counts as success is its own.
-        table: The stage in its file.
-        bounds: When it is.
-        there: Where each object lies in the end.
     """
     stage_id = str(table["id"])
     start_ns, end_ns = bounds.get(stage_id, (0, 0))
@@ -162,11 +148,7 @@ def plan_stage(
 
 
 def named_keypoints(problem: Problem) -> tuple[tuple[float, float, float], ...]:
-    """All keypoints at the start, base frame, where a stage names one; what it names has a number.
-
-    Args:
-        problem: As it is at the start.
-    """
+    """All keypoints at the start, base frame, where a stage names one; named ones have a number."""
     tables = problem.scene.task.stages
     asked = [table.get(kind, ()) for table in tables for kind in ("subgoal", "path")]
     if not any(names_keypoint(record) for records in asked for record in records):
@@ -186,12 +168,7 @@ def goals_of(task: Task, key: str) -> list[dict[str, Any]]:
 
 
 def candidate_grasp(grasp: Grasp, *, chosen: bool) -> CandidateGrasp:
-    """What a plan says of a grasp that was looked at.
-
-    Args:
-        grasp: As found.
-        chosen: Whether the plan takes it.
-    """
+    """What a plan says of a grasp that was looked at."""
     (qw, qx, qy, qz), (x, y, z) = (part.tolist() for part in se3.split(grasp.T_object_tcp))
     return CandidateGrasp(
         object=grasp.object_id,

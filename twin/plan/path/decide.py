@@ -60,13 +60,7 @@ def object_poses(
     joints_rad: Float[np.ndarray, "num_points num_joints"],
     carried: Carried | None,
 ) -> dict[str, Float[np.ndarray, "num_points 4 4"]]:
-    """Where the movable objects are along a movement: at their start, or in the hand.
-
-    Args:
-        problem: Start poses and the robot.
-        joints_rad: Postures.
-        carried: What goes with the tool.
-    """
+    """Where the movable objects are along a movement: at their start, or in the hand."""
     poses = {
         name: np.repeat(T[None], len(joints_rad), axis=0)
         for name, T in problem.scene.movable().items()
@@ -89,12 +83,7 @@ def decide(
     """Check a movement exactly.
 
     Args:
-        problem: Scene and robot.
-        timed: The movement.
         width_m: Distance between the finger pads.
-        config: Its ``eps_col_m`` and depth of allowed contacts count.
-        carried: What is in the hand.
-        allowed: Pairs that may touch.
         audited: Ask python-fcl too, where the monitor refuses nothing.
     """
     robot, scene = problem.robot, problem.scene

@@ -88,9 +88,6 @@ class NoPathError(TwinError):
 
         Args:
             reason: One of ``REASONS``, unreachable, branch, refused, or not a posture.
-            bodies: The pair that touches, where one does.
-            detail: More, in words.
-            work: Postures that were looked at.
         """
         self.reason, self.bodies, self.detail, self.work = reason, bodies, detail, work
         self.leg = ""
@@ -167,13 +164,7 @@ def plan_move(
     """Find a collision-free, short, timed movement to one of some postures.
 
     Args:
-        problem: Scene and robot.
-        start_rad: Where the arm stands.
         goals_rad: Where it may end; the nearest on the way is taken.
-        config: Budgets, limits and seed.
-        width_m: Distance between the finger pads, all the way.
-        carried: What is in the hand.
-        allowed: Pairs that may touch, such as gripper and what it carries.
 
     Raises:
         NoPathError: Start or goals touch something (which), the budget is spent, or the exact
@@ -277,9 +268,6 @@ def timed_path(
 
     Args:
         world: What must stay clear.
-        knots_rad: Postures joined by straight lines.
-        config: Limits and spacing.
-        tool_m_s: The tool moves no faster than this, or than its own limit.
     """
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
     wanted = [value for value in (limit_m_s, tool_m_s) if value]
@@ -335,13 +323,8 @@ def plan_straight(
     check, which lets them touch but not lie in each other.
 
     Args:
-        problem: Scene and robot.
         start_rad: Where the arm stands; the line begins at its tool.
-        T_base_goal: Where it ends.
-        config: Limits.
         width_m: Distance between the finger pads.
-        carried: What is in the hand.
-        allowed: Pairs that may touch on the way.
 
     Raises:
         NoPathError: A pose is out of reach, the arm would have to change its branch, or something
@@ -409,11 +392,7 @@ def waypoints_of(
     """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints.
 
     Args:
-        robot: Gives the tool's poses.
-        path: Times and postures.
         g: Gripper all the way: 1 closed, 0 open.
-        width_m: What it is commanded to.
-        begin_s: When the movement starts.
     """
     found = []
     for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True):

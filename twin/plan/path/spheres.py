@@ -44,7 +44,6 @@ def covering_spheres(
 
     Args:
         corners_m: The corners, in the frame the spheres are wanted in.
-        count: So many spheres, fewer where a part cannot be divided.
 
     Returns:
         Centre and radius of each [m].

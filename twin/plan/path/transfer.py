@@ -54,8 +54,6 @@ def contacts_of(task: Task, object_id: str, *, grasp: bool) -> Allowed:
     """Pairs that a task's stage allows which grasps, or releases, an object.
 
     Args:
-        task: Its stages say what may touch.
-        object_id: What is taken.
         grasp: The grasp's; else the release's.
     """
     key = "grasp" if grasp else "release"
@@ -80,11 +78,6 @@ def plan_transfer(
     """Plan all movements from where the arm stands to where it has let go and left.
 
     Args:
-        problem: Scene and robot, the object where the grasp was planned.
-        grasp: How it is taken.
-        release: Where it is let go.
-        start_rad: Where the arm stands.
-        config: Of every movement.
         lift_m: How far the object is lifted, and let down, straight; less where that is not free.
         straight: Carry it along a straight line of the tool, turned evenly; else around.
 
@@ -274,8 +267,6 @@ def nearest_solutions(
 
     Args:
         robot: Any arm; one with the geometry of a UR gives all its branches.
-        T_base_tcp: Where the tool is wanted.
-        near_rad: Where the arm comes from.
         config: When a pose counts as reached.
     """
     inverse = UrInverse.for_robot(robot)

@@ -209,10 +209,6 @@ def build_world(
     """Fill a native world with an arm, what it carries and what is around it.
 
     Args:
-        problem: Scene and robot.
-        width_m: Distance between the finger pads, all the way.
-        eps_col_m: What pairs keep that may not touch.
-        carried: What is in the hand.
         allowed: Pairs of names that may touch; they are left to the monitor.
         wider_m: Pairs of bodies that keep more: what a check refused before.
     """

@@ -62,7 +62,6 @@ class Boxes:
 
         Args:
             points_m: Points of the body's surface, in its own frame.
-            Ts_base_body: The poses that are proposed.
 
         Returns:
             Distances [m], exact outside; inside minus the depth below the nearest face.
@@ -83,9 +82,7 @@ class Boxes:
 
         Args:
             margins_m: Overwritten; one value everywhere at first, boxes beyond it do not count.
-            keep_m: Distance to keep from each box.
             points_m: Points of the body's surface, in its own frame.
-            Ts_base_body: The poses that are proposed.
         """
         most = float(margins_m.max(initial=-np.inf))
         body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
@@ -102,9 +99,7 @@ def lower_by_grid(
     """Lower each point's margin to its distance to a grid less what is to be kept.
 
     Args:
-        lookup: Distances to an obstacle.
         margins_m: Overwritten.
-        keep_m: Distance to keep.
         points_m: Points of the body's surface, in its own frame.
         Ts_grid_body: The poses that are proposed, in the frame of the grid.
     """

@@ -102,13 +102,10 @@ def final_states(
     """Find where a held object may be let go: distinct final states, the cheapest first.
 
     Args:
-        problem: The scene.
-        grasp: How the hand holds the object, and how wide.
         constraints: What must hold there besides (Eq. 7).
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
             for; ``constraints`` then say what is wanted.
         config: The defaults when None.
-        seed: The same seed gives the same answer.
 
     Raises:
         NoFinalStateError: With its cause, and what is in the way.
@@ -257,11 +254,6 @@ class ReleaseSearch:
     ) -> tuple[Release, ...]:
         """Solve each way to rest, perturb the best, keep the distinct feasible ones.
 
-        Args:
-            stages: From ``stage``.
-            seed: Of the starts.
-            rng: Of the perturbations.
-
         Raises:
             NoFinalStateError: None is feasible.
         """
@@ -375,11 +367,7 @@ def perturbed(
     uniform in [0, tau_r], and it turns the tool in the tool's own frame (errata, resolution 7).
 
     Args:
-        T_base_tcp: The nominal pose.
         tau_p_m: Most of the shift along each axis.
-        tau_r_rad: Most of the turn.
-        count: How many.
-        rng: Where they come from.
     """
     shift = rng.uniform(-tau_p_m, tau_p_m, (count, 3))
     axis = rng.normal(size=(count, 3))

@@ -76,7 +76,6 @@ class Obstacles:
 
         Args:
             points_m: Of the body's surface, in its own frame.
-            Ts_base_body: The poses that are proposed.
         """
         found = np.empty((len(Ts_base_body), len(self.all)))
         to_boxes = self._boxes.candidate_clearance(points_m, Ts_base_body)
@@ -100,9 +99,6 @@ class Obstacles:
 
         Args:
             points_m: Of the body's surface, in its own frame.
-            Ts_base_body: The poses that are proposed.
-            keep_m: Distance to keep from each obstacle, on top of its error.
-            most_m: Larger margins are given as this one, and cost less to find.
         """
         found = np.full((len(Ts_base_body), len(points_m)), most_m)
         keep = keep_m + self._error_m
@@ -114,13 +110,7 @@ class Obstacles:
 
 
 def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) -> Obstacles:
-    """Collect what stands still around carried objects.
-
-    Args:
-        problem: The scene and the shapes of its objects.
-        hulls: The robot, whose foot is taken out of the static grid.
-        carried: Objects that move with the hand.
-    """
+    """Collect what stands still around carried objects."""
     scene = problem.scene
     found = [_table(scene.table_height_m)]
     panels: list[PanelBox] = []
@@ -159,13 +149,7 @@ def _table(height_m: float) -> Obstacle:
 def allowed_with(
     body: str, allowed_contacts: Sequence[tuple[str, str]], names: Sequence[str]
 ) -> Float[np.ndarray, " num_obstacles"]:
-    """Whether a stage allows a body to touch each obstacle, as 1 or 0.
-
-    Args:
-        body: The carried object, or the gripper.
-        allowed_contacts: Pairs of the stage.
-        names: Of the obstacles.
-    """
+    """Whether a stage allows a body to touch each obstacle, as 1 or 0."""
     pairs = {frozenset(pair) for pair in allowed_contacts}
     return np.array([frozenset((body, name)) in pairs for name in names], dtype=np.float64)
 
@@ -176,8 +160,6 @@ def hand_points(
     """Points of the hand's hulls in the tool's frame, with this width between the pads [m].
 
     Args:
-        hulls: The robot; the function moves them.
-        width_m: Between the finger pads.
         num_points: At most; spread as evenly as corners and edges allow.
     """
     robot = hulls.robot

@@ -24,12 +24,7 @@ class NoFinalStateError(TwinError):
     """An object can be let go nowhere."""
 
     def __init__(self, *, cause: str, message: str) -> None:
-        """Remember the cause.
-
-        Args:
-            cause: A short name, which steers what is planned next.
-            message: A sentence.
-        """
+        """Remember the cause."""
         self.cause = cause
         super().__init__(message)
 
@@ -54,10 +49,6 @@ class Target:
 
 def target_of(problem: Problem, object_id: str) -> Target:
     """Find where the success predicates want an object.
-
-    Args:
-        problem: With the task and where its objects are.
-        object_id: One of its objects.
 
     Raises:
         NoFinalStateError: Nothing says it, or what it is put into was not localised.
@@ -111,7 +102,6 @@ def upright_frame(
 
     Args:
         T: Whose x axis, seen from above, is followed.
-        p_m: Origin.
     """
     yaw = np.arctan2(T[1, 0], T[0, 0])
     frame = np.eye(4)
@@ -123,13 +113,7 @@ def upright_frame(
 def orientations(
     model: ObjectModel, R_now: Float[np.ndarray, "3 3"], R_target: Float[np.ndarray, "3 3"]
 ) -> list[Float[np.ndarray, "3 3"]]:
-    """Rotations in which an object may come to rest, the one nearest to now first.
-
-    Args:
-        model: Its symmetry says which ways up are the same.
-        R_now: How it lies now.
-        R_target: The sides it is turned along.
-    """
+    """Rotations in which an object may come to rest, the one nearest to now first."""
     found: list[Float[np.ndarray, "3 3"]] = []
     for S in _same(model):
         R = R_now @ S
@@ -168,9 +152,6 @@ def resting_poses(
 
     Args:
         problem: With the object's shape and how it lies.
-        grasp: How the hand holds it.
-        target: Where it is put.
-        drop_m: Between its underside and what it will lie on.
         most_tilted_rad: Poses in which the tool leans farther from straight down are left out.
 
     Raises:

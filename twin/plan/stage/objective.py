@@ -78,7 +78,6 @@ def moved(
     """Poses after steps [m, rad].
 
     Args:
-        T: Of the tool.
         step: Three of the position in the base frame, three of a rotation vector in the tool's.
     """
     found = T.copy()
@@ -113,12 +112,7 @@ class StageProblem:
     def residuals(
         self, zeta: Zeta, violations: Sequence[Float[np.ndarray, "num_states num_parts"]]
     ) -> Float[np.ndarray, "num_states num_residuals"]:
-        """Return numbers whose squares add up to J, those of the regulariser last.
-
-        Args:
-            zeta: The states.
-            violations: Of these states, from ``violations``.
-        """
+        """Return numbers whose squares add up to J, those of the regulariser last."""
         columns = [
             np.clip(found / term.scale + MARGIN, 0.0, None)
             for term, found in zip(self.subgoal, violations, strict=True)

@@ -114,13 +114,7 @@ class _Seen:
 
 
 def draw_starts(problem: StageProblem, config: SolveConfig, seed: int) -> Zeta:
-    """Draw states around the nominal one; the first is the nominal one itself.
-
-    Args:
-        problem: Whose nominal pose and width are taken.
-        config: How many and how far.
-        seed: The same seed gives the same starts.
-    """
+    """Draw states around the nominal one; the first is the nominal one itself."""
     rng = np.random.default_rng(seed)
     num = config.num_starts
     shift = rng.uniform(-1.0, 1.0, (num, 3)) * SPREAD_M
@@ -148,9 +142,7 @@ def solve(
     """Minimise J from all starts and keep the distinct feasible states.
 
     Args:
-        problem: The stage.
         config: The defaults when None.
-        seed: Of the starts that are drawn.
     """
     config = SolveConfig() if config is None else config
     zeta = draw_starts(problem, config, seed)
@@ -307,9 +299,7 @@ def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, most: int) -> 
     """Go through poses in an order and keep those that differ from all that are kept.
 
     Args:
-        Ts: The poses.
         order: Indices, the best first; others are left out.
-        most: How many are kept.
     """
     kept: list[int] = []
     rest = np.asarray(order, dtype=np.int64)

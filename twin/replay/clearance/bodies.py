@@ -49,7 +49,6 @@ def solid_of(
     """Put a box and a sphere around a piece.
 
     Args:
-        body: The link, object or obstacle that the piece belongs to.
         shape: Its geometry, in the body's frame.
         points_m: Points whose hull holds the shape, same frame.
     """
@@ -60,12 +59,7 @@ def solid_of(
 
 
 def box_solid(body: str, size_m: Float[np.ndarray, "3"]) -> Solid:
-    """A box around the origin.
-
-    Args:
-        body: What the box is, as failures name it.
-        size_m: Whole lengths of the edges.
-    """
+    """A box around the origin."""
     corners = box_corners(size_m)
     return solid_of(body, convex_hull(corners), corners)
 
@@ -95,7 +89,6 @@ def placed_panels(
     Args:
         model: The object; a container has a panel for each wall, a basket more: its round corners,
             its rim and its handles stand out of straight walls.
-        T_base_object: Where it is.
     """
     if model.mesh == BASKET:
         shape = model.inner_m, model.wall_m
@@ -127,12 +120,7 @@ class NearPairs:
     """Some pairs of bodies; where each body is, is written into ``R`` and ``t``."""
 
     def __init__(self, solids: Sequence[Solid], pairs: Sequence[tuple[int, int]]) -> None:
-        """Lay boxes and spheres out.
-
-        Args:
-            solids: The bodies.
-            pairs: Two of them each.
-        """
+        """Lay boxes and spheres out."""
         self.R: Float[np.ndarray, "num_bodies 3 3"] = np.tile(np.eye(3), (len(solids), 1, 1))
         """Rotations ``R_base_body``."""
         self.t: Float[np.ndarray, "num_bodies 3"] = np.zeros((len(solids), 3))
@@ -169,11 +157,7 @@ class OwnLinks:
     """The robot's links against each other."""
 
     def __init__(self, hulls: RobotHulls) -> None:
-        """Choose the pairs that must stay apart.
-
-        Args:
-            hulls: The robot.
-        """
+        """Choose the pairs that must stay apart."""
         self._hulls = hulls
         solids = [solid_of(hull.link, hull.shape, hull.points_m) for hull in hulls.hulls]
         self._near = NearPairs(solids, hulls.pairs)

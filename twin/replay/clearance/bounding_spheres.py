@@ -76,8 +76,6 @@ class BoundingSpheres:
         Never too large; too small by what the finest points leave uncovered, and by 2 % of it.
 
         Args:
-            lookup: The grid of distances to what stands still.
-            R: Rotation of each piece's link in the grid's frame.
             t: Origin of each piece's link in the grid's frame [m].
         """
         answers = np.empty(len(R))
@@ -105,8 +103,6 @@ class BoundingSpheres:
         """Return the smallest of ``distances_m``, or a number where none is below it [m].
 
         Args:
-            lookup: The grid of distances to what stands still.
-            R: Rotation of each piece's link in the grid's frame.
             t: Origin of each piece's link in the grid's frame [m].
             below_m: The number; the smaller it is, the less is looked at.
         """
@@ -227,12 +223,7 @@ def _divided(
 
 @lru_cache(maxsize=4)
 def robot_bounding_spheres(hulls: RobotHulls, left_out: frozenset[str]) -> BoundingSpheres:
-    """Cover the hulls of a robot but those of some links; made once.
-
-    Args:
-        hulls: The robot's convex pieces.
-        left_out: Links without spheres.
-    """
+    """Cover the hulls of a robot but those of some links; made once."""
     gripper = hulls.robot.record.gripper.links
     return BoundingSpheres(
         [

@@ -61,10 +61,6 @@ def half_way(a: State, b: State) -> State:
     """The state in the middle, straight in joints, positions and nodes.
 
     Objects that leapt, or are known at one of the two only, are left out.
-
-    Args:
-        a: The earlier state.
-        b: The later state.
     """
     poses = {}
     for name in a.Ts_base_object.keys() & b.Ts_base_object.keys():
@@ -121,7 +117,6 @@ class Reach:
         """How far any point of each link moved at most [m], when the joints moved straight.
 
         Args:
-            a: The state before.
             b: The state after; only its joints and gripper width are looked at.
         """
         turned = np.abs(b.joints_rad - a.joints_rad)
@@ -147,9 +142,6 @@ def object_travel_m(a: State, b: State, name: str, radius_m: float) -> float:
     """How far any point of an object moved at most [m]; infinite when it is in one state only.
 
     Args:
-        a: The state before.
-        b: The state after.
-        name: The object.
         radius_m: How far its outermost point is from its origin; not used where its nodes are
             known.
     """
@@ -243,8 +235,6 @@ class ClearanceMonitor:
 
         Args:
             t_ns: Time from the start of the trajectory; calls come in order.
-            joints_rad: Where the arm is.
-            width_m: Where the fingers are.
             Ts_base_object: Where the movable objects are; those not known are left out.
             nodes_m: Where the nodes of the soft objects are, base frame; a soft object with a pose
                 only counts as the box around it.
@@ -469,7 +459,6 @@ def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
 
     Args:
         stages: Of a plan, in the order in which they begin.
-        t_ns: Time from the start of the trajectory.
     """
     begun = [stage for stage in stages if stage.t_start_ns <= t_ns]
     if begun:
@@ -485,7 +474,6 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 
     Args:
         stages: Of a plan, in the order in which they begin.
-        t_ns: Time from the start of the trajectory.
     """
     active = active_stage(stages, t_ns)
     if active is None:

@@ -45,10 +45,8 @@ def unmodelled_obstacles(
     What nobody saw counts as free, as in the observed grid, and what lies beyond the grid too.
 
     Args:
-        static: The scene.
         table_height_m: Height of the table in the base frame [m].
         foot: Links that stand still; None when there are none.
-        panels: The boxes that containers are made of.
 
     Returns:
         Distances to what is left; None when nothing is.
@@ -202,7 +200,6 @@ def static_obstacles(
     """The table and the panels, each in its own frame.
 
     Args:
-        panels: Walls and floors of the containers that stand still.
         table_height_m: Of the table's top, over the robot's base.
     """
     T_base_table = np.eye(4)

@@ -65,13 +65,7 @@ class Surroundings:
     """Table, container panels and the unnamed rest of the scene."""
 
     def __init__(self, scene: ReplayScene, hulls: RobotHulls, eps_m: float) -> None:
-        """Place the panels and take what has a name out of the scene's grid.
-
-        Args:
-            scene: Table height, containers and the static scene.
-            hulls: The robot.
-            eps_m: Pairs closer than this are always measured.
-        """
+        """Place the panels and take what has a name out of the scene's grid."""
         self._hulls = hulls
         self._eps_m = eps_m
         self._table_height_m = scene.table_height_m
@@ -122,12 +116,6 @@ class Surroundings:
     ) -> tuple[dict[Pair, float], float]:
         """Measure the nearest pairs of the robot, which ``RobotHulls.place`` has placed.
 
-        Args:
-            Ts_base_object: The objects that the robot is measured against.
-            moved: Those of them that are measured against what stands still.
-            near_m: Pairs closer than this are all measured.
-            counts: Whether a pair's distance counts for the smallest one.
-
         Returns:
             Distances [m], and one that all other pairs keep.
         """
@@ -170,7 +158,6 @@ class Surroundings:
 
         Args:
             left_out: Links that are not asked about.
-            below_m: Returned where no distance is smaller.
         """
         pairing = self._pairing((), ())
         links, near = self._hulls, pairing.near
@@ -292,7 +279,6 @@ class Surroundings:
 
         Args:
             pair: As ``measure`` and ``measure_nodes`` name it; the robot has been placed.
-            Ts_base_object: Where the rigid objects are.
             nodes_m: Where the nodes of the soft objects are, base frame.
         """
         body, index, other, piece = pair
@@ -398,9 +384,7 @@ def posture_clearance(
     is where the path says, whatever the arm does, so it is left out; so are objects.
 
     Args:
-        scene: Table, containers and distances to the rest.
         hulls: The robot's convex pieces; the function moves them.
-        config: Its ``eps_col_m`` is taken off.
         up_to_m: What is farther from contact than this is said to be so far from it; 0 is enough
             for whoever asks for the sign, and takes a fraction of the time.
     """

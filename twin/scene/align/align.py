@@ -67,7 +67,6 @@ def depth_errors(
 
     Args:
         views: Depth images and where their cameras are in the source frame.
-        surfaces: The robot as it stood at each of them.
         pose: Where the source frame lies in the robot's base, and the depth scale.
     """
     errors = [np.zeros(0)]
@@ -86,9 +85,7 @@ def resample(
     """Draw blocks of points with replacement and solve the linearised fit again (Efron, 1979).
 
     Args:
-        equations: At the solution.
         p_base: Points of the robot's surface, to say how far it moves [m].
-        seed: Of the draws.
     """
     rng = np.random.default_rng(seed)
     count = len(equations.weight)
@@ -146,8 +143,6 @@ def search(
 
     Args:
         views: Depth images with the robot at rest; at most ``MAX_VIEWS`` of them are used.
-        robot: Who is looked for.
-        planes: What the robot may stand on.
     """
     used = list(views[:: max(1, -(-len(views) // MAX_VIEWS))])
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(used)]
@@ -170,13 +165,7 @@ def _on_plane(
 def search_near(
     views: Sequence[RobotView], robot: RobotModel, T_base_source: Float[np.ndarray, "4 4"]
 ) -> Hypothesis:
-    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right.
-
-    Args:
-        views: Depth images with the robot at rest.
-        robot: Who is looked for.
-        T_base_source: The pose to search around.
-    """
+    """Try yaws within 6 degrees and places within 7 cm of a pose whose tilt is about right."""
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(views)]
     nowhere = np.zeros(2)
     plane = LevelPlane(T_level_source=T_base_source, low_m=nowhere, high_m=nowhere, share=0.0)
@@ -367,10 +356,7 @@ def align_robot(
     tried; the best are refined; the best must beat every other by a margin.
 
     Args:
-        views: Depth images with the robot's posture, best of several postures.
-        robot: Its description.
         start: A pose known to some centimetres; nothing else is then searched.
-        config: Limits.
 
     Raises:
         RobotNotAlignedError: Nothing fits, or several places fit alike.

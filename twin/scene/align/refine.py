@@ -82,13 +82,8 @@ def refine(
     """Lay measured points on the posed surface: Gauss-Newton with Tukey's weights.
 
     Args:
-        views: Depth images.
-        surfaces: The robot in each view's posture.
-        start: Where to begin, within the first stage's gate.
-        stages: Gates from wide to narrow.
         num_points: At most this many points of all views, at least 200 of each visible link.
         with_scale: Whether the depth scale is estimated; otherwise the fit is rigid.
-        seed: Of the choice of points.
 
     Returns:
         The place, and the equations of the last iteration.

@@ -33,7 +33,6 @@ class RobotView:
 
         Args:
             frame: Colour is not used.
-            posture: How the robot stood then.
             T_source_camera: Pose of the depth camera in the frame that is to be aligned.
         """
         return RobotView(
@@ -96,12 +95,7 @@ def _interior(trusted: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "he
 
 
 def thin(views: Sequence[RobotView], count: int) -> list[ViewCloud]:
-    """Every n-th point of each view, about ``count`` of all views together.
-
-    Args:
-        views: Whose points are thinned, all by the same step.
-        count: Of all points together.
-    """
+    """Every n-th point of each view, about ``count`` of all views together."""
     total = sum(len(view.cloud.p_m) for view in views)
     step = max(1, total // max(count, 1))
     return [view.cloud.take(np.arange(0, len(view.cloud.p_m), step)) for view in views]
@@ -140,7 +134,6 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
 
     Args:
         views: Depth images and where their cameras are in the source frame.
-        seed: Of the random draws.
     """
     clouds = thin(views, NUM_POINTS)
     p = np.concatenate(

@@ -333,12 +333,7 @@ def check_geometry(
 
 
 def corrected(choice: FrameChoice, found: Correction) -> FrameChoice:
-    """A camera with one number of its geometry changed, in all its frames.
-
-    Args:
-        choice: As recorded.
-        found: From ``search_geometry``.
-    """
+    """A camera with one number of its geometry changed, in all its frames."""
     if found.kind == "depth":
         scale = choice.poses.depth_scale * found.value
         return replace(choice, poses=replace(choice.poses, depth_scale=scale))

@@ -137,7 +137,6 @@ def choose_reference_views(
     """Take training frames spread evenly; their depth images are compared with.
 
     Args:
-        views: All training frames.
         scans: Which scan each is of; all of one without it.
     """
     step = max(1, -(-len(views) // MAX_REFERENCE_VIEWS))
@@ -149,12 +148,7 @@ def choose_reference_views(
 
 
 def find_moving(points: Sequence[PointSet], references: Sequence[ReferenceView]) -> MovingVoxels:
-    """Find voxels that more frames look through than confirm, or first the one and then the other.
-
-    Args:
-        points: Surface points of all training frames, or of one held-out frame.
-        references: Training frames.
-    """
+    """Find voxels that more frames look through than confirm, or first one, then the other."""
     p = np.concatenate([item.p_m for item in points])
     keys, inverse, counts = np.unique(_keys(p), return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(inverse, weights=c) / counts for c in p.T], axis=1)

@@ -144,12 +144,7 @@ def score_of(met: Sequence[Meeting]) -> Score:
 
 
 def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
-    """Report on poses as they were recorded; no agreement where views hardly overlap.
-
-    Args:
-        num_pairs: How many pairs of frames were compared.
-        recorded: How well depth fits with the poses as they are.
-    """
+    """Report on poses as they were recorded; no agreement where views hardly overlap."""
     return PoseReport(
         num_pairs=num_pairs,
         agreement=recorded.agreement if recorded.overlap >= MIN_OVERLAP else None,
@@ -160,12 +155,7 @@ def plain_report(num_pairs: int, recorded: Score) -> PoseReport:
 def best_of(
     conventions: Iterable[Convention], score: Callable[[Convention], Score]
 ) -> tuple[Convention, float]:
-    """The convention under which most depth agrees, and how much; 0 without solid overlap.
-
-    Args:
-        conventions: The readings that are tried.
-        score: Says how well depth fits under one of them.
-    """
+    """The convention under which most depth agrees, and how much; 0 without solid overlap."""
     scored = []
     for convention in conventions:
         agreement, overlap = score(convention)
@@ -178,7 +168,6 @@ def is_clearly_better(agreement: float, recorded: PoseReport) -> bool:
 
     Args:
         agreement: Under another reading of the poses, 0..1.
-        recorded: What the poses as they were recorded give.
     """
     return agreement >= GOOD and agreement >= (recorded.agreement or 0.0) + CLEARLY_BETTER
 
@@ -203,11 +192,7 @@ class MovedCameraError(TwinError):
 
 
 def check_poses(images: Sequence[DownscaledDepth]) -> PoseReport:
-    """Carry depth between frames of one camera under every convention.
-
-    Args:
-        images: Small depth images in time order, with poses as recorded.
-    """
+    """Carry depth between frames of one camera under every convention."""
     pairs = list(_informative(images))
     if not pairs:
         return PoseReport(num_pairs=0, agreement=None, overlap=0.0)
@@ -287,10 +272,6 @@ MAX_OTHERS = 12
 
 def check_between(own: Sequence[DownscaledDepth], others: Sequence[DownscaledDepth]) -> PoseReport:
     """Carry the depth of moving cameras into one that stands still, however its pose is read.
-
-    Args:
-        own: Of the camera that stands still.
-        others: Of moving cameras whose poses fit their own depth.
 
     Returns:
         No agreement when there is nothing to compare with, or when no reading of its pose lets the

@@ -69,8 +69,6 @@ def read_training_set(
 
     Args:
         choices: Which frames of which cameras to read.
-        config: Depth limits and what is checked.
-        output: Told what is remarkable about the scan.
 
     Raises:
         NoFramesError: When no frame has colour, depth and a pose together.

@@ -89,8 +89,6 @@ def solve_appearance(
 
     Args:
         cloud: Where to start; its harmonics are solved too if it has any.
-        observations: Images with their exposures.
-        rasteriser: Draws and lifts.
         steps: Conjugate gradient steps, at most; more than six follow the noise.
         allowance: Fewer steps are made, or none, when so many do not fit; what is begun and does
             not end in time is dropped.
@@ -124,9 +122,7 @@ def conjugate_gradients(
 
     Args:
         apply: The symmetric matrix times a vector; None when there is no time for it.
-        right: The right-hand side.
         diagonal: Of the matrix, above zero.
-        steps: At most so many.
     """
     x = np.zeros_like(right)
     residual = right.copy()

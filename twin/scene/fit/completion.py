@@ -72,10 +72,7 @@ def complete_holes(
     """Gaussians that close the holes of the training views, marked; none without holes.
 
     Args:
-        cloud: The fitted scene.
-        views: What it was fitted to.
         config: ``completion`` and ``max_splats`` say how many there may be.
-        raster: How to draw.
     """
     added = cloud.take(np.zeros(0, dtype=np.int64))
     most = round(config.completion * config.max_splats)
@@ -171,12 +168,7 @@ def _swept(hole: _Hole, views: Sequence[TrainingView]) -> Float[np.ndarray, " nu
 def _least(
     cost: Float[np.ndarray, "num_depths num_points"], depths: Float[np.ndarray, " num_depths"]
 ) -> Float[np.ndarray, " num_points"]:
-    """Depth of least cost, refined by a parabola; 0 where no depth has a finite cost.
-
-    Args:
-        cost: Infinite where a distance cannot be.
-        depths: Spaced by one factor.
-    """
+    """Depth of least cost, refined by a parabola; 0 where no depth has a finite cost."""
     best = cost.argmin(axis=0)
     every = np.arange(cost.shape[1])
     below, middle, above = (

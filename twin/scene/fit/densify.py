@@ -68,12 +68,6 @@ def score(
     """Draw the views, evenly chosen where there are many, and lift their errors.
 
     Views that there is no time for are left out.
-
-    Args:
-        cloud: The scene as it is fitted so far.
-        observations: Recorded images with poses and exposures.
-        rasteriser: Draws the cloud.
-        allowance: Time until which views are drawn.
     """
     step = -(-len(observations) // MAX_SCORED_VIEWS)
     error, pixels, size_px, fraction = (np.zeros(len(cloud), np.float32) for _ in range(4))
@@ -103,8 +97,6 @@ def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int)
     """Drop what shows nothing or hides everything, and split where the error is large.
 
     Args:
-        cloud: As it is.
-        scores: Of this cloud.
         max_splats: Never more Gaussians than this.
         most: Never more splits than this at once.
     """

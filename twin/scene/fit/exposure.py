@@ -36,12 +36,6 @@ def solve_exposures(
 
     Least squares over static pixels that are not saturated. Images that there is no time for keep
     the exposures they have.
-
-    Args:
-        cloud: The scene as it is fitted so far.
-        observations: Images with the exposures they have now.
-        rasteriser: Draws the cloud.
-        allowance: Time until which images are looked at.
     """
     exposures = np.array([item.exposure for item in observations], dtype=np.float64)
     for index, item in enumerate(observations):
@@ -67,7 +61,6 @@ def gain_between(
 
     Args:
         drawn: Colour planes, 0..1.
-        target: What was recorded, and which pixels of it count.
     """
     wanted = target.image()
     usable = target.static_mask & (wanted < SATURATED).all(axis=0)

@@ -121,11 +121,7 @@ class _Voxels:
         return replace(self, means=means.astype(np.float64))
 
     def merged(self, origin: Float[np.ndarray, "3"]) -> "_Voxels":
-        """One for all that now lie in the same voxel of their size.
-
-        Args:
-            origin: Corner of the voxels.
-        """
+        """One for all that now lie in the same voxel of their size."""
         level = np.rint(np.log2(self.sizes / self.sizes.min())).astype(np.int64)
         cell = np.floor((self.means - origin) / self.sizes[:, None]).astype(np.int64)
         _, first, inverse = np.unique(
@@ -257,7 +253,6 @@ def flat_gaussians(
         normals: Along which they are flat; any length.
         colors: sRGB, 0..1.
         sizes: Edge of the square or voxel each stands for [m].
-        config: How flat and how opaque.
     """
     sigma = IN_PLANE_SIGMA * sizes
     scales = np.stack([sigma, sigma, config.flatness * sigma], axis=1)

@@ -26,10 +26,6 @@ def even_points(
     """One point in each cell of the surface, with its outward normal; the same ones each time.
 
     Of some samples in a cell it is the one nearest to the middle of the cell.
-
-    Args:
-        meshes: The surface, in parts.
-        spacing_m: Size of a cell.
     """
     rng = np.random.default_rng(0)
     points, normals = [], []

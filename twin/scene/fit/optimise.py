@@ -72,7 +72,6 @@ class SurfacePrior:
         """Move centres that left the slab back to its border, in place.
 
         Args:
-            cloud: As many Gaussians as there are planes.
             slab: Half its thickness, in the Gaussian's size at the start.
         """
         off_m = np.einsum("ni,ni->n", self.normals, cloud.means_m) - self.heights_m
@@ -129,12 +128,7 @@ class FitState:
 
 
 def first_state(session: FitSession, num_views: int) -> FitState:
-    """Before the first image.
-
-    Args:
-        session: Holds the cloud that is to be fitted.
-        num_views: Training images, each with an exposure.
-    """
+    """Before the first image."""
     return FitState(
         session=session,
         size_m=float(np.median(np.exp(session.cloud.scales_log.max(axis=1)))),
@@ -220,7 +214,6 @@ class Events:
 
         Args:
             state: The fit so far; what is done changes it.
-            at: How far along the fit is.
         """
         coarse = at.fraction < self._config.coarse_fraction
         while (
@@ -282,9 +275,6 @@ def keep_colors_in_range(cloud: GaussianCloud) -> None:
 
     Gaussians of which the images show a sliver explain it with any colour, and are seen whole from
     elsewhere. What depends on the direction may go beyond: it is small where few views show it.
-
-    Args:
-        cloud: Changed.
     """
     np.clip(cloud.colors, 0.0, 1.0, out=cloud.colors)
 
@@ -293,9 +283,7 @@ def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
     """The order in which one pass shows the views; the same whenever it is asked for.
 
     Args:
-        seed: Of the fit.
         epoch: Number of the pass, from 0.
-        num_views: Training images.
     """
     return np.random.default_rng([seed, epoch]).permutation(num_views)
 
@@ -368,12 +356,8 @@ def fit(
     between two images: nothing that decides the result depends on it until it strikes.
 
     Args:
-        cloud: Where to start.
         views: Training images; never the held-out ones.
-        config: Budget, loss and seed.
-        advance: Told the percentage done, the recent PSNR and the time left.
         max_splats: Budget of Gaussians; none: as many as there are at the start.
-        clock: Seconds that the budget is counted in.
         spent_s: How much of the budget initialisation has used up; up to half of it counts.
     """
     learner = _Learner(views, config)

@@ -66,11 +66,7 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
     beside the weights, every file it names is compared with its checksum.
 
     Args:
-        folder: Folder with the files named by ``WeightsKind.wanted``.
         kind: What they must be.
-
-    Returns:
-        The content of ``config.json``.
 
     Raises:
         WeightsError: Naming what is missing, cut short, changed, pickled or of another kind.
@@ -94,10 +90,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
 
 def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
     """The safetensors of a folder, all of them present.
-
-    Args:
-        folder: With the weights of one model.
-        kind: What they should be; named in messages.
 
     Raises:
         WeightsError: When there are none, or some of a set of parts are missing.
@@ -128,12 +120,7 @@ def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
 
 
 def weights_hash(folder: Path, kind: WeightsKind) -> str:
-    """SHA-256 over configuration and weights, for the record of what was used.
-
-    Args:
-        folder: With the weights of one model.
-        kind: What they should be; named in messages.
-    """
+    """SHA-256 over configuration and weights, for the record of what was used."""
     return provenance.hash_files([folder / "config.json", *weight_files(folder, kind)])
 
 
@@ -201,8 +188,6 @@ def read_normalisation(
     """Mean and standard deviation of colours 0..1, from ``preprocessor_config.json`` if present.
 
     Args:
-        folder: With the weights of one model.
-        kind: What they should be; named in messages.
         default: Mean and standard deviation per channel where the folder states none.
 
     Raises:
@@ -256,7 +241,6 @@ def network_input(
 
     Args:
         images_u8: sRGB images, of any sizes.
-        size: Height and width that the network takes.
         normalisation: Mean and standard deviation of each colour.
         mode: ``bilinear`` or ``bicubic``; both low-pass when they shrink.
     """
@@ -329,10 +313,7 @@ def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Plac
     """Load a network and put it to inference on its device.
 
     Args:
-        folder: Checked by ``check_folder`` first.
         kind: What the folder must hold.
-        class_name: Name of the class of ``transformers``.
-        placement: On which device.
 
     Raises:
         WeightsError: When the folder is not whole, or leaves parameters of the network without

@@ -72,7 +72,6 @@ class Sam3Segmenter:
         """Load weights from a local folder.
 
         Args:
-            folder: With configuration, weights and tokenizer.
             placement: Device and precision; None: the first GPU, else the CPU, in float32.
             config: Thresholds; None: the defaults.
 
@@ -98,10 +97,7 @@ class Sam3Segmenter:
         overlap.
 
         Args:
-            image_u8: sRGB.
             prompts: A few words each; they become the labels.
-            camera_id: For the result.
-            stamp_ns: For the result.
 
         Raises:
             UsageError: When there are no prompts, too many, or one that cannot be read.
@@ -176,7 +172,6 @@ class DinoFeatures:
         """Load weights from a local folder.
 
         Args:
-            folder: With configuration and weights.
             placement: Device and precision; None: the first GPU, else the CPU, in float32.
 
         Raises:
@@ -272,7 +267,6 @@ class ClipEmbedder:
         """Load weights from a local folder.
 
         Args:
-            folder: With configuration, weights and tokenizer.
             placement: Device and precision; None: the first GPU, else the CPU, in float32.
 
         Raises:
@@ -307,7 +301,6 @@ class ClipEmbedder:
         """Unit vectors of what the masks cut out, each cropped to its square on a neutral ground.
 
         Args:
-            images_u8: The image of each mask.
             masks: Of the same sizes, none empty.
 
         Raises:
@@ -340,8 +333,6 @@ def masked_crop(
     """The square around a mask with a margin; all but the mask has the ground's colour.
 
     Args:
-        image_u8: sRGB.
-        mask: True on the thing that is cut out.
         ground_u8: sRGB of everything around it.
 
     Raises:
@@ -381,8 +372,6 @@ def split_spec(spec: str, option: str, known: tuple[str, ...]) -> tuple[str, Pat
 
     Args:
         spec: As the user wrote it; ``~`` is expanded in the folder.
-        option: The command-line option it came with, for the message.
-        known: Names that may stand before the colon.
 
     Raises:
         UsageError: When the name is none of those known, or the folder is missing.

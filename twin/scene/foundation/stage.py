@@ -62,7 +62,6 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     """Check all that the models need, before anything slow begins.
 
     Args:
-        config: Which models were named, and on which device they run.
         task: Its objects give the words to look for where no prompt does; None: there is no task.
 
     Returns:
@@ -96,7 +95,6 @@ def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
     """What to look for: the prompts given, else the names of the task's objects.
 
     Args:
-        config: May hold prompts.
         task: Names objects; None: there is no task.
 
     Raises:
@@ -127,12 +125,8 @@ def ask_models(
     """Run segmenter and feature model over frames, one model in memory at a time.
 
     Args:
-        config: Which models.
-        frames: Training frames.
         cloud: The Gaussians that features are lifted to, in the frames' root frame.
-        task: Names what to look for when no prompts are given.
         threads: For lifting; 0: all cores.
-        advance: Told how many frames are done, over both models.
 
     Raises:
         UsageError: When a folder, prompt or device cannot be used.
@@ -180,14 +174,8 @@ def embed_things(
     """Give every thing of a scene its CLIP vector and write ``features.npz``.
 
     Args:
-        folder: The scene folder.
-        scene: The things, labelled over ``cloud``.
-        cloud: All Gaussians of the scene.
-        frames: Where the things are cut out of.
         features: What ``ask_models`` found, written along; None: vectors only.
-        config: Names the folder of CLIP.
         threads: For drawing; 0: all cores.
-        advance: Told how many things are done.
 
     Returns:
         What ``scene.json`` says about the vectors.
@@ -229,14 +217,6 @@ def thing_vectors(
     advance: Advance = lambda done, note: None,
 ) -> tuple[Float32[np.ndarray, "num_instances num_channels"], list[int]]:
     """One unit vector for each instance, the mean over the frames that show most of it.
-
-    Args:
-        embedder: Turns cut-out images into vectors.
-        scene: The instances and which Gaussians are theirs.
-        cloud: The Gaussians that the labels of the scene refer to.
-        frames: Images in which instances are looked for.
-        rasteriser: Draws the labels into each frame.
-        advance: Told the number of instances done and the label of the last.
 
     Returns:
         Vectors in the order of the instances, zero where no frame shows one; how many frames each

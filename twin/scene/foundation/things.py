@@ -52,19 +52,15 @@ def add_semantics(
     Nothing found, or masks that do not fit, is a remark, not an error: the scene is good without.
 
     Args:
-        folder: The scene folder.
         background: What ``background.ply`` holds. Those that nobody measured are guessed surfaces:
             without masks no thing is looked for in them.
         objects: What ``objects/<id>/gaussians.ply`` hold, moved to where they were scanned; without
             masks each is an instance of that name.
-        viewpoints: Training frames, to count in how many an instance shows.
         masks: Masks of a 2D segmenter; without any the default segmenter looks at the Gaussians.
-        features: Features of the same Gaussians, background first.
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         threads: For drawing; 0: all cores.
-        advance: Told the percentage done.
 
     Returns:
         What ``scene.json`` says under ``semantics``.
@@ -142,11 +138,6 @@ def ask_models_about(
     """Ask segmenter and feature model about training frames; nothing when none is named.
 
     Args:
-        config: Which models.
-        choices: The training frames, with the poses the fit ended with.
-        cloud: All Gaussians of the scene.
-        task: Names what to look for when no prompts are given.
-        output: Shows how far it is.
         threads: For lifting; 0: all cores.
 
     Returns:
@@ -169,12 +160,7 @@ def ask_models_about(
 
 
 def training_frames(choices: Sequence[FrameChoice], count: int) -> list[RgbdFrame]:
-    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time.
-
-    Args:
-        choices: Cameras and the stamps of their training frames.
-        count: Of all cameras together.
-    """
+    """Read at most ``count`` training frames, spread evenly over episodes, cameras and time."""
     numbered = [(index, ns) for index, each in enumerate(choices) for ns in sorted(each.train_ns)]
     chosen = {numbered[index] for index in spread(np.arange(len(numbered)), count)}
     frames: list[RgbdFrame] = []
@@ -198,18 +184,9 @@ def write_scene_semantics(
     """Say what is what in a decomposed scene.
 
     Args:
-        folder: The scene folder.
-        decomposed: The scene in parts.
-        views: What it was fitted to.
         threads: For drawing; 0: all cores.
-        output: How to talk.
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         models: Large models to ask beside the default segmenter; None: none.
-        choices: Training frames that these look at.
-        task: Names what they look for.
-
-    Returns:
-        ``{"semantics": ...}`` for ``scene.json``.
 
     Raises:
         UsageError: When a model cannot be used.

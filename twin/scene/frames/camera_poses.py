@@ -35,10 +35,7 @@ def same_pose(
     """Say whether two poses lie nearer to each other than both limits.
 
     Args:
-        T_base_a: One pose.
         T_base_b: The other, in the same frame.
-        distance_m: Limit of what lies between their origins.
-        angle_rad: Limit of the angle between them.
     """
     near = np.linalg.norm(T_base_a[:3, 3] - T_base_b[:3, 3]) < distance_m
     return bool(near and se3.rotation_angle_rad(T_base_a[:3, :3].T @ T_base_b[:3, :3]) < angle_rad)
@@ -55,13 +52,7 @@ LOOKS = 40
 def unknown_mask(
     tree: TransformTree, frames: Iterable[str], stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> Bool[np.ndarray, " num_stamps"]:
-    """Mark instants at which the pose of a frame is not finite, or was not published near by.
-
-    Args:
-        tree: Knows the frames.
-        frames: All of them have to be known.
-        stamps_ns: Source times.
-    """
+    """Mark instants at which the pose of a frame is not finite, or was not published near by."""
     unknown = np.zeros(len(stamps_ns), dtype=bool)
     for frame in frames:
         with np.errstate(invalid="ignore"):
@@ -73,13 +64,7 @@ def unknown_mask(
 def least_gap_s(
     tree: TransformTree, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
 ) -> float | None:
-    """Least time between an instant and a published pose [s]; None without either.
-
-    Args:
-        tree: The transforms that were published.
-        frame: Whose poses count.
-        stamps_ns: The instants, in any order.
-    """
+    """Least time between an instant and a published pose [s]; None without either."""
     posed_ns = tree.stamps_ns(frame)
     if len(posed_ns) == 0 or len(stamps_ns) == 0:
         return None
@@ -122,8 +107,6 @@ def never_moves(tree: TransformTree, frame: str, posed_ns: Int[np.ndarray, " num
     """Say whether a frame stays where it is in its root frame.
 
     Args:
-        tree: Knows the frame.
-        frame: A camera's, for example.
         posed_ns: When it was posed, at least once; some of these are compared.
     """
     some = posed_ns[np.unique(np.linspace(0, len(posed_ns) - 1, LOOKS).round().astype(int))]
@@ -223,13 +206,8 @@ def find_poses(
     neither the path of the camera nor its loop closures.
 
     Args:
-        episode: Recorded.
-        camera_id: Has colour and depth.
         stamps_ns: Source times of its frames, ascending.
         held_out_ns: Those of them that nothing is learnt from.
-        config: Where poses come from, and the depth that is trusted.
-        output: Told what was found.
-        calibration: Where cameras are mounted, if known.
 
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
@@ -272,11 +250,6 @@ def find_poses(
 def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> None:
     """See that colour and depth are posed in one frame.
 
-    Args:
-        tree: The transforms of the episode.
-        episode: Says in which frames its images are.
-        camera_id: The camera, by its name in the topics.
-
     Raises:
         FrameNotFoundError: When the tree does not know the colour frame.
         UnusableCameraError: When nothing says how the depth frame lies to it.
@@ -302,9 +275,6 @@ def calibrated_poses(
 
     Args:
         episode: Gives joints for a camera in the hand, and how colour and depth lie to each other.
-        camera_id: The camera, by its name in the topics.
-        mount: Link, pose on it and depth scale.
-        stamps_ns: Of the images.
 
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
@@ -328,9 +298,6 @@ def calibrated_tree_at(
 
     Args:
         episode: Gives joints for a camera in the hand, and the stamps of the images.
-        camera_id: The camera, by its name in the topics.
-        mount: Link and pose on it.
-        stamps_ns: The additional instants.
 
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
@@ -371,13 +338,7 @@ def _say_unposed(
 
 
 def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool:
-    """Say whether ``/tf`` holds more of a camera than how its own parts lie to each other.
-
-    Args:
-        tree: The transforms of the episode.
-        episode: Says in which frames its images are.
-        camera_id: The camera, by its name in the topics.
-    """
+    """Say whether ``/tf`` holds more of a camera than how its own parts lie to each other."""
     frame = streams.camera_info(episode, camera_id).frame_id
     if frame not in tree.frames():
         return False

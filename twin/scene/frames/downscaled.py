@@ -43,7 +43,6 @@ def downscaled_depth(frame: RgbdFrame, width_px: int) -> DownscaledDepth:
     """Take every n-th pixel so that about this many columns remain; nothing is averaged.
 
     Args:
-        frame: Its depth image is taken.
         width_px: Columns that are wanted; an image with fewer stays as it is.
     """
     step = max(1, round(frame.depth_camera.width / width_px))
@@ -57,12 +56,7 @@ def downscaled_depth(frame: RgbdFrame, width_px: int) -> DownscaledDepth:
 
 
 def thinned_camera(camera: Camera, step: int) -> Camera:
-    """The camera whose pixel (i, j) looks where pixel (i step, j step) looked.
-
-    Args:
-        camera: Of the whole image.
-        step: Pixels from one that is kept to the next.
-    """
+    """The camera whose pixel (i, j) looks where pixel (i step, j step) looked."""
     return Camera(
         width=-(-camera.width // step),
         height=-(-camera.height // step),
@@ -77,10 +71,6 @@ def colors_in_depth(frame: RgbdFrame, step: int) -> UInt8[np.ndarray, "height wi
     """Colour of every n-th depth pixel, looked up in a colour camera that may stand elsewhere.
 
     Black where the colour camera does not see the point.
-
-    Args:
-        frame: Colour and depth, and where both cameras are.
-        step: Depth pixels from one that is kept to the next.
     """
     depth = np.nan_to_num(frame.depth_m[::step, ::step], posinf=0.0)
     p_depth = thinned_camera(frame.depth_camera, step).unproject(depth)
@@ -97,8 +87,6 @@ def meet(
     """Carry the first image's points into the second and compare depths, and greys if there.
 
     Args:
-        first: Whose measurements are carried over.
-        second: Whose depth they are compared with.
         T_second_first: Pose of the first camera in the frame of the second.
     """
     measured = first.depth_m > 0

@@ -104,13 +104,7 @@ class Aligner:
         return Look(small=small, image=image)
 
     def lay(self, source: Look, target: Look, T_guess: Float[np.ndarray, "4 4"]) -> Step | None:
-        """Lay one frame onto another, from a guess; None when they then disagree.
-
-        Args:
-            source: The frame that is laid onto the other.
-            target: The frame it is laid onto.
-            T_guess: Pose of the source's camera in the target's, to start from.
-        """
+        """Lay one frame onto another, from a guess; None when they then disagree."""
         success, T, information = self.open3d.pipelines.odometry.compute_rgbd_odometry(
             source.image,
             target.image,
@@ -254,10 +248,6 @@ def follow_camera(
 
     Args:
         frames: In time order; their poses are not looked at, except how colour lies to depth.
-        held_out_ns: Stamps of frames that are placed, but do not help to place others.
-        config: Settings.
-        advance: Told how many frames are done.
-        name: The camera, for what is said when it is lost.
 
     Raises:
         LostError: When most frames cannot be placed.

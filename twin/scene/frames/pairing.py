@@ -30,7 +30,6 @@ def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_
 
     Args:
         episode: Whose images are paired; none is decoded.
-        camera_id: The camera, by its name in the topics.
     """
     found = {color[0] for color, _ in _pairs(episode, camera_id, keep=False)}
     return np.array(sorted(found), dtype=np.int64)
@@ -42,10 +41,7 @@ def frames_at(
     """Yield those of ``streams.rgbd_frames`` whose colour image carries one of some stamps.
 
     Args:
-        episode: Recorded.
-        camera_id: Has colour and depth.
         tree: Poses both of its frames.
-        stamps_ns: From ``paired_stamps_ns``.
     """
     wanted = set(stamps_ns)
     if not wanted:
@@ -106,10 +102,6 @@ def name_of(episode: Episode, camera_id: str) -> str:
 
 def check_camera(episode: Episode, camera_id: str) -> None:
     """Look at the first intrinsics and the first image of colour and depth.
-
-    Args:
-        episode: Whose messages are looked at.
-        camera_id: The camera, by its name in the topics.
 
     Raises:
         UnusableCameraError: The lens distorts, intrinsics are missing or of another image size, or

@@ -56,13 +56,7 @@ def posed_view(
     camera: Camera,
     T_world_camera: Float[np.ndarray, "4 4"],
 ) -> PosedView:
-    """Prepare an image: smaller, grey, with slopes.
-
-    Args:
-        image_u8: sRGB.
-        camera: Of the image.
-        T_world_camera: In any unit of length.
-    """
+    """Prepare an image: smaller, grey, with slopes."""
     factor = max(1, -(-camera.width // WORK_WIDTH_PX))
     height, width = (side // factor for side in image_u8.shape[:2])
     part = image_u8[: height * factor, : width * factor].astype(np.float32).mean(axis=2) / 255.0
@@ -83,14 +77,7 @@ def sweep(
     far: float,
     advance: Callable[[int], None] = lambda done: None,
 ) -> list[Float32[np.ndarray, "height width"]]:
-    """Depth along the axis of each view, 0 where it is not known.
-
-    Args:
-        views: All of one static scene.
-        near: Least depth that is tried, in the unit of the poses.
-        far: The most.
-        advance: Told how many views are done.
-    """
+    """Depth along the axis of each view, 0 where it is not known."""
     inverse = np.linspace(1.0 / far, 1.0 / near, NUM_DEPTHS)
     references = [choose_references(index, views, near, far) for index in range(len(views))]
     found = []
@@ -104,14 +91,7 @@ def sweep(
 
 
 def choose_references(index: int, views: Sequence[PosedView], near: float, far: float) -> list[int]:
-    """Views that look the same way from the best distance, best first.
-
-    Args:
-        index: Of the view that is swept.
-        views: All.
-        near: Least depth.
-        far: Most depth.
-    """
+    """Views that look the same way from the best distance, best first."""
     own = views[index].T_world_camera
     typical = np.sqrt(near * far)
     Ts = np.stack([view.T_world_camera for view in views])
@@ -233,15 +213,7 @@ def _confirmed(
     depths: Sequence[Float32[np.ndarray, "height width"]],
     step: float,
 ) -> Float32[np.ndarray, "height width"]:
-    """The depth of one view where others, carried over, say the same.
-
-    Args:
-        index: Of the view.
-        references: Views that it was compared with.
-        views: All.
-        depths: Of all, as swept.
-        step: Inverse depths that differ by less are the same.
-    """
+    """The depth of one view where others, carried over, say the same."""
     view, depth = views[index], depths[index]
     p_world = se3.apply(view.T_world_camera, view.camera.unproject(depth.astype(np.float64)))
     count = np.zeros(depth.shape, dtype=np.int32)

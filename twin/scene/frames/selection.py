@@ -76,11 +76,7 @@ def pick(
     out, unless hardly any would remain.
 
     Args:
-        stamps_ns: Source stamps in order.
         path_m: Distance the camera has come since the first frame, see ``path_length_m``.
-        smear_px: How far the image moves during one exposure.
-        count: How many are wanted.
-        sharpness_of: Asked once, for the frames that come into question.
     """
     if len(stamps_ns) == 0 or count < 1:
         return stamps_ns[:0]
@@ -107,14 +103,7 @@ def path_length_m(
 def smear_px(
     tree: TransformTree, frame_id: str, stamps_ns: Int[np.ndarray, " num_frames"], focal_px: float
 ) -> Float[np.ndarray, " num_frames"]:
-    """How far the image of something at a typical distance moves during one exposure [px].
-
-    Args:
-        tree: Knows the camera's poses around the instants.
-        frame_id: Of the camera.
-        stamps_ns: Of its images.
-        focal_px: Its focal length.
-    """
+    """How far the image of something at a typical distance moves during one exposure [px]."""
     with np.errstate(invalid="ignore"):  # a pose beside one that is not finite: motion unknown
         before = tree.Ts_root_frame(frame_id, stamps_ns - MOTION_WINDOW_NS)
         after = tree.Ts_root_frame(frame_id, stamps_ns + MOTION_WINDOW_NS)
@@ -130,11 +119,6 @@ def robot_smear_px(
     """The same for a robot in front of a camera that stands still, by its fastest joint.
 
     0 where no joints were recorded.
-
-    Args:
-        episode: Whose joints are read.
-        stamps_ns: Of the camera's images.
-        focal_px: Its focal length.
     """
     try:
         track = streams.joint_track(episode)
@@ -146,13 +130,7 @@ def robot_smear_px(
 
 
 def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -> dict[int, float]:
-    """Decode the colour images with these stamps and rate each.
-
-    Args:
-        episode: Whose images are decoded.
-        camera_id: The camera, by its name in the topics.
-        stamps_ns: Source stamps of the images that are rated.
-    """
+    """Decode the colour images with these stamps and rate each."""
     topic = streams.find_camera_topic(episode, camera_id, "color/image")
     wanted = set(stamps_ns)
     found: dict[int, float] = {}
@@ -299,12 +277,7 @@ def rgbd_camera_ids(episode: Episode) -> list[str]:
 
 
 def cameras_with(episode: Episode, others: Sequence[str]) -> list[str]:
-    """Cameras that have colour and some other topics; never those of stand-in truth.
-
-    Args:
-        episode: Whose topics are looked at.
-        others: Ends of the topics a camera has beside its colour images.
-    """
+    """Cameras that have colour and some other topics; never those of stand-in truth."""
     topics = {topic for topic in episode.topics() if not is_truth(topic)}
     stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
     return sorted(
@@ -323,8 +296,6 @@ def choose_frames(
     Which frames are held out depends on their number alone, never on what they show.
 
     Args:
-        sources: The episodes a scene is made from.
-        config: How many frames to use, and how many to hold out.
         output: Told which cameras are left out, and why.
         calibration: Where cameras are mounted; None: they are where ``/tf`` or odometry says.
 
@@ -464,7 +435,6 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
 
     Args:
         values: In their order.
-        count: At most so many.
     """
     if len(values) <= count:
         return values
@@ -483,12 +453,7 @@ def _is_stationary(
 
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
-    """Yield the frames of a choice that carry one of the stamps, with the poses it chose.
-
-    Args:
-        choice: Camera, episode and poses.
-        stamps_ns: Source stamps of the colour images that are wanted.
-    """
+    """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
     for frame in frames_at(choice.episode, choice.camera_id, choice.poses.tree, stamps_ns):
         yield _corrected(frame, choice)
 

@@ -56,11 +56,6 @@ MAX_MM = 65535
 def find_or_sweep_sources(run: RunFolder, config: FrameConfig, output: Output) -> Sources:
     """The run's RGB-D scans; where there are none, its posed colour scans with estimated depth.
 
-    Args:
-        run: Keeps the derived episodes.
-        config: Which images are held out, and how many are used.
-        output: Told that depth is estimated.
-
     Raises:
         NoFramesError: When there is neither.
     """

@@ -62,15 +62,10 @@ def localise_episode(
     Stand-in truth is never read.
 
     Args:
-        episode: Recorded, with posed colour and depth.
-        task: Whose objects are looked for.
-        config: Settings; the defaults when None.
         after_ns: Only frames later than this source time; then ``before_ns`` counts alone.
         before_ns: Only frames earlier than this source time.
         held_out_ns: Frames that must not be looked at.
         last_seen_m: Where objects were seen before; tells equal ones apart.
-        surfaces: Of scanned objects, from the scene.
-        poses: Where calibrated cameras are.
 
     Raises:
         GstError: When no camera can be used; what is wrong with the first.
@@ -148,12 +143,7 @@ def write_localised(
     made from the same bytes with the same settings is kept unless ``force``.
 
     Args:
-        run: Where derived episodes go.
-        episode: The recorded source.
-        task: Whose objects are looked for.
-        config: Settings; the defaults when None.
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
-        force: Write again even when it is there.
 
     Raises:
         GstError: When no camera can be used; what is wrong with the first.

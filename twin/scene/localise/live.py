@@ -107,10 +107,8 @@ class LiveCell:
         """Where a camera was: where it was calibrated, else where ``/tf`` says.
 
         Args:
-            camera_id: The camera, by its name in the topics.
             color: Frame of its colour images.
             depth: Frame of its depth images.
-            stamps_ns: Of the images.
         """
         mount = self.mounts.get(camera_id)
         if mount is None:
@@ -141,9 +139,6 @@ def frames_of(
     """The newest frames of one camera, taken at rest since the last execution ended.
 
     Args:
-        camera_id: The camera, by its name in the topics.
-        camera: What it sent last.
-        cell: Where things are.
         quiet_since_ns: When the last execution ended; images must be later, on the cell's clock.
         max_frames: At most so many, the newest.
 
@@ -248,7 +243,6 @@ class LiveView:
         """Listen for ``/<cell>/cam/...``, events, joint states, transforms and the URDF.
 
         Args:
-            cell: Its name.
             calibration: Of the run. Cameras in it are where it says, and never where ``/tf`` does.
             urdf: The robot description, whatever is published; None: what is published.
         """
@@ -275,8 +269,6 @@ class LiveView:
         """Remember one message; one that cannot be read is counted and passed over.
 
         Args:
-            topic: Where it was published.
-            data: As it came.
             received_ns: On the receiver's clock.
             type_name: Of an image: raw or compressed; "" is what the topic's name promises.
         """

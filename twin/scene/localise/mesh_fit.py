@@ -52,7 +52,6 @@ def mesh_surface(
     Args:
         vertices_m: Of the known or a reconstructed mesh, in the object frame.
         triangles: Counter-clockwise seen from outside.
-        num_samples: How many.
     """
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -65,12 +64,7 @@ def mesh_surface(
 
 @cache
 def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
-    """Surface of the mesh that the task file names.
-
-    Args:
-        model: An object with a mesh.
-        num_samples: Points on the surface.
-    """
+    """Surface of the mesh that the task file names."""
     mesh = object_mesh(model)
     return mesh_surface(mesh.vertices_m, mesh.triangles, num_samples)
 
@@ -81,8 +75,6 @@ def facing(
     """Tell which samples turn their outside to a view's camera.
 
     Args:
-        T_object_base: The base, seen from the object.
-        view: Says where the depth camera is.
         surface: Samples and their normals, in the object's frame.
     """
     ray = se3.apply(T_object_base, view.T_base_depth[None, :3, 3])[0] - surface.p_m
@@ -107,9 +99,6 @@ def seen_through(
 
     Args:
         T: ``T_base_object``.
-        surface: The mesh.
-        views: With their depth.
-        margin_m: How far behind.
         shifts_m: Of the object in each view, x and y; None: where ``T`` says.
     """
     looked = []
@@ -130,9 +119,6 @@ def agreeing(
 
     Args:
         T: ``T_base_object``.
-        surface: The mesh.
-        views: With their depth.
-        margin_m: How far off a measurement may be.
     """
     T_object_base = se3.invert(T)
     share = 0.0
@@ -180,9 +166,7 @@ def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSur
     """Read the meshes of a task's scanned objects, as far as the scene has reconstructed them.
 
     Args:
-        run: Whose scene is read.
         task: Other objects have a shape of their own there.
-        num_samples: Points spread over each mesh.
 
     Raises:
         UnreadableSceneError: When ``object.json`` cannot be understood.
@@ -279,14 +263,8 @@ def fit_mesh(
     one height.
 
     Args:
-        cluster: Points of the object.
         views: What the cameras saw, in the order of the cluster's ``view_ids``.
-        surface: The mesh, see ``surface_of``.
-        fit: Standard errors and bounds.
-        config: Starts and scores.
         tilt_sigma_rad: Prior of roll and pitch: small for what stands, large for what may lie.
-        yaw_period_rad: Turn about its own vertical after which the object looks the same.
-        lying: Start on each of the other five sides, too.
     """
     cluster = cluster.thinned(fit.max_points)
     centre = cluster.p_base.mean(axis=0)

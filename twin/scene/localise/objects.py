@@ -100,11 +100,8 @@ def correct_for_table(
     """Move each view so that its table lies at z = 0; views that see too little stay.
 
     Args:
-        views: What each camera sees.
         task: Its objects do not count as table.
-        config: What may be table, and how far it may correct.
         points: From half its ``min_likeness`` on, a point is the object's and not the table's.
-        colour: What has an object's colour.
     """
     corrected, fits = [], {}
     for view in views:
@@ -145,8 +142,6 @@ def fit_table(
     Args:
         p_base: Points of the table, as the camera says now [m].
         p_base_camera: Where the camera is [m].
-        camera_id: Whose correction it is, for the record.
-        config: Noise of the points, and priors of the errors.
     """
     d = p_base - p_base_camera
     # z after the correction: p_z - s d_z + h + (rotation x d)_z. On the table d_z is minus the
@@ -236,7 +231,6 @@ def localise_objects(
     Args:
         frames: Posed frames of any cameras; several of one still camera are averaged.
         task: Whose ``objects`` are looked for by colour and laid out by known shape.
-        config: Settings; the defaults when None.
         last_seen_m: Where objects were seen before; tells equal ones apart. Default: where the
             task starts them.
         surfaces: Of scanned objects, from the scene, in their own frames. Without one the object

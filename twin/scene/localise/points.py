@@ -52,7 +52,6 @@ def likeness(
     Args:
         image_linear: Linear light, not sRGB.
         color_srgb: Colour of the object, 0..255.
-        config: What is too dark, and how far the hue may be off.
     """
     total = image_linear.sum(axis=-1)
     dark = total < 3 * config.min_luminance
@@ -116,13 +115,6 @@ def fuse_stationary(
 
     Frames of a camera that moved in between make separate views, the newest are kept. Depth is
     averaged over the frames that measured a pixel, if at least half of them did.
-
-    Args:
-        frames: Of all cameras, in any order.
-        max_frames: Frames that one view is averaged over.
-        max_views: Views of one camera.
-        task: Says which part of the table is searched.
-        config: Limits of the points that are kept.
     """
     groups: list[list[RgbdFrame]] = []
     for frame in sorted(frames, key=lambda item: -item.stamp_ns):
@@ -195,7 +187,6 @@ def moved(view: CameraView, T_new_old: Float[np.ndarray, "4 4"], depth_factor: f
     """The same view with its cameras moved in the base frame and its depth scaled.
 
     Args:
-        view: As the camera's pose was.
         T_new_old: Correction of that pose, base frame.
         depth_factor: True depth divided by measured depth.
     """
@@ -248,14 +239,7 @@ class Cluster:
 def object_points(
     views: Sequence[CameraView], model: ObjectModel, config: PointConfig, colour: ColourConfig
 ) -> list[Cluster]:
-    """Clusters of voxel-averaged points of an object's colour, largest first.
-
-    Args:
-        views: What each camera sees.
-        model: The object; its colour counts.
-        config: Lowest height, voxel size and gap between clusters.
-        colour: What has an object's colour.
-    """
+    """Clusters of voxel-averaged points of an object's colour, largest first."""
     parts = []
     for view in views:
         p = view.p_base
@@ -276,7 +260,6 @@ def voxel_mean(
 
     Args:
         points: In any frame [m].
-        voxel_m: Edge length of a voxel.
     """
     if len(points) == 0:
         return points
@@ -298,8 +281,6 @@ def clusters(
 
     Args:
         points: In the base frame [m].
-        view_ids: Which view each comes from.
-        gap_m: About this much free table, seen from above, parts two groups.
     """
     if len(points) == 0:
         return []

@@ -70,14 +70,7 @@ class LocalisedObject:
 def missing(
     model: ObjectModel, stamp_ns: int, reason: str, detail: Mapping[str, Any]
 ) -> LocalisedObject:
-    """Say why an object was not found.
-
-    Args:
-        model: The object that was looked for.
-        stamp_ns: Of the newest image that was looked at.
-        reason: As the operator reads it.
-        detail: Numbers behind it, for the record.
-    """
+    """Say why an object was not found."""
     return LocalisedObject(
         object_id=model.id,
         found=False,
@@ -102,9 +95,6 @@ def found_by_mesh(
     """Turn a fitted mesh into a result; what nearly stands on the table stands on it.
 
     Args:
-        model: The object that was looked for.
-        fit: Its mesh laid onto the points.
-        stamp_ns: Of the newest image that was looked at.
         rest_tolerance_m: Height over or under its rest that still counts as standing.
         detail: Numbers for the record; those of the fit are added.
     """
@@ -151,9 +141,7 @@ def found_by_shape(
     """Turn a fitted shape into a result; what nearly stands on the table stands on it.
 
     Args:
-        model: The object that was looked for.
         fit: Its shape laid onto points and outlines.
-        stamp_ns: Of the newest image that was looked at.
         rest_tolerance_m: Height over or under its rest that still counts as standing.
         detail: Numbers for the record; the lift is added.
     """
@@ -194,8 +182,6 @@ def found_by_box(
     Args:
         model: The object that was looked for; only its size is known.
         points: What was seen of it, base frame [m].
-        stamp_ns: Of the newest image that was looked at.
-        detail: Numbers for the record.
     """
     yaw = rectangle_yaw_rad(points[:, :2])
     c, s = np.cos(yaw), np.sin(yaw)
@@ -225,12 +211,7 @@ def found_by_box(
 def reduce_by_symmetry(
     T_base_object: Float[np.ndarray, "4 4"], model: ObjectModel
 ) -> Float[np.ndarray, "4 4"]:
-    """Choose the yaw nearest zero among those that look the same.
-
-    Args:
-        T_base_object: An upright pose.
-        model: Its symmetry says which turns about the vertical look the same.
-    """
+    """Choose the yaw nearest zero among those that look the same."""
     period = yaw_period_rad(model)
     yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
     reduced = np.mod(yaw + period / 2, period) - period / 2

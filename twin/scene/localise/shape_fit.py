@@ -64,11 +64,6 @@ def find_outlines(
     goes on.
 
     Args:
-        views: What each camera sees.
-        model: The object; its colour and corners count.
-        T_base_object: Where it is thought to be.
-        colour: What has an object's colour.
-        window_m: How far around the predicted outline is searched.
         sigma_px: Standard error of one edge point.
     """
     outlines = []
@@ -152,13 +147,7 @@ def _occluded(
 def outline_distances(
     outline: Outline, model: ObjectModel, T_base_object: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, " num_edges"]:
-    """Signed distance of each edge point to the predicted outline, positive outside [m].
-
-    Args:
-        outline: Edge points of one view.
-        model: The object; its corners predict the outline.
-        T_base_object: Where it is thought to be.
-    """
+    """Signed distance of each edge point to the predicted outline, positive outside [m]."""
     T_camera_object = se3.invert(outline.view.T_base_color) @ T_base_object
     uv, _ = outline.view.color_camera.project(se3.apply(T_camera_object, corners(model)))
     hull = ConvexHull(uv)
@@ -250,11 +239,7 @@ def fit_shape(
     the points; the best one is refined with the outlines, looked for in a shrinking window.
 
     Args:
-        cluster: Points of the object.
         views: Those the points come from; their images have the outlines.
-        model: The object, its size known.
-        colour: What has an object's colour.
-        config: Noise, priors of the cameras and robust limits.
     """
     cluster = cluster.thinned(config.max_points)
     centre = cluster.p_base.mean(axis=0)
@@ -296,9 +281,6 @@ def refine_on_points(
 
     Args:
         points: On the surface of the object, base frame [m].
-        model: The object, its size known.
-        T_base_object: The pose to start from, upright.
-        config: Noise and robust limits.
     """
     cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
     problem = _Problem(

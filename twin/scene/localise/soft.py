@@ -112,14 +112,6 @@ def soft_shape(
     """Extents along the axes of the fitted pose: those at rest, plus how far the seen ends moved.
 
     All points near the fitted surface count, whatever their colour.
-
-    Args:
-        views: What the cameras saw.
-        surface: Its mesh at rest.
-        model: Its extents at rest.
-        fit: Where it was found.
-        points: Size of the voxels.
-        soft: How far the surface may be off.
     """
     T = fit.T_base_object
     T_object_base = se3.invert(T)
@@ -166,13 +158,8 @@ def candidates(
     """Clusters that may be one toy each; what touches is cut apart.
 
     Args:
-        model: The toy.
         count: How many equal ones there are at most.
-        views: What the cameras saw.
         blocked: Rigid objects with their poses; their points do not count.
-        points: Which points count.
-        colour: Which pixels have the toy's colour.
-        soft: Heights and sizes.
     """
     parts = []
     for view in views:
@@ -258,15 +245,7 @@ def fit_toys(
     """Find toys that all look the same.
 
     Args:
-        models: Equal but for their ids.
-        views: What the cameras saw.
-        blocked: Rigid objects that were found, with their poses.
         expected_m: Where each toy is expected, by id; those without are taken as they come.
-        points: Which points count.
-        colour: Which pixels have the toy's colour.
-        fit: Standard errors and bounds.
-        mesh: Starts and scores.
-        soft: See there.
         min_explained: Share of a cluster's points that the toy must explain.
 
     Returns:
@@ -321,17 +300,7 @@ def fit_toy(
     *,
     turn: bool,
 ) -> MeshFit:
-    """Lay a toy's mesh onto points, standing first, on its other sides if that explains little.
-
-    Args:
-        group: The points.
-        views: What the cameras saw.
-        surface: The mesh at rest.
-        fit: Standard errors and bounds.
-        mesh: Starts and scores.
-        soft: What explains little.
-        turn: Whether to try the other sides at all.
-    """
+    """Lay a toy's mesh onto points, standing first, on its other sides if that explains little."""
     standing = fit_mesh(group, views, surface, fit, mesh, tilt_sigma_rad=soft.tilt_sigma_rad)
     doubtful = standing.seen_through > soft.well_seen_through
     doubtful |= standing.explained < soft.well_explained

@@ -49,13 +49,10 @@ def stationary_frames(
     place in the robot's base nobody knows, is passed over as long as another one can.
 
     Args:
-        episode: Recorded, with posed colour and depth.
-        max_per_camera: At most so many.
         after_ns: Only frames later than this source time.
         before_ns: Only frames earlier than this source time.
         evenly: Spread them evenly over the interval instead of taking the last ones.
         held_out_ns: Frames that must not be looked at.
-        poses: Where calibrated cameras are.
 
     Raises:
         GstError: When no camera can be used; what is wrong with the first.
@@ -150,9 +147,6 @@ def is_stationary(
     """Say whether a frame's pose is the same shortly before and after an instant.
 
     Args:
-        tree: Knows the frame's poses around the instant.
-        frame_id: Of the camera.
-        stamp_ns: The instant.
         until_ns: Nothing later is looked at; None: no limit.
     """
     last_ns = (
@@ -171,7 +165,6 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
     """Where the cameras of an episode are, as far as they were calibrated.
 
     Args:
-        episode: Whose cameras, and whose joints for those in the hand.
         calibration: Of the run; None: no camera was calibrated.
 
     Raises:

@@ -45,7 +45,6 @@ def with_halo(
     Args:
         cloud: The whole scene in ``base_link`` whose z = 0 is the table.
         owner: Index of the object each Gaussian belongs to so far, in the order of the poses; -1.
-        poses: Where the objects are.
         shapes: Reconstructed shapes in the frames of their objects; others are left as they are.
     """
     distance, nearest = _nearest(cloud, poses, shapes)
@@ -77,12 +76,8 @@ def hidden_table(
     loses nothing: the filling has it too.
 
     Args:
-        cloud: As in ``with_halo``.
         owner: As in ``with_halo``; what belongs to an object is not asked.
-        poses: Where the objects are.
         shapes: Reconstructed shapes in the frames of their objects.
-        task: Their colours.
-        min_likeness: Of a Gaussian in an object's own colour.
     """
     on_top = cloud.means_m.astype(np.float64)
     on_top[:, 2] = np.maximum(on_top[:, 2], 0.0)  # below the table, the point above counts
@@ -98,13 +93,7 @@ def hidden_table(
 def alike(
     cloud: GaussianCloud, model: ObjectModel, min_likeness: float
 ) -> Bool[np.ndarray, " num_splats"]:
-    """Tell which Gaussians have an object's colour, see ``twin.scene.localise.points.likeness``.
-
-    Args:
-        cloud: The Gaussians that are asked about.
-        model: The object; its colour counts.
-        min_likeness: From this likeness on the colour is the object's.
-    """
+    """Tell which Gaussians have an object's colour, see ``twin.scene.localise.points.likeness``."""
     color_u8 = np.clip(np.rint(cloud.colors * 255), 0, 255).astype(np.uint8)
     linear = linear_image(color_u8[None])[0]
     return np.asarray(likeness(linear, model.color_srgb, ColourConfig()) >= min_likeness)
@@ -157,14 +146,7 @@ def object_poses(
     task: Task,
     config: SplitConfig | None = None,
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Where the Gaussians of each object that was found are: its pose laid onto them.
-
-    Args:
-        cloud: The whole scene in ``base_link``.
-        localised: Where the objects were while it was scanned.
-        task: Their shapes and colours.
-        config: Settings; the defaults when None.
-    """
+    """Where the Gaussians of each object that was found are: its pose laid onto them."""
     config = SplitConfig() if config is None else config
     return {
         key: _refined(cloud, task.objects[key], item.T_base_object, config)
@@ -184,10 +166,7 @@ def assign_splats(
 
     Args:
         cloud: The whole scene in ``base_link`` whose z = 0 is the table.
-        poses: From ``object_poses``.
-        task: Shapes and colours.
         shapes: Reconstructed shapes in the frames of their objects, where there are any.
-        config: Settings; the defaults when None.
     """
     config = SplitConfig() if config is None else config
     shapes = {} if shapes is None else shapes

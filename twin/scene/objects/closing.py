@@ -58,8 +58,6 @@ def closed_object(
     Args:
         mesh: In the object's frame, closed.
         views: What the scene was fitted to, in the base frame.
-        T_base_object: Where the object was.
-        config: How flat and how opaque.
     """
     surface = _ClosedSurface(mesh)
     looks = [_Look.of(view, surface, T_base_object) for view in views]
@@ -202,7 +200,6 @@ def weighted_median(
     """Median over views of each channel; 0 where nothing has weight.
 
     Args:
-        values: What each view says.
         weights: How much it counts, at least 0.
     """
     order = np.argsort(values, axis=0)

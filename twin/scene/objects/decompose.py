@@ -70,11 +70,6 @@ def fill_footprint(
 ) -> GaussianCloud:
     """Flat Gaussians on the table wherever the background leaves a hole under an object.
 
-    Args:
-        background: The scene without the object.
-        model: Its footprint.
-        T_base_object: Where it stood.
-
     Returns:
         The filling alone, marked as completed; empty where the table was seen, or where there is
         none around.
@@ -147,10 +142,6 @@ def split_objects(
     place. Objects that were not found stay in the background.
 
     Args:
-        cloud: The whole scene in ``base_link``.
-        localised: Where the objects were while it was scanned.
-        task: Their shapes and colours.
-        config: Settings; the defaults when None.
         shapes: Reconstructed, in the frames of the objects; without one the task's shape decides,
             which for a toy is the box around it.
     """
@@ -182,9 +173,7 @@ def closed_parts(
 
     Args:
         parts: As cut out of the scene; objects without such a shape stay as they are.
-        poses: Where the shapes stand.
         shapes: In the frames of the objects.
-        views: What the scene was fitted to, with the objects' colours.
         config: The shape of new Gaussians.
     """
     objects = dict(parts.objects)
@@ -229,10 +218,6 @@ def write_objects(
     object frame.
 
     Args:
-        folder: The scene folder.
-        parts: Their Gaussians.
-        localised: Where they were found.
-        task: Their known shapes.
         shapes: Reconstructed shapes in the object frame, or why there is none; the known shape
             is written for objects that are not listed, too.
 
@@ -315,7 +300,6 @@ class Decomposition:
         """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
 
         Args:
-            run: Whose scene folder is written.
             views: What the scene was fitted to; says what is static.
         """
         static = write_static(run.scene_dir, views, self.task, self.places)
@@ -393,8 +377,6 @@ def decompose(
     """Cut the tasks' objects out of the scene where the first episode of each task shows them.
 
     Args:
-        sources: The episodes the scene was made from.
-        cloud: The whole fitted scene.
         choices: Which frames are held out: the objects are not looked for in them.
         views: What the scene was fitted to; objects are reconstructed from them.
         output: How to talk; None: say nothing.
@@ -459,10 +441,6 @@ def _localised(
 def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectSplats]:
     """Load the objects that ``scene.json`` lists, each in its own frame.
 
-    Args:
-        run: Whose scene folder is read.
-        record: The content of ``scene.json``.
-
     Raises:
         PathNotFoundError: When a splat file is gone.
         UnreadablePlyError: When one is damaged.
@@ -491,10 +469,6 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 
 def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
     """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform.
-
-    Args:
-        pose: What the file holds.
-        path: The file, for the message.
 
     Raises:
         UnreadableSceneError: When they are no pose; names the file.

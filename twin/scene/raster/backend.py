@@ -114,8 +114,6 @@ class CudaRasteriser:
 
         Args:
             cloud: The Gaussians, in the base frame.
-            camera: Size of the image and intrinsics.
-            T_base_camera: Where the camera is.
         """
         torch = self._torch
         leaves = {name: torch.tensor(rows, device=self._device) for name, rows in arrays(cloud)}
@@ -136,8 +134,6 @@ class CudaRasteriser:
 
         Args:
             cloud: The Gaussians, in the base frame.
-            camera: Size of the image and intrinsics.
-            T_base_camera: Where the camera is.
         """
         planes = self.draw_planes(cloud, camera, T_base_camera)
         alpha = planes[4]

@@ -90,12 +90,7 @@ class CloudGradient:
 def native_camera(
     camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float32[np.ndarray, "3 4"], tuple[int, int, float, float, float, float]]:
-    """Pose and intrinsics as the extension takes them.
-
-    Args:
-        camera: Size of the image and intrinsics.
-        T_base_camera: Where the camera is.
-    """
+    """Pose and intrinsics as the extension takes them."""
     intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     return as_float32(se3.invert(T_base_camera)[:3]), intrinsics
 
@@ -164,8 +159,6 @@ class FitSession:
         """Draw one view, compare it with what was seen, and follow the gradient.
 
         Args:
-            target: Image, depth and static mask at the camera's size.
-            T_base_camera: Where it was seen from.
             rates: Adam's step size for each array by name; arrays without one stay as they are,
                 and so do their moments.
             exposure: Times the drawn (red, green, blue, 1) is compared with the image.
@@ -216,7 +209,6 @@ class FitSession:
         """Go on with another cloud.
 
         Args:
-            cloud: Copied.
             parents: For each of its Gaussians the row of the present cloud whose moments it goes
                 on with, or -1 for none; nothing given: none for all.
         """
@@ -285,8 +277,6 @@ class Rasteriser:
 
         Args:
             cloud: The Gaussians, in the base frame.
-            camera: Size of the image and intrinsics.
-            T_base_camera: Where the camera is.
         """
         planes: np.ndarray = self._native.draw(
             cloud.means_m,
@@ -306,12 +296,7 @@ class Rasteriser:
         planes: Float32[np.ndarray, "5 height width"],
         plane_gradients: Float32[np.ndarray, "5 height width"],
     ) -> CloudGradient:
-        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud.
-
-        Args:
-            planes: As the last ``draw_planes`` returned them.
-            plane_gradients: Gradient of the loss on each number of the planes.
-        """
+        """Carry a gradient on the planes of the last ``draw_planes`` back to its cloud."""
         means, quats, scales, opacities, colors, harmonics, pose = self._native.pull(
             planes, plane_gradients
         )
@@ -376,8 +361,6 @@ class Rasteriser:
 
         Args:
             cloud: The Gaussians, in the base frame.
-            camera: Size of the image and intrinsics.
-            T_base_camera: Where the camera is.
         """
         planes = self.draw_planes(cloud, camera, T_base_camera)
         image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))

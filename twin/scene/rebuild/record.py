@@ -62,16 +62,6 @@ def make_record(
 
     Args:
         key: Names the inputs and settings; a rebuild with the same key is not repeated.
-        scene_hash: Of the background's file; names the scene.
-        sources: The episodes it was made from.
-        left_out: Why cameras were not used.
-        training: Frames that were learnt from, with the report on the scan.
-        config: Settings of the rebuild.
-        fitted: The cloud, and what fitting it took.
-        views: Numbers of the held-out views.
-        num_background: Gaussians that belong to no object.
-        num_completed: Those of them that stand for what nobody measured.
-        cost: Of the whole rebuild.
     """
     settings = asdict(config)
     settings.pop("force")
@@ -119,14 +109,7 @@ def make_record(
 def protocol_of(
     choices: Sequence[FrameChoice], fitted: FitResult, config: RebuildConfig, cost: Cost
 ) -> dict[str, Any]:
-    """How the scene was made, as far as whoever rates its views must know.
-
-    Args:
-        choices: Frames that were learnt from or held out.
-        fitted: The cloud, and what fitting it took.
-        config: Settings of the rebuild.
-        cost: Of the rebuild so far.
-    """
+    """How the scene was made, as far as whoever rates its views must know."""
     frames = config.frames
     return {
         "holdout": holdout_text(frames),

@@ -85,11 +85,6 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
     Work already done with the same inputs and settings is not repeated unless forced.
 
-    Args:
-        run: Whose scans are read, and whose scene folder is written.
-        config: Frames, fit, models, and whether to redo what is there.
-        output: Shows progress and remarks.
-
     Raises:
         NoFramesError: When the run has no RGB-D frames, and no posed images without depth.
         UnusableCameraError: When no camera can be used or followed.

@@ -94,13 +94,8 @@ def rate_view(
     """Compare one rendered view with its recorded frame.
 
     Args:
-        frame: The recorded image.
         recorded: The same frame as the fit would have seen it; gives depth.
-        view: What was rendered from the same pose.
         static_mask: True where nothing moved.
-        seen: True where the view shows what was measured, and not what was completed.
-        episode: Id of the recorded episode.
-        stationary: The camera stands still.
     """
     rendered_u8 = view.image_u8()
     rendered, wanted = as_float(rendered_u8), as_float(frame.image_u8)
@@ -143,12 +138,7 @@ def finite_psnr_db(
 
 
 def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
-    """Average the held-out views; cameras that stand still are kept apart.
-
-    Args:
-        numbers: One entry for each held-out frame.
-        files: Derived episodes that hold the views.
-    """
+    """Average the held-out views; cameras that stand still are kept apart."""
     moving = [item for item in numbers if not item.stationary_camera]
     stationary = [item for item in numbers if item.stationary_camera]
     averages = {
@@ -178,13 +168,7 @@ OBJECT_SHARE = 0.5
 
 
 def views_path(run: RunFolder, episode: Episode, scene_hash: str) -> Path:
-    """Name of the derived episode that holds an episode's held-out views.
-
-    Args:
-        run: Keeps derived episodes.
-        episode: The recorded one.
-        scene_hash: Of the scene that was rendered.
-    """
+    """Name of the derived episode that holds an episode's held-out views."""
     return run.derived_dir / f"{episode.path.stem}.views.{scene_hash}.mcap"
 
 
@@ -235,14 +219,7 @@ class HeldOutViews:
 def write_views(
     run: RunFolder, choices: Sequence[FrameChoice], job: ViewsJob, advance: Advance
 ) -> list[ViewNumbers]:
-    """Render every held-out frame; one derived episode per recorded one, replaced if present.
-
-    Args:
-        run: Keeps the derived episodes.
-        choices: Cameras and the stamps of their held-out frames.
-        job: The scene, and what to say about how it was made.
-        advance: Told the number of views done and how good the last is.
-    """
+    """Render every held-out frame; one derived episode per recorded one, replaced if present."""
     rasteriser = Rasteriser(job.raster)
     numbers: list[ViewNumbers] = []
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}

@@ -104,10 +104,8 @@ class RobotFrames:
         The robot's points are kept for its links when it stood still.
 
         Args:
-            episode: Whose joints say how the robot stood.
             frame: Only its stamp counts.
             points: The surface that the frame measured, root frame.
-            view: The frame as the fit sees it.
         """
         surface = self._surface(episode, frame.stamp_ns)
         if surface is None:
@@ -121,8 +119,6 @@ class RobotFrames:
         """Keep the robot's points of a frame that the background does not need.
 
         Args:
-            episode: Whose joints say how the robot stood.
-            stamp_ns: When the frame was taken.
             points: The surface that it measured, root frame.
         """
         surface = self._surface(episode, stamp_ns)
@@ -132,12 +128,7 @@ class RobotFrames:
     def stationary_postures(
         self, episode: Episode, stamps_ns: Iterable[int]
     ) -> dict[int, Float[np.ndarray, " num_joints"]]:
-        """Joints at those of some instants at which the robot of an episode stood still [rad].
-
-        Args:
-            episode: Whose joints are read.
-            stamps_ns: The instants.
-        """
+        """Joints at those of some instants at which the robot of an episode stood still [rad]."""
         tracked = self._tracked.get(str(episode.path))
         if tracked is None:
             return {}
@@ -222,14 +213,7 @@ class RobotFrames:
         episode: Episode,
         stamp_ns: int,
     ) -> GaussianCloud:
-        """Put the robot into a scene as it stood at an instant of an episode.
-
-        Args:
-            cloud: The scene, in the frames' root.
-            links: As ``links`` gives them.
-            episode: Whose joints count.
-            stamp_ns: When.
-        """
+        """Put the robot into a scene as it stood at an instant of an episode."""
         tracked = self._tracked.get(str(episode.path))
         if tracked is None or not links.clouds or not tracked.track.covers(stamp_ns):
             return cloud
@@ -254,8 +238,6 @@ def robot_mask(
 
     Args:
         surface: The robot as it stood, base frame.
-        camera: Size of the image and intrinsics.
-        T_base_camera: Where the camera is.
         depth_m: What the camera measured; 0 is "not measured" and hides nothing.
     """
     expected = surface.depth_along(camera.rays(), T_base_camera)
@@ -299,7 +281,6 @@ def find_robot(choices: Sequence[FrameChoice], output: Output) -> FoundRobot:
 
     Args:
         choices: Cameras whose training frames are used; their root frame decides how to look.
-        output: Told how well scene and robot fit.
     """
     root = root_frame(choices[0])
     episodes = list({choice.episode.path: choice.episode for choice in choices}.values())
@@ -328,9 +309,7 @@ def look_closer(
     posture, so up to two dozen postures far from each other are read for its links.
 
     Args:
-        found: Receives the robot's points.
         choices: Only cameras that stand still, and their spare frames, are read.
-        limits: Which depth is trusted.
         stride: Pixels from one that becomes a point to the next, along rows and columns.
     """
     for choice in choices:
@@ -361,8 +340,6 @@ def write_robot(run: RunFolder, found: FoundRobot, links: LitLinks) -> dict[str,
     """Write ``robot/<link>.ply`` and return what ``scene.json`` says about the robot.
 
     Args:
-        run: Whose scene folder is written.
-        found: Where the robot is in the scene.
         links: Gaussians of each link, in its own frame, and the light on them.
     """
     record: dict[str, Any] = {

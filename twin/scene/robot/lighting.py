@@ -57,11 +57,7 @@ EVEN = Lighting()
 
 
 def read_lighting(record: Mapping[str, Any]) -> Lighting:
-    """Light on the arm as ``scene.json`` has it; even in older scenes.
-
-    Args:
-        record: The content of ``scene.json``.
-    """
+    """Light on the arm as ``scene.json`` has it; even in older scenes."""
     found = record.get("robot", {}).get("lighting")
     return EVEN if found is None else Lighting(coefficients=tuple(found["brightness_sh2"]))
 

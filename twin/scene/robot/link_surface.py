@@ -52,7 +52,6 @@ def link_lighting(
 
     Args:
         shapes: Of the links, in their frames.
-        seen: What was measured of each.
     """
     patches: list[Patches] = []
     first = 0
@@ -88,8 +87,6 @@ def own_colors(
 
     Args:
         shapes: Of the link, in its frame: measured normals are noisy, theirs are not; may be none.
-        seen: What was measured.
-        lighting: In which it was.
     """
     if lighting == EVEN:
         return [item.points for item in seen]
@@ -127,10 +124,7 @@ def on_surface(
     """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured.
 
     Args:
-        shapes: All shapes of the link.
         sets: What was measured of it, in its frame.
-        spacing_m: From one Gaussian to the next.
-        config: How flat and how opaque.
     """
     p, normals = even_points(shapes, spacing_m)
     seen_m, seen_normals, seen_colors = (

@@ -37,10 +37,6 @@ def posed(
 
     Args:
         links: Per link its Gaussians in the link's frame, as ``read_links`` gives them.
-        joints_rad: Where the arm is to be.
-        urdf: The robot's description.
-        width_m: Opening of the gripper.
-        lighting: In which the links' own colours are drawn.
 
     Returns:
         One cloud in the base frame, links in the order of the mapping; empty without links.
@@ -114,10 +110,6 @@ def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str,
 
 def read_links(run: RunFolder, record: Mapping[str, Any]) -> dict[str, GaussianCloud]:
     """Load the links that ``scene.json`` lists under ``robot``, each in its own frame.
-
-    Args:
-        run: Whose scene folder is read.
-        record: The content of ``scene.json``.
 
     Raises:
         PathNotFoundError: A file is gone.

@@ -44,8 +44,6 @@ def smooth_shares(
 
     Args:
         share: How much of each Gaussian the masks give to each thing, 0..1.
-        cloud: Places and colours of the Gaussians.
-        config: How far and across what colours shares spread.
     """
     told = np.flatnonzero(share.max(axis=0, initial=0.0) > 0.01)
     if len(told) <= config.num_neighbours:
@@ -132,12 +130,6 @@ def associate(
     to the thing with the largest share of its light inside matching masks, if that is more than
     the background's share plus ``background_bias``. Frames whose mask of the thing is missing
     do not count against it: a dropped mask says nothing about the edge.
-
-    Args:
-        observations: What each frame's masks say.
-        num_splats: Gaussians of the scene.
-        config: When masks mean the same thing.
-        smooth: What neighbours have to say about the shares before Gaussians are decided.
     """
     candidates = _candidates(observations, num_splats, config)
     sets = [votes > 0 for votes in candidates]

@@ -53,12 +53,7 @@ class Voxels:
 
 
 def make_voxels(points: SurfacePoints, voxel_m: float) -> Voxels:
-    """Average the points of each occupied voxel.
-
-    Args:
-        points: Coloured, oriented points of visible surfaces.
-        voxel_m: Edge length of a voxel.
-    """
+    """Average the points of each occupied voxel."""
     cells = np.floor(points.p_m / voxel_m).astype(np.int64)
     _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     index = index.reshape(-1)
@@ -81,9 +76,7 @@ def means_of(
     """Average the rows of each group; a group without rows gives zero.
 
     Args:
-        values: What is averaged, column by column.
         group: Which group each row belongs to, from 0.
-        num_groups: How many there are, those without rows included.
     """
     count = np.maximum(np.bincount(group, minlength=num_groups), 1)
     sums = [np.bincount(group, weights=column, minlength=num_groups) for column in values.T]
@@ -97,7 +90,6 @@ def neighbour_pairs(
 
     Args:
         p_m: In any frame.
-        reach_m: The distance.
     """
     if len(p_m) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -112,7 +104,6 @@ def components(
 
     Args:
         num_nodes: Of the graph; a node without an edge is a group of its own.
-        pairs: Its edges, by node numbers.
     """
     weights = np.ones(len(pairs), dtype=np.int8)
     graph = coo_matrix((weights, (pairs[:, 0], pairs[:, 1])), shape=(num_nodes, num_nodes))
@@ -123,13 +114,7 @@ def components(
 def pairs_among(
     ids: Int[np.ndarray, " num_members"], pairs: Int[np.ndarray, "num_pairs 2"], num_nodes: int
 ) -> Int[np.ndarray, "num_own 2"]:
-    """The pairs that lie among some nodes, in the numbering of these.
-
-    Args:
-        ids: The nodes.
-        pairs: Of all nodes.
-        num_nodes: How many there are in all.
-    """
+    """The pairs that lie among some nodes, in the numbering of these."""
     rank = np.full(num_nodes, -1, dtype=np.int64)
     rank[ids] = np.arange(len(ids))
     own = rank[pairs]
@@ -156,12 +141,7 @@ def make_patches(
     Float[np.ndarray, "num_patches 3"],
     Float[np.ndarray, "num_patches 3"],
 ]:
-    """Group voxels that are near and face the same way: patch of each, centres, normals.
-
-    Args:
-        voxels: Places and normals.
-        size_m: Edge length of a patch.
-    """
+    """Group voxels that are near and face the same way: patch of each, centres, normals."""
     cells = np.floor(voxels.p_m / size_m).astype(np.int64)
     axis = np.abs(voxels.normals).argmax(axis=1)
     forward = np.take_along_axis(voxels.normals, axis[:, None], axis=1)[:, 0] > 0
@@ -216,10 +196,6 @@ def split_by_valleys(
     outlines seen from above hardly overlap: heads, handles and the floor of a box stay.
 
     Args:
-        voxels: Of one connected group.
-        height_m: Of each voxel over the supporting plane.
-        pairs: Voxels that are neighbours.
-        voxel_m: Edge length of a voxel.
         config: What counts as a valley and as standing.
     """
     patch, p, normals = make_patches(voxels, config.patch_voxels * voxel_m)
@@ -290,10 +266,6 @@ def joined_by_outline(
     one, a head in front of its body.
 
     Args:
-        pieces: Voxel numbers of each piece.
-        voxels: That the numbers refer to.
-        height_m: Of each voxel over the supporting plane.
-        voxel_m: Edge length of a voxel.
         config: Which colours are one, and how far outlines must overlap.
     """
     xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
@@ -378,12 +350,6 @@ def split_by_colour(
     k-means in Lab for k = 1.. with a Schwarz criterion whose noise has a floor; then connected
     pieces of one colour. A piece much smaller than its neighbour is a marking (a beak, a label)
     and joins it, unless it lies in the neighbour's cavity.
-
-    Args:
-        voxels: Of one connected group.
-        height_m: Of each voxel over the supporting plane.
-        pairs: Voxels that are neighbours.
-        config: Noise and least distance of colours, least size of a piece.
     """
     colour = without_shading(voxels.lab, config.lightness_weight)
     classes = _colour_classes(colour, config)

@@ -79,10 +79,6 @@ def without_shading(
     """Lab as it would be at lightness 50, and a little of the lightness itself.
 
     Light that is s times as strong multiplies a, b and L + 16 by the cube root of s.
-
-    Args:
-        lab: CIE L, a, b.
-        lightness_weight: Factor on the lightness that is kept as first number.
     """
     strength = np.maximum(lab[:, :1] + 16.0, 25.0) / 66.0
     return np.concatenate([lightness_weight * lab[:, :1], lab[:, 1:] / strength], axis=1)

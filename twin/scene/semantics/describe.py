@@ -64,13 +64,6 @@ def scene_from_masks(
 ) -> SemanticScene:
     """Fuse the masks of a 2D segmenter into the Gaussians of a scene.
 
-    Args:
-        cloud: The scene.
-        frames: Masks with where their cameras stood.
-        rasteriser: What to draw with.
-        config: When masks mean the same thing.
-        advance: Told the percentage done.
-
     Raises:
         SemanticsError: When a mask does not fit its camera.
     """
@@ -132,9 +125,6 @@ def scene_by_default(
     work is done in a frame where it does, and a remark says that, too.
 
     Args:
-        cloud: The scene.
-        viewpoints: Frames, to count in how many an instance shows.
-        rasteriser: What to draw with.
         config: What counts as a thing; the defaults when None.
         known: Gaussians of the objects that a task names, by their ids. They come first, under
             their names.
@@ -142,7 +132,6 @@ def scene_by_default(
             are told apart on these, which are thinner than any coat of Gaussians.
         fused: The surface as it was measured, evenly sampled: things are looked for in it. None:
             in the scene's Gaussians, which a fit put where colours change.
-        advance: Told the percentage done.
     """
     frames = list(viewpoints)
     ids = np.flatnonzero(solid_splats(cloud))
@@ -322,15 +311,7 @@ def describe(
     object of a task is called by its ``key`` and its colour, whatever the label.
 
     Args:
-        cloud: The whole scene.
-        number: Id of the instance.
-        mask: Its Gaussians.
-        label: What it is called.
-        support: Frames with a matching mask.
-        seen: Frames that show it.
         score: Confidence, 0..1.
-        source: Who found it.
-        plane: What it stands on.
         key: Id of the object in the task; empty: none.
         surface_m: Points of its reconstructed surface, where there is one.
     """

@@ -65,7 +65,6 @@ def fit_basis(maps: Sequence[FeatureMap], num_kept: int) -> FeatureBasis:
     """Principal component analysis over cells of all maps, evenly thinned.
 
     Args:
-        maps: Feature maps of one model.
         num_kept: Components to keep; fewer when there are fewer channels or cells.
 
     Raises:
@@ -107,11 +106,7 @@ def lift_reduced(
     A Gaussian gets the mean of what the maps say about it.
 
     Args:
-        rasteriser: Draws the cloud and carries values back.
         cloud: The Gaussians, in the frame of the viewpoints.
-        frames: The whole feature map of each image, and where its camera stood.
-        basis: Principal components that the maps are reduced to.
-        source: Which models made the features, for the record.
     """
     reduced = [(viewpoint, basis.reduce(item)) for viewpoint, item in frames]
     mean, weight = lift_features(rasteriser, cloud, reduced)
@@ -126,12 +121,7 @@ def lift_reduced(
 
 
 def save_features(folder: Path, features: SceneFeatures) -> Path:
-    """Write ``features.npz`` whole or not at all; features as 16-bit floats.
-
-    Args:
-        folder: The scene folder.
-        features: Of Gaussians and instances.
-    """
+    """Write ``features.npz`` whole or not at all; features as 16-bit floats."""
     buffer = io.BytesIO()
     np.savez(
         buffer,

@@ -43,10 +43,7 @@ def branches(
     Args:
         p_m: Voxels above the plane.
         height_m: Of each over the plane.
-        pairs: Neighbours.
-        voxel_m: Their size.
         max_size_m: Groups that reach farther along an axis are parted.
-        min_voxels: Smaller groups are noise.
     """
     groups: list[np.ndarray] = []
     too_large = np.zeros(len(p_m), dtype=bool)

@@ -212,8 +212,6 @@ def label_of(key: str, colour: str, *, is_open: bool, shape: str = "") -> str:
     colour gets its shape: "red" is a red cube.
 
     Args:
-        key: Its id in the task file.
-        colour: Name of its colour.
         is_open: Whether it has a cavity that opens upwards.
         shape: One of ``SHAPE_WORDS``; empty where nobody knows.
     """
@@ -288,10 +286,7 @@ def query(
     with its object's activation ("handle of the basket", "the duck's head").
 
     Args:
-        scene: What there is.
-        text: An object, optionally with a part of it.
         embeddings: One vector for each instance, in the order of ``scene.instances``.
-        encoder: The model that made them.
 
     Raises:
         SemanticsError: When the text says nothing, or the embeddings do not fit.

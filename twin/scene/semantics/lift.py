@@ -48,7 +48,6 @@ def observe(
     """Carry the masks of one frame to the Gaussians.
 
     Args:
-        rasteriser: Draws the cloud and carries values back.
         cloud: The Gaussians, in the frame of the viewpoint.
         viewpoint: Of the frame that the masks belong to.
         masks: Of one frame, at the size of its image.
@@ -102,9 +101,7 @@ def lift_features(
     The Gaussians are drawn at the maps' own resolution: a feature cell is a pixel.
 
     Args:
-        rasteriser: Draws the cloud and carries values back.
         cloud: The Gaussians, in the frame of the viewpoints.
-        frames: The feature map of each image, and where its camera stood.
 
     Returns:
         Features, and how many cells' worth each Gaussian gave; both zero where never seen.
@@ -136,12 +133,7 @@ def lift_features(
 
 
 def camera_of_cells(camera: Camera, feature_map: FeatureMap) -> Camera:
-    """The camera whose pixels are the feature cells; the last cells may reach over the edge.
-
-    Args:
-        camera: Of the whole image.
-        feature_map: Made from that image.
-    """
+    """The camera whose pixels are the feature cells; the last cells may reach over the edge."""
     _, height, width = feature_map.values.shape
     stride = feature_map.stride
     if (
@@ -173,10 +165,8 @@ def render_labels(
     """Per pixel the label that gives it most; 0 also where empty space gives more.
 
     Args:
-        rasteriser: Draws the cloud.
         cloud: The Gaussians, in the frame of the viewpoint.
         labels: Of each Gaussian; 0 is the background.
-        viewpoint: Camera and where it stands.
     """
     planes = rasteriser.draw_planes(cloud, viewpoint.camera, viewpoint.T_base_camera)
     ids, weight = rasteriser.label_map(labels)
@@ -190,9 +180,7 @@ def visible_weight(
     """Pixels' worth of one camera's image that each Gaussian gives.
 
     Args:
-        rasteriser: Draws the cloud and carries values back.
         cloud: The Gaussians, in the frame of the viewpoint.
-        viewpoint: Camera and where it stands.
     """
     camera = viewpoint.camera
     ones = np.ones((1, camera.height, camera.width), dtype=np.float32)

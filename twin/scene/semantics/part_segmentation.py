@@ -59,8 +59,6 @@ def find_parts(
     Args:
         xyh_m: Its points: x, y and height above what it stands on.
         label: What it is called; decides what parts to look for.
-        cell_m: Spacing of the points.
-        config: How parts are told apart.
     """
     low, high = np.quantile(xyh_m, [0.01, 0.99], axis=0)
     middle = (low + high) / 2

@@ -77,13 +77,7 @@ class PatchConfig:
 def cut_into_patches(
     points: SurfacePoints, spacing_m: float, config: PatchConfig
 ) -> Int[np.ndarray, " num_points"]:
-    """Number the things in one large group from 1; 0 is the rest.
-
-    Args:
-        points: Of the group.
-        spacing_m: From each to the nearest other, in the median.
-        config: What belongs together and what stands out.
-    """
+    """Number the things in one large group from 1; 0 is the rest."""
     voxel_m = max(config.voxel_m, 2.0 * spacing_m)
     if voxel_m > config.max_voxel_m:
         return np.zeros(len(points), dtype=np.int64)

@@ -126,7 +126,6 @@ def ground_of(
 
     Args:
         points: What was seen, in a frame whose z points up.
-        config: What counts as a thing.
     """
     try:
         plane = find_support(points.p_m, points.normals, config.support)

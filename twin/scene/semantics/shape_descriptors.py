@@ -66,12 +66,7 @@ class ShapeDescriptors:
 
 
 def height_map(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> HeightMap:
-    """Highest point per cell; cells within the outline that show none take their neighbour's.
-
-    Args:
-        xyh_m: Place on the supporting plane and height over it.
-        cell_m: Edge length of a cell.
-    """
+    """Highest point per cell; cells within the outline that show none take their neighbour's."""
     cells = np.floor(xyh_m[:, :2] / cell_m).astype(np.int64)
     low = cells.min(axis=0) - 3
     shape = cells.max(axis=0) - low + 4
@@ -98,7 +93,6 @@ def find_height_map_cavity(
     The rim is the highest level that still holds half the area of the widest.
 
     Args:
-        heights: What the thing looks like from above.
         min_depth_fraction: A cavity is at least this deep, in heights of the thing.
     """
     height = float(heights.top_m.max())
@@ -130,7 +124,6 @@ def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> Sh
 
     Args:
         xyh_m: x, y and height above the plane it stands on.
-        cell_m: Spacing of the points or more.
     """
     low, high = np.quantile(xyh_m, [0.005, 0.995], axis=0)
     extent = float((high - low).max())

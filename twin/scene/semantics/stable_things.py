@@ -45,7 +45,6 @@ def segment_stably(
 
     Args:
         points: What was seen, in a frame whose z points up; evenly spaced.
-        config: What counts as a thing.
 
     Raises:
         NoSupportError: When there is no level plane to stand on, and nothing stands out.

@@ -32,7 +32,6 @@ def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int])
     """Write labels and parts of a scene; return what ``scene.json`` says about it.
 
     Args:
-        folder: The scene folder.
         scene: Labels of all Gaussians: those of the background, then of each object.
         rows: How many Gaussians each of them has, in that order: ``background``, object ids.
 
@@ -110,7 +109,6 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
     """Read what ``write_semantics`` wrote, for files with these numbers of Gaussians.
 
     Args:
-        folder: The scene folder.
         rows: How many Gaussians each file has, in the order of the labels: ``background``, object
             ids.
 

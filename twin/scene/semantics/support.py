@@ -115,11 +115,6 @@ def find_support(
     largest few planes the one with most points on it and just above it wins: a floor may be
     larger than the table, but less stands on the part of it that is seen.
 
-    Args:
-        p_m: Points of the scene, z up.
-        normals: Unit vectors at the points.
-        config: Tolerances, and how many planes are compared.
-
     Raises:
         NoSupportError: When no level plane has enough points.
     """
@@ -164,9 +159,6 @@ def as_measured(
     """The plane with the bend that the cameras gave it; the same where it is flat.
 
     Args:
-        plane: What things stand on.
-        p_m: Points of the scene, z up.
-        normals: Unit vectors at the points.
         config: How near counts as the plane.
     """
     near = (np.abs(plane.height_m(p_m)) < BENT_M) & _faces_up(normals, config)
@@ -191,9 +183,7 @@ def _fit_bend(
     """Fit it to points near the plane, robustly: what stands on the plane is among them.
 
     Args:
-        p_m: Points that face up.
         height_m: Of each over the plane.
-        tolerance_m: Points this near are the plane.
     """
     center_m = p_m[:, :2].mean(axis=0)
     reach_m = float(np.abs(p_m[:, :2] - center_m).max())
@@ -311,7 +301,6 @@ def level_frame(
     plane found along it says exactly where up is.
 
     Args:
-        p_m: Points of the scene.
         normals: Unit vectors at the points, towards whoever saw them.
         Ts_base_camera: Where the cameras stood; none: z is up.
         config: What counts as a support plane.
@@ -363,9 +352,6 @@ def roughness_m(
     """Standard deviation of what belongs to the plane across it, by the median: noise and warp.
 
     Args:
-        p_m: Points of the scene, z up.
-        normals: Unit vectors at the points.
-        plane: What things stand on.
         config: How near counts as the plane: five tolerances, upright points only.
     """
     height = plane.height_m(p_m)

@@ -125,7 +125,6 @@ def look(box: VoxelBox, view: MaskedView) -> Sight:
 
     Args:
         box: The voxels, in the frame the view is given in.
-        view: Depth and the object's pixels.
     """
     x, y, z = _in_camera(box, se3.invert(view.T_base_camera))
     camera = view.camera
@@ -228,9 +227,6 @@ def gather(
     """Let every view say which voxels it sees through and which lie at the object's surface.
 
     Args:
-        box: The voxels.
-        views: Depth with masks.
-        truncation_m: So near to a surface a view says how far it is.
         min_free_views: So many must look through a voxel before it is free.
         behind_m: So far behind a surface it still speaks: further than half a thin wall, and one
             side of it would push out the other. Two voxels when None.
@@ -284,10 +280,7 @@ def solid_of(
     """Voxels of the object: its largest piece above the plane, without hollows nobody sees.
 
     Args:
-        evidence: From ``gather``.
         support_z_m: Height of the plane it stands on; nothing of it is below. None without one.
-        low_m: Lower corner of the region in which the object's points were measured.
-        high_m: Upper corner.
 
     Raises:
         ShapeError: When next to nothing is left.
@@ -341,8 +334,6 @@ def signed_distances(
 
     Args:
         solid: True inside; with at least one voxel of each kind.
-        evidence: Mean distances in truncations, and where there are any.
-        truncation_m: From ``voxel_box``.
     """
     voxel = evidence.box.voxel_m
     seen = evidence.weight >= MIN_WEIGHT

@@ -30,11 +30,6 @@ def write_shape(
 ) -> tuple[list[str], dict[str, Any]]:
     """Write the geometry of one object, in the frame of its mesh.
 
-    Args:
-        folder: The object's folder, which exists.
-        shape: From ``reconstruct``.
-        soft: Whether it gets a lattice.
-
     Returns:
         Names of the files, and what ``object.json`` says of them.
     """

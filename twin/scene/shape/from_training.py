@@ -61,7 +61,6 @@ def shapes_of(
         models: Known shapes: they say which pixels are the object's, nothing more.
         Ts_base_object: Where the objects were; others are left out.
         config: Settings; the defaults, with eight rounds of view alignment, when None.
-        advance: Told how many objects are done, and what is next.
     """
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}
@@ -120,9 +119,7 @@ def masked_view(
 
     Args:
         view: The training view, in the base frame.
-        key: Name of the object.
         models: All objects of the task, by name.
-        Ts_base_object: Where those are that were found.
     """
     target = view.full
     depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
@@ -161,9 +158,7 @@ def image_window(
     """Rows and columns that can show something within reach of a point; none behind the camera.
 
     Args:
-        camera: Size of the image and intrinsics.
         p_camera: The point in the camera's frame [m]; homogeneous.
-        reach_m: How far from the point.
     """
     x, y, z = p_camera[:3]
     if z + reach_m <= 0:
@@ -216,9 +211,7 @@ def rim_height_m(
     it. None where the views show too little of the walls.
 
     Args:
-        views: What the scene was fitted to.
         model: A container; where its walls stand is taken from it.
-        T_base_object: Where it is.
     """
     half, wall = np.array(model.size_m[:2]) / 2, model.wall_m
     low_m, high_m = (share * model.size_m[2] for share in HEIGHTS)
@@ -254,7 +247,6 @@ def with_heights(task: Task, heights_m: Mapping[str, float]) -> Task:
     """A task whose containers are as high as they were seen to be.
 
     Args:
-        task: With the published sizes.
         heights_m: Of rims over the origin, by container; what is missing stays.
     """
     objects = {
@@ -278,11 +270,7 @@ def write_static(
     Only a task says that z = 0 is a table; without one nothing closes the scene below.
 
     Args:
-        folder: The scene folder.
-        views: What the scene was fitted to.
         task: Whose objects were taken out; None when there is none.
-        Ts_base_object: Where they were.
-        config: Settings; the defaults when None.
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
@@ -314,8 +302,6 @@ def from_outside_m(
 
     Args:
         points: In the base frame [m].
-        model: The object.
-        T_base_object: Where it is.
     """
     if model.mesh is not None and model.soft is None:
         distance = object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))

@@ -29,8 +29,6 @@ def isosurface(
 
     Args:
         values: At grid points; negative inside.
-        origin_m: The first grid point.
-        voxel_m: Distance of grid points.
     """
     padded = np.pad(values, 1, constant_values=max(voxel_m, float(np.abs(values).max())))
     inside = padded < 0

@@ -34,7 +34,6 @@ def starts(
 
     Args:
         points: What was seen of the object, base frame [m].
-        model: The object, its size and symmetry known.
     """
     z = model.rest_height_m
     if model.origin_at_centre:
@@ -96,8 +95,6 @@ def surface_distances(
 
     Args:
         points: In the base frame [m].
-        model: The object, made of panels.
-        T_base_object: Where it is.
     """
     p = se3.apply(se3.invert(T_base_object), points)
     rows = np.arange(len(p))

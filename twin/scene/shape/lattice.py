@@ -81,7 +81,6 @@ def tet_volumes_m3(
     """Signed volumes.
 
     Args:
-        nodes_m: Where the nodes are.
         tets: Node indices of each tetrahedron; their order decides the sign.
     """
     a, b, c, d = (nodes_m[tets[:, k]] for k in range(4))
@@ -90,10 +89,6 @@ def tet_volumes_m3(
 
 def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
     """Fill a shape with a lattice.
-
-    Args:
-        shape: From ``reconstruct``.
-        config: Settings; the defaults when None.
 
     Raises:
         ShapeError: When the shape is thinner than the spacing everywhere.

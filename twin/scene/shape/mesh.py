@@ -47,7 +47,6 @@ def volume_m3(vertices_m: Vertices, faces: Faces) -> float:
 
     Args:
         vertices_m: Of the mesh, in any frame.
-        faces: Vertex indices, counterclockwise seen from outside.
     """
     a, b, c = (vertices_m[faces[:, k]] for k in range(3))
     return float(np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6)
@@ -60,7 +59,6 @@ def face_normals(
 
     Args:
         vertices_m: Of the mesh; the normals are in their frame.
-        faces: Vertex indices, counterclockwise seen from where the normal points.
     """
     a, b, c = (vertices_m[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)

@@ -104,7 +104,6 @@ def reconstruct(
         views: Depth with masks, in one frame whose z axis points up.
         support_z_m: Height of the plane the object stands on: its unseen underside is closed
             there. None when it does not stand on one.
-        config: Settings; the defaults when None.
 
     Raises:
         ShapeError: When fewer than two views show the object, all from one side, or nothing
@@ -165,8 +164,6 @@ def voxel_box(
 
     Args:
         low: Lower corner of the extent; on the plane that something stands on, where it does.
-        high: Upper corner.
-        config: Finest voxels and truncation.
     """
     voxel = max(config.min_voxel_m, float((high - low).max()) / config.voxels_along)
     truncation = max(config.truncation_voxels * voxel, config.min_truncation_m)
@@ -185,10 +182,7 @@ def describe_solid(
     """Mesh a solid and say what of it was seen.
 
     Args:
-        grid: Its distances.
         evidence: Where views saw a surface, and what is known to be empty.
-        num_views: So many views said so.
-        truncation_m: How far a view's word reached.
     """
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
     completed = ~_observed(vertices, faces, evidence)
@@ -257,7 +251,6 @@ def moved_views(
 
     Args:
         views: In the base frame.
-        T_new_base: The base, seen from the new frame.
     """
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
@@ -280,7 +273,6 @@ def shape_of_mesh(
 
     Args:
         vertices_m: In the frame that is wanted, z up.
-        faces: Triangles, wound alike.
         points_m: What was measured on the object, in the same frame.
         config: Size of the voxels; the defaults when None.
 

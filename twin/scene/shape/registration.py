@@ -40,7 +40,6 @@ def seen_surface(view: MaskedView, *, with_plane: bool) -> SeenSurface:
     """Pick the object's oriented points evenly, and what was measured around it.
 
     Args:
-        view: Depth with the object's pixels.
         with_plane: There is a plane; otherwise no points around the object are returned.
     """
     camera, depth = view.camera, view.known_depth_m().astype(np.float64)

@@ -129,7 +129,6 @@ def distances_of_solid(
 
     Args:
         solid: True inside; with at least one voxel of each kind the result is finite.
-        voxel_m: Size of a voxel.
     """
     outside = ndimage.distance_transform_edt(~solid) - 0.5
     inside = ndimage.distance_transform_edt(solid) - 0.5
@@ -149,7 +148,6 @@ def smoothed(
 
     Args:
         distances_m: Signed, negative inside.
-        voxel_m: Edge length of a voxel.
         sigma_voxels: Standard deviation of the Gaussian mean, in voxels.
     """
     mean = ndimage.gaussian_filter(distances_m, sigma_voxels, mode="nearest")

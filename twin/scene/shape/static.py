@@ -156,7 +156,6 @@ def static_sdf(
         views: What the scene was fitted to; pixels that show something moving are left out.
         table_z_m: Height of the table: all below is solid. None when there is none.
         objects: Distances to the things that may be moved: the scene is made free of them.
-        config: Settings; the defaults when None.
 
     Raises:
         ShapeError: When the views measured next to nothing.

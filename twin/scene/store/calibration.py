@@ -114,7 +114,6 @@ def write_calibration(
     """Write ``calibration.json``; cameras identified earlier and not looked at now are kept.
 
     Args:
-        run: Run folder; ``scene/`` is made where needed.
         cameras: Per camera what was found, with ``link``, ``stream`` and ``T_link_camera``.
         not_identified: Per camera why nothing was found.
     """
@@ -135,10 +134,6 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
     """Write what was found out about physics; earlier versions stay under ``physics_history``.
 
     A result that was not promoted is kept there too and changes nothing that replays use.
-
-    Args:
-        run: Run folder; ``scene/`` is made where needed.
-        physics: The record, with ``promoted``, ``identified`` and ``id``.
     """
     kept = _kept(run)
     history = list(kept.get("physics_history", []))
@@ -156,7 +151,6 @@ def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, A
     """Write what the run's trials say of what nobody measured; an earlier posterior is replaced.
 
     Args:
-        run: Run folder; ``scene/`` is made where needed.
         posterior: The record, with ``draws`` and the trials they were weighed by.
     """
     return _store(run, {**_kept(run), "posterior": posterior})
@@ -193,12 +187,6 @@ def calibrated_tree(
     A camera in the hand follows the recorded joints. How colour and depth lie to each other comes
     from the recording's own transforms; without them they count as aligned.
 
-    Args:
-        episode: Gives joints for a camera in the hand, and the recorded transforms.
-        camera_id: The camera, by its name in the topics.
-        mount: Link and pose on it.
-        stamps_ns: The instants.
-
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
         RobotDescriptionError: A camera in the hand, and no usable robot description.
@@ -220,10 +208,7 @@ def mounted_tree(
     """Pose a camera in the robot's base as it is mounted, recorded or live.
 
     Args:
-        mount: How it is mounted.
-        frames: Its colour and its depth frame.
         tree: Knows how they lie to each other, or does not: then they count as aligned.
-        stamps_ns: The instants.
         track: Where the hand was; a fixed camera needs none.
     """
     color, depth = frames
@@ -258,9 +243,7 @@ def without_joints(
     """Those of some instants at which nobody recorded where the hand that carries a camera was.
 
     Args:
-        episode: Whose joints are read.
         mount: A fixed camera needs no joints: the answer is empty.
-        stamps_ns: The instants.
 
     Raises:
         EpisodeError: A camera in the hand, and no joint states.
@@ -276,7 +259,6 @@ def unknown_postures(
 
     Args:
         track: Where the robot was; None: it does not matter, and the answer is empty.
-        stamps_ns: The instants.
     """
     if track is None:
         return frozenset()

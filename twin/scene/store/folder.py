@@ -101,12 +101,7 @@ def read_scene(run: RunFolder) -> Scene:
 
 
 def write_record(run: RunFolder, record: Mapping[str, Any]) -> Path:
-    """Write ``scene.json`` last, by renaming: it vouches for everything else in the folder.
-
-    Args:
-        run: Whose scene folder is written.
-        record: The content of ``scene.json``.
-    """
+    """Write ``scene.json`` last, by renaming: it vouches for everything else in the folder."""
     path = run.scene_dir / SCENE_FILE
     write_whole(path, (json.dumps(record, indent=2) + "\n").encode())
     return path

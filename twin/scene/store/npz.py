@@ -41,9 +41,7 @@ def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.n
     """Read named arrays; sizes are checked before anything is unpacked, pickles are refused.
 
     Args:
-        path: Of the file.
         names: The arrays that are wanted; others are passed over.
-        max_bytes: What they may take together, unpacked.
 
     Raises:
         UnreadableArraysError: When the file is none, lacks an array, or holds too much.

@@ -12,7 +12,6 @@ def segment_points(
 
     Args:
         points: What was seen, in a frame whose z points up.
-        config: What counts as a thing.
 
     Raises:
         NoSupportError: When there is no level plane to stand on, and nothing stands out.
