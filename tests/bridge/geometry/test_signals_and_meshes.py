@@ -6,7 +6,7 @@ import pytest
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.geometry.mesh import sample_triangles
-from bridge.geometry.signals import LAGS_S, lag_between_steps, lag_of_least_cost, runs_of_true
+from bridge.geometry.signals import LAGS_S, lag_of_least_cost, runs_of_true
 from bridge.media.color import linear_from_srgb
 
 
@@ -19,13 +19,6 @@ def test_of_lags_that_fit_equally_well_the_smallest_is_taken() -> None:
     assert lag_of_least_cost(np.zeros(len(LAGS_S))) == 0.0
     costs = np.abs(LAGS_S - 0.3)
     assert lag_of_least_cost(costs) == pytest.approx(0.3)
-
-
-@pytest.mark.parametrize("true_s", [0.0, 0.093, 0.0331])
-def test_a_lag_is_found_between_the_steps(true_s: float) -> None:
-    lags_s = np.arange(101) * 0.005
-    found = lag_between_steps((lags_s - true_s) ** 2, lags_s)
-    assert found == pytest.approx(true_s, abs=1e-9)
 
 
 @pytest.mark.parametrize("in_order", [False, True])
