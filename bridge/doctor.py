@@ -20,7 +20,10 @@ class Extra:
 EXTRAS = {
     "base": Extra(
         "read, write, check and list episodes",
-        ("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping", "jsonschema", "lz4"),
+        (
+            *("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping"),
+            *("jsonschema", "jsonschema-rs", "msgspec", "lz4"),
+        ),
     ),
     "record": Extra(
         "record from zenoh; ROS 2 messages; colour images",

@@ -22,6 +22,7 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
+from dashboards.loading import LOADING
 from dashboards.recording import PageClock, Problems, Recording
 from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
@@ -269,8 +270,8 @@ def _bends(
     names = () if gathering.task is None else gathering.task.soft_objects
     if not names:
         return {}
-    from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
-
+    with LOADING:
+        from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
     bends = {}
     for name in names:
         track = replay.objects.get(name)

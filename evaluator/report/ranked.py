@@ -12,6 +12,7 @@ TABLES: dict[str, str] = {
     "conclusions": "for which task the twin may stand in for the robot",
     "layout": "whether to run with replanning",
     "success": "which candidate to use",
+    "notes": "what these numbers must not be taken for",
     "trials": "which trial to look at",
     "against": "which of two twins to use",
     "image_methods": "which reconstruction to use",

@@ -194,7 +194,7 @@ def test_a_limit_that_nothing_can_reach_or_miss_is_refused(text: str) -> None:
 
 def test_every_file_is_there_before_a_missed_threshold_ends_the_command(tmp_path: Path) -> None:
     assert evaluate(RATES, out=tmp_path / "out", fail_under="r=0.99, agreement.bias_pp=0") == 3
-    for name in ("report.html", "results.json", "tables/success.csv", "figures/scatter.pdf"):
+    for name in ("report.html", "results.json", "tables/success.csv", "figures/scatter.svg"):
         assert (tmp_path / "out" / name).is_file()
 
 

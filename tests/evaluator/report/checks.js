@@ -14,7 +14,8 @@
   for (const svg of all("svg")) if (svg.getAttribute("role") !== "img") say("svg that is no image", svg);
   for (const figure of all("figure")) {
     if (!figure.querySelector("figcaption")) say("figure without caption", figure);
-    if (figure.querySelector("svg") && !figure.querySelector("details table")) say("figure without data", figure);
+    const drawn = figure.querySelector("svg");
+    if (drawn && !/[0-9]/.test(drawn.querySelector("desc")?.textContent ?? "")) say("figure without its values in words", figure);
   }
   for (const link of all("a")) {
     if (!link.textContent.trim()) say("link without text", link);
