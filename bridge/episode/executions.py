@@ -94,7 +94,13 @@ def with_execution(episode: Episode, events: Iterable[Mapping[str, Any]]) -> lis
     if moved is None:
         return found
     return found + [
-        {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, "plan_id": NO_PLAN}
+        {
+            "schema_version": 1,
+            "stamp_ns": stamp_ns,
+            "type": kind,
+            "plan_id": NO_PLAN,
+            "text": "found from the joints",
+        }
         for kind, stamp_ns in zip(EXECUTION, moved, strict=True)
     ]
 
