@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
-from bridge.episode.topics import OF_RECORDER, is_latched, is_truth
+from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole
 
@@ -340,8 +340,8 @@ def _fell_silent(
     if rule is not None:
         limit_s = rule.silence_s
         return limit_s is not None and presence.messages > 0 and s_from_ns(tail_ns) > limit_s
-    if not by_habit or is_latched(topic) or not presence.is_regular:
-        return False
+    if not by_habit or is_latched(topic) or topic.endswith(EVENT) or not presence.is_regular:
+        return False  # events come when something happens, the recorder's own notes too
     return s_from_ns(tail_ns) > max(LEAST_SILENCE_S, HABIT * s_from_ns(presence.longest_ns))
 
 

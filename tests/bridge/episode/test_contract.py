@@ -128,6 +128,12 @@ def test_without_a_contract_only_a_regular_stream_that_ends_early_has_an_unknown
     assert breaches_of(reports) == []
 
 
+def test_events_promise_no_next_one_however_many_came() -> None:
+    span = Span(NS_PER_S, 11 * NS_PER_S)
+    reports = judge({"/lab/event": seen(*steady(1.0, 4.0))}, None, span, {})
+    assert unknown_tails(reports) == []
+
+
 def test_a_contract_survives_its_file_and_its_record(tmp_path: Path) -> None:
     contract = Contract(topics={JOINTS: RULE, "/lab/plan": TopicRule(required=False)}, cell="lab")
     write_contract(contract, tmp_path / "cell.toml", source="good.mcap")
