@@ -75,7 +75,7 @@ GONE: dict[str, str] = {
             "gate --moved-m",
             "gate --moved-rad",
         ),
-        "It is a constant now; docs/replay.md and docs/gate.md give its value.",
+        "Nobody set it, so it is a constant of the code now.",
     ),
 }
 """By command, or by command and flag (``"record --quota-mb"``); each text is a sentence."""

@@ -32,6 +32,11 @@ _NOISE = 6.0
 """What lies within so many standard deviations of a joint's noise is no motion."""
 
 
+def whose(plan_id: str) -> str:
+    """What was executed, as messages name it."""
+    return "the motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
+
+
 def motion_ns(*tracks: JointTrack) -> tuple[int, int] | None:
     """Source times of the first and the last motion of any joint; None where nothing moved.
 

@@ -12,6 +12,7 @@ from bridge.episode.topics import GRIPPER_STATE, JOINT_STATES
 from bridge.robots.robot import GRIPPER_WIDTH, Robot
 from bridge.task.plan import Plan, Stage
 from twin.replay.config import ReplayConfig
+from twin.replay.observed import PLATEAU_M, in_order
 from twin.replay.path import MAX_DURATION_S, WIDTH_SLACK_M, JointPath, UnusablePlanError
 
 SQUEEZE_M = 0.01
@@ -109,8 +110,6 @@ def _not_recorded(plan_id: str, what: str, missing_ns: int, where: str) -> Unusa
     )
 
 
-_PLATEAU_M = 0.002
-"""A finger distance this close to the smallest one of a grasp belongs to the grasp."""
 _AHEAD_NS, _CREEP_M = 100_000_000, 0.003
 """Fingers that close by less than this within a tenth of a second are stopped by something."""
 _LATENESS_NS = 2_000_000_000
@@ -149,10 +148,7 @@ def path_of_execution(
             found=f"was recorded without the joints {', '.join(missing)}",
             hint=f"The recording has {', '.join(track.names)}.",
         )
-    order = [track.names.index(name) for name in robot.joints]
-    arm = JointTrack(
-        names=robot.joints, stamps_ns=track.stamps_ns, position=track.position[:, order]
-    )
+    arm = in_order(track, robot)
     check_track(arm, "joints", plan.id)
     widths = gripper_widths(widths, plan, robot)
     first_ns = int(track.stamps_ns[0])
@@ -225,14 +221,14 @@ def closed_mask(
     for start_ns, end_ns in _closed_intervals(plan):
         window = np.flatnonzero((times_ns >= start_ns) & (times_ns <= end_ns + _LATENESS_NS))
         wide = np.maximum.accumulate(width_m[window])
-        begun = width_m[window] < wide - _PLATEAU_M
+        begun = width_m[window] < wide - PLATEAU_M
         # Something soft gives way for seconds: stopped is what hardly closes any further.
         ahead = np.interp(times_ns[window] + _AHEAD_NS, times_ns, width_m)
         stopped = window[begun & (width_m[window] - ahead < _CREEP_M)]
         if len(stopped):
             # One stretch: from where the fingers stop to where they leave that for good.
             rest = width_m[stopped[0] :]
-            left = np.flatnonzero(rest > np.minimum.accumulate(rest) + _PLATEAU_M)
+            left = np.flatnonzero(rest > np.minimum.accumulate(rest) + PLATEAU_M)
             last = stopped[0] + left[0] if len(left) else window[-1] + 1
             closed[stopped[0] : last] = True
     return closed
@@ -256,5 +252,5 @@ def _first_close(
     times_ns: Int[np.ndarray, " num_samples"], width_m: Float[np.ndarray, " num_samples"]
 ) -> int | None:
     """When the fingers first begin to close."""
-    closing = np.flatnonzero(width_m < np.maximum.accumulate(width_m) - _PLATEAU_M)
+    closing = np.flatnonzero(width_m < np.maximum.accumulate(width_m) - PLATEAU_M)
     return int(times_ns[closing[0]]) if len(closing) else None

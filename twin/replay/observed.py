@@ -20,8 +20,9 @@ from bridge.task.plan import Plan, Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.robot.model import RobotModel
 
-_PLATEAU_M = 0.002
-"""Finger distances that differ by less are the same."""
+PLATEAU_M = 0.002
+"""Finger distances that differ by less are the same: one this close to the smallest belongs to the
+grasp."""
 LEFT_M = 0.05
 """A stage that grasps or releases ends when the tool is this far from where the fingers did it."""
 
@@ -82,11 +83,11 @@ def find_grips(
     for index, width in enumerate(width_m.tolist()):
         if first is None:
             widest = max(widest, width)
-            if width < widest - _PLATEAU_M:
+            if width < widest - PLATEAU_M:
                 first, narrowest = index, width
             continue
         narrowest = min(narrowest, width)
-        if width > narrowest + _PLATEAU_M:
+        if width > narrowest + PLATEAU_M:
             found.append(_grip(times_ns, width_m, first, index, narrowest))
             widest, first, narrowest = width, None, np.inf
     if first is not None:
@@ -101,7 +102,7 @@ def _grip(
     last: int,
     narrowest_m: float,
 ) -> Grip:
-    held = first + int(np.argmax(width_m[first : last + 1] <= narrowest_m + _PLATEAU_M))
+    held = first + int(np.argmax(width_m[first : last + 1] <= narrowest_m + PLATEAU_M))
     return int(times_ns[first]), int(times_ns[held]), int(times_ns[last])
 
 

@@ -11,7 +11,7 @@ from itertools import groupby, pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bridge.episode.executions import NO_PLAN
+from bridge.episode.executions import whose
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from bridge.robots.robot import Robot
@@ -114,8 +114,7 @@ class UnusablePlanError(TwinError):
     def __init__(self, *, plan_id: str, found: str, hint: str) -> None:
         """Remember the plan."""
         self.plan_id = plan_id
-        whose = "the motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
-        super().__init__(f"{whose} {found}. {hint}")
+        super().__init__(f"{whose(plan_id)} {found}. {hint}")
 
 
 def check_usable(plan: Plan, robot: RobotModel) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema, streams
-from bridge.episode.executions import NO_PLAN, executed_events
+from bridge.episode.executions import NO_PLAN, executed_events, whose
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
@@ -50,18 +50,17 @@ def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution
     Args:
         events: All of an episode, in their order.
     """
-    whose = "motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
     mine = [event for event in events if event.get("plan_id") == plan_id]
     count = sum(event["type"] == "execution_started" for event in mine)
     start, end = execution_ns(mine, plan_id)
     interval = None if start is None or end is None else (start, end)
     problem = ""
     if count and interval is None:
-        problem = f"the execution of {whose} began, and nobody recorded that it ended"
+        problem = f"the execution of {whose(plan_id)} began, and nobody recorded that it ended"
     elif count > 1:
         problem = (
-            f"{whose} was executed {count} times, and which end belongs to which nobody can tell; "
-            "give each execution a plan with an id of its own"
+            f"{whose(plan_id)} was executed {count} times, and which end belongs to which nobody "
+            "can tell; give each execution a plan with an id of its own"
         )
     return Execution(interval_ns=interval, problem=problem)
 
@@ -214,9 +213,9 @@ def _nothing_to_replay(
         if urdf is None:
             known = f"record {ROBOT_DESCRIPTION}, attach robot.urdf, or name it: --robot ur5"
             return Prepared(why_not=f"nobody said which robot it is; {known}")
-        whose = robot_of(urdf)
-        check_joints(streams.joint_track(episode), f"episode {info.id}", whose)
-        width_track(episode, whose)
+        described = robot_of(urdf)
+        check_joints(streams.joint_track(episode), f"episode {info.id}", described)
+        width_track(episode, described)
     except GstError as error:
         return Prepared(why_not=str(error))
     return None if moved else Prepared(why_not="nothing moved: its joints stay where they were")

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.episode import schema
-from bridge.episode.executions import NO_PLAN
+from bridge.episode.executions import whose
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack, joint_track, robot_description
 from bridge.episode.topics import GRIPPER_STATE, ROBOT_DESCRIPTION
@@ -36,11 +36,10 @@ def check_clock(
         BackwardTimeError: Naming the topic, the instant and by how much; or an execution that took
             no time.
     """
-    whose = "the motion" if plan_id == NO_PLAN else f"plan {plan_id!r}"
     if end_ns <= start_ns:
         raise BackwardTimeError(
-            f"the execution of {whose} ended {(start_ns - end_ns) * 1e-9:.2f} s before it started; "
-            "look at the clock of the events"
+            f"the execution of {whose(plan_id)} ended {(start_ns - end_ns) * 1e-9:.2f} s before it "
+            "started; look at the clock of the events"
         )
     topics = [
         topic
@@ -56,7 +55,7 @@ def check_clock(
         if jumped and message.topic in inside and stamp_ns <= end_ns:
             raise BackwardTimeError(
                 f"the time of {message.topic} goes back by {(before_ns - stamp_ns) * 1e-9:.2f} s "
-                f"at {max(0, before_ns - start_ns) * 1e-9:.2f} s of {whose}; the "
+                f"at {max(0, before_ns - start_ns) * 1e-9:.2f} s of {whose(plan_id)}; the "
                 "execution is not known in its right order"
             )
         if start_ns <= stamp_ns <= end_ns:
