@@ -11,13 +11,14 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-from cyclopts import App, Parameter
+from cyclopts import App, Group, Parameter
 from cyclopts.config import Toml
 from rich.console import Console
 
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.gone import refuse_gone
+from bridge.leaves import Command, leaf_commands, refuse_missing_command
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -33,236 +34,236 @@ RECORDING, EXCHANGE = "bridge.cli.recording", "bridge.cli.exchange"
 LISTS = Parameter(consume_multiple=True, negative_iterable="")
 """``--policies nominal loose`` and ``--policies nominal --policies loose`` say the same."""
 
-Command = tuple[str, str, str, str]
-"""Name, function, what it does, and an example of what follows its name."""
-COMMANDS: tuple[Command, ...] = (
-    (
-        "demo",
-        "dashboards.cli:demo",
-        "Run the whole loop on the stand-in cell, in minutes.",
-        "runs/demo",
-    ),
-    (
-        "trials",
-        "dashboards.cli:trials",
-        "Try policies without and with replanning on the same starts.",
-        "runs/study --trials 20",
-    ),
-    (
-        "design",
-        "evaluator.cli:design",
-        "Size a study before its first trial, and lock its protocol.",
-        "runs/study --rate 0.5 --gain 0.3 --width 0.4",
-    ),
-    ("record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday"),
-    (
-        "ctl",
-        f"{RECORDING}:ctl",
-        "Start, stop, mark or label from another terminal.",
-        "start --id trial_1",
-    ),
-    ("info", f"{EPISODES}:info", "Show what an episode holds.", "runs/demo/episodes/scan.mcap"),
-    ("check", f"{EPISODES}:check", "Verify an episode and list dropped messages.", "runs/demo"),
-    (
-        "recover",
-        f"{EPISODES}:recover",
-        "Repair what a killed recorder left; report what is lost.",
-        "runs/demo",
-    ),
-    ("ls", f"{EPISODES}:ls", "List the episodes of a run.", "runs/demo --outcome failure"),
-    (
-        "label",
-        f"{EPISODES}:label",
-        "Set the outcome of a recorded episode.",
-        "runs/demo trial_1 --result failure",
-    ),
-    (
-        "rebuild",
-        "twin.cli:rebuild",
-        "Fit a Gaussian-splat scene; render held-out views.",
-        "runs/monday --budget 60s",
-    ),
-    ("render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday"),
-    (
-        "calibrate",
-        "twin.cli:calibrate",
-        "Calibrate cameras or physics from recorded episodes.",
-        "runs/monday --cameras",
-    ),
-    (
-        "replay",
-        "twin.cli:replay",
-        "Replay every planned and executed trajectory in the twin.",
-        "runs/monday --workers 2",
-    ),
-    (
-        "gate",
-        "twin.cli:gate",
-        "Judge plans over zenoh before the robot moves.",
-        "runs/monday",
-    ),
-    (
-        "plan",
-        "twin.plan.cli:plan",
-        "Plan from words, or for a cell that asks over zenoh.",
-        "runs/monday --task 'put the cube into the box' --dry",
-    ),
-    (
-        "evaluate",
-        "evaluator.cli:evaluate",
-        "Compute success rates and agreement; write a report.",
-        "runs/monday",
-    ),
-    (
-        "dashboard",
-        "dashboards.cli:dashboard",
-        "Serve review pages on the loopback address.",
-        "runs/monday",
-    ),
-    (
-        "view",
-        "dashboards.cli:view",
-        "Open an episode and its replays in Rerun's 3D viewer.",
-        "runs/monday",
-    ),
-    (
-        "share",
-        "dashboards.cli:share",
-        "Write trials with their clips into one file to send.",
-        "runs/monday --trials trial_0003",
-    ),
-    (
+USES = (
+    "Start here",
+    "Record",
+    "Review",
+    "Rebuild and replay",
+    "Plan and gate",
+    "Evaluate",
+    "Exchange",
+)
+"""What one does with the commands, in the order of the help."""
+
+START, RECORD, REVIEW, REBUILD, PLAN, EVALUATE, EXCHANGE_USE = USES
+
+CORE: tuple[Command, ...] = (
+    Command(
         "doctor",
         f"{EPISODES}:doctor",
         "Show what is installed, what is missing and how to get it.",
         "--json",
+        START,
+    ),
+    Command(
+        "record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday", RECORD
+    ),
+    Command(
+        "ctl",
+        f"{RECORDING}:ctl",
+        "Start, stop, mark or label from another terminal.",
+        "start --id trial_1",
+        RECORD,
+    ),
+    Command(
+        "publish folder",
+        f"{PUBLISH}:publish_folder",
+        "Play an RGB-D folder as a live camera.",
+        "DIR --episode scan",
+        RECORD,
+    ),
+    Command(
+        "publish episode",
+        f"{PUBLISH}:publish_episode",
+        "Play an episode back with its own timing.",
+        "FILE --rate 2 --topics 'lab/**'",
+        RECORD,
+    ),
+    Command(
+        "task check",
+        f"{TASKS}:check",
+        "Say what is wrong with task files, or what they ask for.",
+        "my_task.toml",
+        RECORD,
+    ),
+    Command(
+        "task new",
+        f"{TASKS}:new",
+        "Write a task file to start from.",
+        "cube_onto_block",
+        RECORD,
+    ),
+    Command(
+        "robot check",
+        "twin.cli:robot_check",
+        "Joints, limits, frames, gripper; what is refused.",
+        "mine.toml",
+        RECORD,
+    ),
+    Command(
+        "info",
+        f"{EPISODES}:info",
+        "Show what an episode holds.",
+        "runs/demo/episodes/scan.mcap",
+        REVIEW,
+    ),
+    Command(
+        "check",
+        f"{EPISODES}:check",
+        "Verify an episode and list dropped messages.",
+        "runs/demo",
+        REVIEW,
+    ),
+    Command(
+        "recover",
+        f"{EPISODES}:recover",
+        "Repair what a killed recorder left; report what is lost.",
+        "runs/demo",
+        REVIEW,
+    ),
+    Command(
+        "ls",
+        f"{EPISODES}:ls",
+        "List the episodes of a run.",
+        "runs/demo --outcome failure",
+        REVIEW,
+    ),
+    Command(
+        "label",
+        f"{EPISODES}:label",
+        "Set the outcome of a recorded episode.",
+        "runs/demo trial_1 --result failure",
+        REVIEW,
+    ),
+    Command(
+        "dashboard",
+        "dashboards.cli:dashboard",
+        "Serve review pages on the loopback address.",
+        "runs/monday",
+        REVIEW,
+    ),
+    Command(
+        "view",
+        "dashboards.cli:view",
+        "Open an episode and its replays in Rerun's 3D viewer.",
+        "runs/monday",
+        REVIEW,
+    ),
+    Command(
+        "share",
+        "dashboards.cli:share",
+        "Write trials with their clips into one file to send.",
+        "runs/monday --trials trial_0003",
+        REVIEW,
+    ),
+    Command(
+        "rebuild",
+        "twin.cli:rebuild",
+        "Fit a Gaussian-splat scene; render held-out views.",
+        "runs/monday --budget 60s",
+        REBUILD,
+    ),
+    Command(
+        "render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday", REBUILD
+    ),
+    Command(
+        "calibrate",
+        "twin.cli:calibrate",
+        "Calibrate cameras or physics from recorded episodes.",
+        "runs/monday --cameras",
+        REBUILD,
+    ),
+    Command(
+        "replay",
+        "twin.cli:replay",
+        "Replay every planned and executed trajectory in the twin.",
+        "runs/monday --workers 2",
+        REBUILD,
+    ),
+    Command(
+        "gate",
+        "twin.cli:gate",
+        "Judge plans over zenoh before the robot moves.",
+        "runs/monday",
+        PLAN,
+    ),
+    Command(
+        "evaluate",
+        "evaluator.cli:evaluate",
+        "Compute success rates and agreement; write a report.",
+        "runs/monday",
+        EVALUATE,
+    ),
+    Command(
+        "design",
+        "evaluator.cli:design",
+        "Size a study before its first trial, and lock its protocol.",
+        "runs/study --rate 0.5 --gain 0.3 --width 0.4",
+        EVALUATE,
+    ),
+    Command(
+        "import rgbd",
+        f"{EXCHANGE}:import_rgbd",
+        "An RGB-D folder: scene.json, TUM, 7-Scenes.",
+        "DIR runs/x",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "import images",
+        f"{EXCHANGE}:import_images",
+        "Posed images without depth: COLMAP, transforms.json.",
+        "DIR runs/x",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "import rosbag2",
+        f"{EXCHANGE}:import_rosbag2",
+        "A rosbag2 recording, byte for byte.",
+        "BAG runs/x",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "import trials",
+        f"{EXCHANGE}:import_trials",
+        "A trials CSV, for evaluate.",
+        "trials.csv runs/x",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "export tum",
+        f"{EXCHANGE}:export_tum",
+        "Cameras as folders of the TUM RGB-D layout.",
+        "EPISODE DIR",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "export rosbag2",
+        f"{EXCHANGE}:export_rosbag2",
+        "An episode as a rosbag2 folder.",
+        "EPISODE DIR",
+        EXCHANGE_USE,
+    ),
+    Command(
+        "export csv",
+        f"{EXCHANGE}:export_csv",
+        "Joints, poses, events ... as tidy CSV files.",
+        "runs/x DIR",
+        EXCHANGE_USE,
     ),
 )
 
-GROUPS: dict[str, tuple[str, tuple[Command, ...]]] = {
-    "publish": (
-        "Publish sensor and robot data over zenoh.",
-        (
-            (
-                "folder",
-                f"{PUBLISH}:publish_folder",
-                "Play an RGB-D folder as a live camera.",
-                "DIR --episode scan",
-            ),
-            (
-                "episode",
-                f"{PUBLISH}:publish_episode",
-                "Play an episode back with its own timing.",
-                "FILE --rate 2 --topics 'lab/**'",
-            ),
-            (
-                "realsense",
-                f"{PUBLISH}:publish_realsense",
-                "RealSense cameras: colour, depth, calibration.",
-                "--cell lab --camera side=123622270224",
-            ),
-            (
-                "ur",
-                f"{PUBLISH}:publish_ur",
-                "A UR arm: joints, tool, gripper, modes.",
-                "192.168.1.10 --cell lab",
-            ),
-            (
-                "standin",
-                f"{PUBLISH}:publish_standin",
-                "The stand-in cell: a simulated laboratory.",
-                "--trials 3 --seed 1",
-            ),
-        ),
-    ),
-    "task": (
-        "Write and check task files.",
-        (
-            (
-                "check",
-                f"{TASKS}:check",
-                "Say what is wrong with task files, or what they ask for.",
-                "my_task.toml",
-            ),
-            ("new", f"{TASKS}:new", "Write a task file to start from.", "cube_onto_block"),
-        ),
-    ),
-    "robot": (
-        "Robot files: arms, grippers and tools.",
-        (
-            (
-                "check",
-                "twin.cli:robot_check",
-                "Joints, limits, frames, gripper; what is refused.",
-                "mine.toml",
-            ),
-        ),
-    ),
-    "import": (
-        "Import recordings of other programs into a run.",
-        (
-            (
-                "rgbd",
-                f"{EXCHANGE}:import_rgbd",
-                "An RGB-D folder: scene.json, TUM, 7-Scenes.",
-                "DIR runs/x",
-            ),
-            (
-                "images",
-                f"{EXCHANGE}:import_images",
-                "Posed images without depth: COLMAP, transforms.json.",
-                "DIR runs/x",
-            ),
-            (
-                "rosbag2",
-                f"{EXCHANGE}:import_rosbag2",
-                "A rosbag2 recording, byte for byte.",
-                "BAG runs/x",
-            ),
-            (
-                "lerobot",
-                f"{EXCHANGE}:import_lerobot",
-                "A LeRobotDataset v3.0, one episode file each.",
-                "DIR runs/x --episodes 0-9",
-            ),
-            (
-                "trials",
-                f"{EXCHANGE}:import_trials",
-                "A trials CSV, for evaluate.",
-                "trials.csv runs/x",
-            ),
-        ),
-    ),
-    "export": (
-        "Export episodes to formats of other programs.",
-        (
-            (
-                "lerobot",
-                f"{EXCHANGE}:export_lerobot",
-                "Trials as a LeRobotDataset v3.0.",
-                "runs/x DIR",
-            ),
-            (
-                "tum",
-                f"{EXCHANGE}:export_tum",
-                "Cameras as folders of the TUM RGB-D layout.",
-                "EPISODE DIR",
-            ),
-            (
-                "rosbag2",
-                f"{EXCHANGE}:export_rosbag2",
-                "An episode as a rosbag2 folder.",
-                "EPISODE DIR",
-            ),
-            (
-                "csv",
-                f"{EXCHANGE}:export_csv",
-                "Joints, poses, events ... as tidy CSV files.",
-                "runs/x DIR",
-            ),
-        ),
-    ),
+GROUPS = {
+    "publish": ("Publish sensor and robot data over zenoh.", RECORD),
+    "task": ("Write and check task files.", RECORD),
+    "robot": ("Robot files: arms, grippers and tools.", RECORD),
+    "import": ("Import recordings of other programs into a run.", EXCHANGE_USE),
+    "export": ("Export episodes to formats of other programs.", EXCHANGE_USE),
 }
+
+
+def commands() -> tuple[Command, ...]:
+    """Every command: the core's, and those that leaves bring."""
+    return CORE + leaf_commands()
 
 
 def build_app() -> App:
@@ -277,19 +278,22 @@ def build_app() -> App:
         error_console=Console(stderr=True),
         default_parameter=LISTS,
     )
-    for name, target, text, example in COMMANDS:
-        app.command(target, name=name, help=_help(text, f"{name} {example}"))
-    for name, (text, members) in GROUPS.items():
-        group = App(name=name, help=text)
-        for member, target, member_text, example in members:
-            help_text = _help(member_text, f"{name} {member} {example}")
-            group.command(target, name=member, help=help_text)
-        app.command(group)
+    headings = {use: Group(use, sort_key=place) for place, use in enumerate(USES)}
+    groups = {
+        name: App(name=name, help=text, group=headings[use]) for name, (text, use) in GROUPS.items()
+    }
+    for command in commands():
+        group, _, member = command.name.rpartition(" ")
+        parent = groups[group] if group else app
+        heading = {} if group else {"group": headings[command.use]}
+        parent.command(command.target, name=member, help=_help(command), **heading)
+    for group_app in groups.values():
+        app.command(group_app)
     return app
 
 
-def _help(text: str, example: str) -> str:
-    return f"{text}\n\nExample: robot-gst {example}"
+def _help(command: Command) -> str:
+    return f"{command.text}\n\nExample: robot-gst {command.name} {command.example}"
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -300,6 +304,7 @@ def run(arguments: Sequence[str]) -> int:
         if config is not None:
             app.config = Toml(config, must_exist=True)
         refuse_gone(tokens)
+        refuse_missing_command(tokens)
         code = app(tokens)
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")
@@ -384,8 +389,10 @@ def _check_tables(path: Path) -> None:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError:  # cyclopts reports it better
         return
-    known: dict[str, set[str]] = {name: set() for name, *_ in COMMANDS}
-    known |= {group: {name for name, *_ in members} for group, (_, members) in GROUPS.items()}
+    known: dict[str, set[str]] = {}
+    for command in commands():
+        name, _, member = command.name.partition(" ")
+        known.setdefault(name, set()).update({member} - {""})
     for name, table in content.items():
         refuse_gone([name])
         wrong = [name] if name not in known else []

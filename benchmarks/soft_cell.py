@@ -173,7 +173,7 @@ def furnished(trial: Trial) -> World:
     for key in trial.task.containers:
         world.add_static(trial.task.objects[key].panels(), trial.Ts_base_object[key])
     for key in trial.task.soft_objects:
-        world.soft.add(key, body_of(trial, key), trial.Ts_base_object[key])
+        world.soft_bodies().add(key, body_of(trial, key), trial.Ts_base_object[key])
     return world
 
 
@@ -195,7 +195,7 @@ def replayed(trial: Trial) -> tuple[dict[str, Toy], float, float]:
             if step % 24 == 0:
                 paused = time.process_time()
                 for key in highest:
-                    z = float(np.mean(world.soft.nodes_m(key)[:, 2]))
+                    z = float(np.mean(world.soft_bodies().nodes_m(key)[:, 2]))
                     highest[key] = max(highest[key], z)
                 spent += time.process_time() - paused
         cpu_s = time.process_time() - before - spent
@@ -205,15 +205,15 @@ def replayed(trial: Trial) -> tuple[dict[str, Toy], float, float]:
 
 def _judge(world: World, trial: Trial, key: str, highest_m: float) -> Toy:
     model = body_of(trial, key)
-    nodes, T = world.soft.nodes_m(key), world.T_base_object(key)
+    nodes, T = world.soft_bodies().nodes_m(key), world.T_base_object(key)
     off = (nodes - T[:3, 3]) @ T[:3, :3] - model.nodes_m
     container = trial.task.objects[trial.task.containers[0]]
     T_box = trial.Ts_base_object[trial.task.containers[0]]
     return Toy(
         held=highest_m > trial.Ts_base_object[key][2, 3] + LIFTED_M,
         placed=inside(T, T_box, container) and not world.finger_touches(key),
-        num_inverted=world.soft.health(key).num_inverted,
-        extents_off=float(np.abs(world.soft.extents_m(key) / model.size_m - 1).max()),
+        num_inverted=world.soft_bodies().health(key).num_inverted,
+        extents_off=float(np.abs(world.soft_bodies().extents_m(key) / model.size_m - 1).max()),
         shape_error_m=float(np.linalg.norm(off, axis=1).max()),
         T_base_object=T,
     )

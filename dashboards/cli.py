@@ -6,12 +6,10 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.terminal import Output
-from dashboards.config import DashboardConfig, DemoConfig, ShareConfig, TrialsConfig
+from dashboards.config import DashboardConfig, ShareConfig
 
 OUTPUT = Output()
 DASHBOARD = DashboardConfig()
-DEMO = DemoConfig()
-TRIALS = TrialsConfig()
 SHARE = ShareConfig()
 
 
@@ -44,38 +42,6 @@ def dashboard(
             package=error.name, extra="dashboard", purpose="the dashboard"
         ) from error
     return serve(runs, config, output)
-
-
-def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) -> int:
-    """Run the whole loop on the stand-in cell: record, rebuild, replay, evaluate, show.
-
-    Example: robot-gst demo runs/demo --quick
-
-    Args:
-        run: Run folder; made where needed. The same command again goes on where it was stopped.
-        config: How much to do.
-        output: How to talk.
-    """
-    from dashboards.demo import run_demo
-
-    return run_demo(run, config, output)
-
-
-def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTPUT) -> int:
-    """Try policies on the same starts, without and with replanning, in the stand-in cell.
-
-    Example: robot-gst trials runs/study --task cube_into_box --trials 20
-    With a coin in the gate's place too:
-    robot-gst trials runs/study --arms without with control --coin 0.4
-
-    Args:
-        run: Run folder; made where needed. The same command again goes on where it was stopped.
-        config: What the study does; written to protocol.json before the first trial.
-        output: How to talk.
-    """
-    from dashboards.trials import run_trials
-
-    return run_trials(run, config, output)
 
 
 def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT) -> int:

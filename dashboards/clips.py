@@ -206,7 +206,7 @@ def as_video(found: Footage, config: ClipConfig) -> bytes:
         MissingDependencyError: Without PyAV.
     """
     with LOADING:
-        from bridge.exchange.lerobot.video import VideoWriter  # noqa: PLC0415  # the extra [video]
+        from bridge.media.video_writer import VideoWriter  # noqa: PLC0415  # the extra [video]
 
     height, width = found.frames[0].shape[:2]
     with TemporaryDirectory(prefix="robot-gst-") as folder:

@@ -68,9 +68,20 @@ def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
     return SoftNodes(stamps_ns=stamps_ns, points_m=_in_object(points_m[:count], track, stamps_ns))
 
 
-def not_bent(name: str, trajectory: str | None) -> str:
-    """Return the note for an object whose nodes cannot be drawn."""
-    return f"{name}: as replayed ({trajectory}) drawn without being bent"
+Bent = tuple[Float[np.ndarray, "num_nodes 3"], Float[np.ndarray, "num_states num_nodes 4 4"]]
+"""Nodes unbent [m], and ``T_base_node`` at each instant."""
+
+
+def bent(
+    replay: Recording,
+    name: str,
+    track: PoseTrajectory,
+    own_ns: Int[np.ndarray, " num_samples"],
+    found: Correction,
+) -> Bent | None:
+    """Move the nodes of an object as ``bend`` does; None where there are none that can be drawn."""
+    nodes = read_soft_nodes(replay, name)
+    return None if nodes is None else bend(nodes, track, own_ns, found)
 
 
 def bend(
@@ -78,14 +89,11 @@ def bend(
     track: PoseTrajectory,
     own_ns: Int[np.ndarray, " num_samples"],
     found: Correction,
-) -> tuple[Float[np.ndarray, "num_nodes 3"], Float[np.ndarray, "num_states num_nodes 4 4"]]:
+) -> Bent:
     """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
 
     Args:
         own_ns: The page's samples on the replay's clock, evenly spaced.
-
-    Returns:
-        The nodes unbent [m], and ``T_base_node`` at each instant.
     """
     rest_m = nodes.rest_m
     num_nodes = len(rest_m)

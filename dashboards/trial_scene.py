@@ -19,6 +19,7 @@ from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
+from bridge.leaves import has_leaf, load_leaf
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from dashboards.library import derived_paths
@@ -270,16 +271,19 @@ def _bends(
     names = () if gathering.task is None else gathering.task.soft_objects
     if not names:
         return {}
-    with LOADING:
-        from dashboards.soft_nodes import bend, not_bent, read_soft_nodes  # noqa: PLC0415  # a leaf
     bends = {}
     for name in names:
-        track = replay.objects.get(name)
-        nodes = gathering.problems.attempt(partial(read_soft_nodes, replay, name), None)
-        if track is None or nodes is None:
-            gathering.problems.texts.append(not_bent(name, trajectory))
+        track, found = replay.objects.get(name), None
+        if track is not None and has_leaf("soft"):
+            with LOADING:
+                bent = partial(load_leaf("soft", "bent"), replay, name, track, own_ns, correction)
+            found = gathering.problems.attempt(bent, None)
+        if found is None:
+            gathering.problems.texts.append(
+                f"{name}: as replayed ({trajectory}) drawn without being bent"
+            )
             continue
-        rest_m, Ts = bend(nodes, track, own_ns, correction)
+        rest_m, Ts = found
         bends[name] = Bend(rest_nodes_m=rest_m, Ts_base_node=Ts)
     return bends
 

@@ -37,7 +37,6 @@ from bridge.task.protocol import (
     with_coins,
 )
 from bridge.terminal import Output
-from dashboards.config import BUILT_IN_POLICY, TrialsConfig
 from dashboards.demo import (
     Background,
     StepFailedError,
@@ -51,6 +50,7 @@ from dashboards.demo import (
     step,
     stop_command,
 )
+from dashboards.standin_cli import BUILT_IN_POLICY, TrialsConfig
 
 EVERY_TASK = "all"
 POLL_S = 0.2

@@ -1,4 +1,4 @@
-"""Commands that publish: a folder, an episode, the stand-in cell, RealSense cameras, a UR arm."""
+"""Commands that publish a folder or an episode; leaves bring others."""
 
 import contextlib
 import threading
@@ -10,9 +10,6 @@ from cyclopts import Parameter
 
 from bridge.sources.folder.config import FolderConfig
 from bridge.sources.playback.config import PlaybackConfig
-from bridge.sources.realsense.config import RealSenseConfig
-from bridge.sources.standin.settings import SessionConfig
-from bridge.sources.ur.config import UrConfig
 from bridge.terminal import Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT
 
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
 
 OUTPUT = Output()
 FOLDER = FolderConfig()
-STANDIN = SessionConfig()
 LOOPBACK = (DEFAULT_ENDPOINT,)
 
 
@@ -192,118 +188,3 @@ def _space_bar(pace: "Pace", say: Callable[[str], None]) -> Iterator[None]:
             ended.set()
             if has_keys:
                 watcher.join()
-
-
-def publish_standin(
-    *,
-    config: Annotated[SessionConfig, Parameter(name="*")] = STANDIN,
-    connect: tuple[str, ...] = LOOPBACK,
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
-    output: Output = OUTPUT,
-) -> int:
-    """Run the stand-in cell: a simulated laboratory that records a scan, trials, then probes.
-
-    It needs a recorder (robot-gst record RUN) and, with replanning, a gate (robot-gst gate RUN).
-    SIGINT or SIGTERM finish the open episode.
-    Example: robot-gst publish standin --trials 3 --seed 1
-    Scan only: robot-gst publish standin --trials 0
-    Probes of physics only: robot-gst publish standin --trials 0 --no-scan --probes 4
-    Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
-
-    Args:
-        config: What the session does.
-        connect: Where the recorder listens.
-        zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
-    """
-    from bridge.sources.source import run_source
-    from bridge.sources.standin.session import StandinSource, describe
-    from bridge.wire.config import WireConfig
-
-    wire = WireConfig(connect=connect, config=zenoh_config)
-    summary = run_source(StandinSource(config), wire, output)
-    output.result(summary, describe(summary))
-    return 0
-
-
-REALSENSE = RealSenseConfig()
-UR = UrConfig()
-
-
-def publish_realsense(
-    *,
-    config: Annotated[RealSenseConfig, Parameter(name="*")] = REALSENSE,
-    list: Annotated[bool, Parameter(negative=())] = False,
-    duration_s: Duration = None,
-    connect: tuple[str, ...] = LOOPBACK,
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
-    output: Output = OUTPUT,
-) -> int:
-    """Publish RealSense cameras (D435, D405 and others): colour, depth, calibration.
-
-    It runs until SIGINT or SIGTERM; a camera that was unplugged is taken up again.
-    Example: robot-gst publish realsense --cell lab --camera side=123622270224
-
-    Args:
-        config: Which cameras, and how.
-        list: Say what is attached and end.
-        duration_s: Stop after this long [s].
-        connect: Where the recorder listens.
-        zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
-    """
-    from bridge.sources.realsense.device import describe_device
-    from bridge.sources.realsense.publish import RealSenseSource, attached_devices
-    from bridge.sources.source import run_source
-    from bridge.wire.config import WireConfig
-
-    list_devices = attached_devices()
-    if list:
-        found = [describe_device(device) for device in list_devices()]
-        output.result({"cameras": found}, "\n".join(found) or "no RealSense camera is attached")
-        return 0
-    source = RealSenseSource(config, list_devices)
-    wire = WireConfig(
-        connect=connect, config=zenoh_config, shared_memory_mb=config.shared_memory_mb
-    )
-    counts = run_source(source, wire, output, duration_s=duration_s)
-    lines = [
-        f"{camera}: {sent['color_frames']} colour and {sent['depth_frames']} depth frames sent, "
-        f"{sent['color_lost']} and {sent['depth_lost']} lost on the way from the camera"
-        for camera, sent in counts.items()
-    ]
-    output.result({"cameras": counts}, "\n".join(lines))
-    return 0
-
-
-def publish_ur(
-    host: str,
-    /,
-    *,
-    config: Annotated[UrConfig, Parameter(name="*")] = UR,
-    duration_s: Duration = None,
-    connect: tuple[str, ...] = LOOPBACK,
-    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
-    output: Output = OUTPUT,
-) -> int:
-    """Publish a UR arm over RTDE: joints, TCP, gripper, URDF, robot and safety mode. Reads only.
-
-    It runs until SIGINT or SIGTERM; a robot that went away is taken up again.
-    Example: robot-gst publish ur 192.168.1.10 --cell lab --gripper tool_analog_in:0
-
-    Args:
-        host: Name or address of the controller.
-        config: What is read, and how.
-        duration_s: Stop after this long [s].
-        connect: Where the recorder listens.
-        zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
-    """
-    from bridge.sources.source import run_source
-    from bridge.sources.ur.publish import UrSource, describe_counts
-    from bridge.wire.config import WireConfig
-
-    wire = WireConfig(connect=connect, config=zenoh_config)
-    counts = run_source(UrSource(host, config), wire, output, duration_s=duration_s)
-    output.result(counts, describe_counts(counts))
-    return 0

@@ -13,9 +13,9 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output
 from dashboards import demo
-from dashboards.config import DemoConfig
 from dashboards.demo import Trial, groups_of, look
 from dashboards.errors import DashboardError
+from dashboards.standin_cli import DemoConfig
 
 TASK = "cube_into_box"
 QUICK = DemoConfig(quick=True, serve=False)

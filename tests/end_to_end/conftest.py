@@ -12,6 +12,7 @@ import pytest
 from loopback import free_endpoint
 
 ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "tests" / "twin" / "scene")]
 SHARED = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))
 Gst = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bridge.cli.publish import publish_standin
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.robots.default import MAX_WIDTH_M
 from bridge.sources.standin import session
 from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.cli import publish_standin
 from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import (
     LOOK_S,

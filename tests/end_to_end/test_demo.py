@@ -5,11 +5,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import textured_room
+from leafless import run_without
 from mcap.reader import make_reader
 
 from bridge.episode.reader import Episode
+from bridge.episode.run_folder import RunFolder
+from bridge.leaves import LEAVES
 
 ROOT = Path(__file__).parents[2]
 SHORT = """
@@ -120,3 +125,30 @@ def test_running_the_demo_again_keeps_what_is_whole_and_adds_what_is_missing(dem
     kept = {path: path.stat().st_mtime_ns for path in all_files(demo)}
     changed = {path for path in before if kept.get(path) != before[path]}
     assert changed <= {path for path in before if path.name.startswith(lost.stem)}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a scan of a small room."""
+    run = RunFolder.create(tmp_path_factory.mktemp("room") / "room")
+    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=9)
+    return run.path
+
+
+@pytest.fixture(scope="module")
+def whole(demo: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What comes of the core's commands with every leaf there."""
+    return run_without(None, demo, room, tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_the_core_does_the_same_without_a_leaf(
+    leaf: str, whole: dict[str, Any], demo: Path, room: Path, tmp_path: Path
+) -> None:
+    found = run_without(leaf, demo, room, tmp_path)
+    done = {name: found[name] for name in ("check", "rebuild", "replay", "evaluate")}
+    assert done == dict.fromkeys(done, 0)
+    assert found["/"] == found["/episode/trial_0001"] == 200
+    assert found["elsewhere"] == []
+    assert found["record"] > 1000
+    assert found == whole

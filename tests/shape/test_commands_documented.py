@@ -8,7 +8,6 @@ import pytest
 from cyclopts import App
 
 import robot_gst
-from robot_gst import COMMANDS, GROUPS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "cli.md").read_text()
@@ -27,8 +26,7 @@ def command_lines() -> list[str]:
 
 
 def test_every_command_stands_in_the_table_of_commands() -> None:
-    names = [name for name, *_ in COMMANDS]
-    names += [f"{group} {name}" for group, (_, members) in GROUPS.items() for name, *_ in members]
+    names = [command.name for command in robot_gst.commands()]
     missing = [name for name in names if not re.search(rf"`{name}[ `]", PAGE)]
     assert missing == []
 

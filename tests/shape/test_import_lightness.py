@@ -26,6 +26,7 @@ LIGHT_ROOMS = (
     "twin.plan.cli",
     "evaluator.cli",
     "dashboards.cli",
+    "dashboards.standin_cli",
     "dashboards.scene_file",
     "evaluator.result",
     "robot_gst",

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from bridge.errors import MissingDependencyError
 from twin.physics.arm import Hulls, Joints
+from twin.physics.bending import SoftBodies
 from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
 from twin.physics.engine import ENGINE_VERSION
-from twin.physics.soft_world import SoftWorld
 from twin.physics.unseen import EVEN, Unseen
 from twin.physics.world import Box, World
 
@@ -51,7 +51,7 @@ class PhysicsWorld(Protocol):
     def robot(self) -> DrivenRobot:
         """The arm with its gripper."""
 
-    def soft_bodies(self) -> SoftWorld:
+    def soft_bodies(self) -> SoftBodies:
         """What is soft in this world; an engine for rigid bodies only raises ``UsageError``."""
 
     def add_table(self, height_m: float) -> object:

@@ -23,8 +23,8 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, write_description
+from twin.physics.bending import SoftBodies
 from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
-from twin.physics.soft_world import SoftWorld
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 from twin.physics.world import Box
 
@@ -275,7 +275,7 @@ class MujocoWorld:
         self._data: Any = None
         self._compile()
 
-    def soft_bodies(self) -> SoftWorld:
+    def soft_bodies(self) -> SoftBodies:
         """Soft bodies, which this engine does not replay.
 
         Raises:

@@ -350,6 +350,17 @@ class SoftModel:
         return float(np.pi / max(self.size_m) * np.sqrt(self.young_pa / density))
 
 
+def shape_of(model: ObjectModel, arrays: Mapping[str, np.ndarray] | None) -> SoftModel:
+    """The lattice that a scene found of an object; without one the task's mesh, filled.
+
+    Args:
+        arrays: Of the object's ``soft.npz``, object frame.
+    """
+    if arrays is None:
+        return SoftModel.from_task(model)
+    return SoftModel.from_lattice(arrays, model)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SoftHealth:
     """Whether a soft body is still what it was."""
@@ -359,6 +370,11 @@ class SoftHealth:
     max_stretch: float
     """Longest edge relative to its length at rest; infinite for a body that burst."""
     is_finite: bool
+
+    @property
+    def burst(self) -> bool:
+        """It is no body any more; what comes after is noise."""
+        return not self.is_finite or not self.max_stretch < BURST_STRETCH
 
     @property
     def sound(self) -> bool:

@@ -7,18 +7,20 @@ spinning friction: a patch is its corner points, which resist turning more than 
 same bits on every run.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import cos
+from operator import methodcaller
 from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
+from bridge.leaves import load_leaf
 from twin.physics.arm import Arm, Hulls, PhysicsError, Press
+from twin.physics.bending import SoftBodies
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import give_client_back, open_client, pybullet
-from twin.physics.soft_world import SoftWorld
 from twin.physics.unseen import EVEN, Unseen, box_inertia
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
@@ -101,7 +103,9 @@ class World:
             raise
         self._undamp(self.robot.id)
         self._press = Press(self.robot)
-        self.soft = SoftWorld(self._client, self.robot, urdf, mesh_hulls_m, config)
+        self._description = (urdf, mesh_hulls_m)
+        self._soft: SoftBodies | None = None
+        self._solids: list[Callable[[SoftBodies], None]] = []
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
         """Add solid boxes that never move, one body each; returns the body ids.
@@ -115,7 +119,7 @@ class World:
             T_owner_box[:3, 3] = centre
             body = self._box(extents, 0.0, T_base_owner @ T_owner_box)
             self._set_friction(body, self.config.surface_friction)
-            self.soft.add_static(extents, T_base_owner @ T_owner_box)
+            self._meet(methodcaller("add_static", extents, T_base_owner @ T_owner_box))
             ids.append(body)
         return ids
 
@@ -160,7 +164,7 @@ class World:
         self._set_friction(body, self.config.object_friction)
         self._undamp(body)
         self._anchors.add(body)
-        self.soft.add_free(body, size_m, mass_kg, T_base_object, unseen)
+        self._meet(methodcaller("add_free", body, size_m, mass_kg, T_base_object, unseen))
         self.free_ids[object_id] = body
 
     def _box(
@@ -237,24 +241,28 @@ class World:
             width_m: Distance between the finger pads.
         """
         self.robot.reset(joints_rad, width_m)
-        self.soft.place_links()
+        if self._soft is not None:
+            self._soft.place_links()
 
     def step(self) -> None:
         """Advance rigid and soft bodies by one fixed step."""
-        self.soft.push_rigid()
+        soft = self._soft
+        if soft is not None:
+            soft.push_rigid()
         anew = self._anchors.refresh()
-        if not self.soft.names:  # soft bodies slow the fingers down themselves
+        if soft is None or not soft.names:  # soft bodies slow the fingers down themselves
             self._press.update(anew=anew)
         pybullet.stepSimulation(physicsClientId=self._client)
-        self.soft.step()
+        if soft is not None:
+            soft.step()
 
     def object_pose(self, object_id: str) -> tuple[float, ...]:
         """Position [m] and quaternion wxyz of an object that moves, seven numbers.
 
         The pose of a soft body is the rigid motion nearest to its nodes, weighted by mass.
         """
-        if object_id in self.soft.names:
-            return self.soft.pose(object_id)
+        if (soft := self._softly(object_id)) is not None:
+            return soft.pose(object_id)
         p, (x, y, z, w) = pybullet.getBasePositionAndOrientation(
             self._free(object_id), physicsClientId=self._client
         )
@@ -267,15 +275,15 @@ class World:
 
     def T_base_object(self, object_id: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object that moves, as ``object_pose``."""
-        if object_id in self.soft.names:
-            return self.soft.T_base_object(object_id).copy()
+        if (soft := self._softly(object_id)) is not None:
+            return soft.T_base_object(object_id).copy()
         pose = np.array(self.object_pose(object_id))
         return se3.transform_from(pose[3:], pose[:3])
 
     def finger_touches(self, object_id: str) -> bool:
         """Whether a finger is in contact with an object that moves."""
-        if object_id in self.soft.names:
-            return self.soft.finger_touches(object_id)
+        if (soft := self._softly(object_id)) is not None:
+            return soft.finger_touches(object_id)
         body = self._free(object_id)
         return any(
             point[8] <= 0.0
@@ -294,13 +302,35 @@ class World:
                 total += point[10] * np.array(point[11]) + point[12] * np.array(point[13])
         return float(np.linalg.norm(total))
 
-    def soft_bodies(self) -> SoftWorld:
-        """What is soft in this world."""
-        return self.soft
+    def soft_bodies(self) -> SoftBodies:
+        """What is soft in this world; asking the first time begins it.
+
+        Raises:
+            MissingDependencyError: Without the leaf ``soft``.
+        """
+        if self._soft is None:
+            begin = load_leaf("soft", "world")
+            soft: SoftBodies = begin(self._client, self.robot, *self._description, self.config)
+            for add in self._solids:
+                add(soft)
+            self._soft = soft
+        return self._soft
+
+    def _meet(self, add: Callable[[SoftBodies], None]) -> None:
+        """Let soft bodies meet a solid; those that come later meet it too."""
+        self._solids.append(add)
+        if self._soft is not None:
+            add(self._soft)
+
+    def _softly(self, object_id: str) -> SoftBodies | None:
+        """The soft bodies, where an object is one of them."""
+        has = self._soft is not None and object_id in self._soft.names
+        return self._soft if has else None
 
     def _free(self, object_id: str) -> int:
         if object_id not in self.free_ids:
-            known = ", ".join([*self.free_ids, *self.soft.names]) or "none"
+            soft = () if self._soft is None else self._soft.names
+            known = ", ".join([*self.free_ids, *soft]) or "none"
             message = f"no object {object_id!r} moves in this world. There are: {known}."
             raise PhysicsError(message)
         return self.free_ids[object_id]

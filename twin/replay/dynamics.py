@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
+from bridge.leaves import load_leaf
 from bridge.task.task_file import ObjectModel
+from twin.physics.bending import SoftHealth, SoftShape
 from twin.physics.engines import PhysicsWorld, open_world
-from twin.physics.soft import BURST_STRETCH, SoftHealth, SoftModel
 from twin.physics.unseen import EVEN
 from twin.replay.clearance.bodies import placed_panels, placement_of
 from twin.replay.config import ReplayConfig
@@ -30,26 +31,21 @@ LIFT_M = 0.0002
 """Objects localised into their support start this far above it instead."""
 
 
-def soft_models(scene: ReplayScene) -> dict[str, SoftModel]:
+def soft_models(scene: ReplayScene) -> dict[str, SoftShape]:
     """The soft objects that were localised: the scene's lattice where it has one, else the task's.
 
     Their extents at rest are those of the task file either way, so that the same shape predicate
     judges both.
     """
-    models = {}
+    models: dict[str, SoftShape] = {}
     for name in scene.movable():
         model = scene.task.objects[name]
         if model.soft is not None:
-            arrays = scene.lattices.get(name)
-            models[name] = (
-                SoftModel.from_task(model)
-                if arrays is None
-                else SoftModel.from_lattice(arrays, model)
-            )
+            models[name] = load_leaf("soft", "shape")(model, scene.lattices.get(name))
     return models
 
 
-def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> None:
+def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]) -> None:
     """Put table, containers and objects where the scene says.
 
     Args:
@@ -68,7 +64,7 @@ def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]
             world.add_free(name, np.array(model.size_m), model.mass_kg, T_free, unseen)
 
 
-def outline_m(model: ObjectModel, soft: SoftModel | None) -> Float[np.ndarray, "num_points 3"]:
+def outline_m(model: ObjectModel, soft: SoftShape | None) -> Float[np.ndarray, "num_points 3"]:
     """Points whose convex hull holds the object, in its own frame [m].
 
     Args:
@@ -196,7 +192,7 @@ def _mesh_hulls(hulls: RobotHulls) -> dict[str, list[Float[np.ndarray, "num_poin
 class _Samples:
     """Collects states while a world runs."""
 
-    def __init__(self, scene: ReplayScene, soft: dict[str, SoftModel]) -> None:
+    def __init__(self, scene: ReplayScene, soft: dict[str, SoftShape]) -> None:
         self._objects = list(scene.movable())
         self._soft = list(soft)
         self._fixed = scene.containers()
@@ -275,8 +271,7 @@ class _Samples:
 
 def burst_of(health: SoftHealth) -> str | None:
     """Say in what way a soft body has burst; None when it has not."""
-    burst = not health.is_finite or not health.max_stretch < BURST_STRETCH
-    return health.describe() if burst else None
+    return health.describe() if health.burst else None
 
 
 START_OVERLAP_M = 0.006
@@ -301,7 +296,7 @@ class _Solid:
     fixed: bool = False
 
 
-def free_start(scene: ReplayScene, soft: Mapping[str, SoftModel]) -> ReplayScene:
+def free_start(scene: ReplayScene, soft: Mapping[str, SoftShape]) -> ReplayScene:
     """Move objects apart that lie in each other or in a container by little.
 
     The object that can move is moved, along the direction of least depth; of two, each by half.

@@ -337,7 +337,7 @@ def _writer(out: Path, rate_hz: float) -> Iterator[Write]:
 
         yield write_images
         return
-    from bridge.exchange.lerobot.video import VideoWriter  # noqa: PLC0415  # the extra [video]
+    from bridge.media.video_writer import VideoWriter  # noqa: PLC0415  # the extra [video]
 
     video: VideoWriter | None = None
 

@@ -16,7 +16,6 @@ from jaxtyping import UInt16
 
 MOST_CODE = 4095
 NO_MEASUREMENT = 0
-PIX_FMT = "gray12le"
 SUFFIX = "_depth"
 """Ends the name of a camera's depth among the features."""
 

@@ -34,11 +34,12 @@ from bridge.episode.topics import (
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.depth import PIX_FMT, SUFFIX
+from bridge.exchange.lerobot.depth import SUFFIX
 from bridge.exchange.lerobot.layout import DatasetInfo, LeRobotFormatError, parquet, read_info
 from bridge.exchange.lerobot.video import read_frames
 from bridge.exchange.output import is_of_stand_in
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
+from bridge.media.video_writer import PIX_FMT
 from bridge.terminal import Advance
 
 BATCH_ROWS = 1024

@@ -14,7 +14,7 @@ from bridge.errors import MissingDependencyError
 from bridge.exchange.lerobot import layout
 from bridge.exchange.lerobot.depth import DepthCoding
 from bridge.exchange.lerobot.layout import parquet
-from bridge.exchange.lerobot.video import VideoWriter
+from bridge.media.video_writer import VideoWriter
 
 PIXEL_STRIDE = 4
 """Image statistics look at every fourth pixel of both axes."""

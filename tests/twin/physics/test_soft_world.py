@@ -31,7 +31,7 @@ def closed_on(world: World, model: SoftModel, steps: int = 120) -> np.ndarray:
     """Close the fingers on a body between them; where the tool is."""
     world.reset_robot(HOME, 0.043)
     T_tcp = world.robot.T_base_link("tcp")
-    world.soft.add("toy", model, T_tcp)
+    world.soft_bodies().add("toy", model, T_tcp)
     for _ in range(steps):
         world.robot.command(HOME, np.zeros(6), 0.0)
         world.step()
@@ -47,7 +47,7 @@ def test_fingers_stop_on_a_soft_body_and_hold_it(urdf: str, box_of_cells: Boxes)
         assert world.finger_touches("toy")
         drift = world.T_base_object("toy")[:3, 3] - T_tcp[:3, 3]
         assert np.linalg.norm(drift) < 5e-3, "the grasp does not hold against gravity"
-        assert world.soft.health("toy").sound
+        assert world.soft_bodies().health("toy").sound
         widths = []
         for _ in range(60):
             world.robot.command(HOME, np.zeros(6), 0.0)
@@ -67,7 +67,9 @@ def test_a_body_let_go_falls_and_takes_its_shape_again(urdf: str, box_of_cells: 
             world.step()
         assert not world.finger_touches("toy")
         assert world.T_base_object("toy")[2, 3] < 0.05
-        np.testing.assert_allclose(world.soft.extents_m("toy") / model.size_m, 1.0, atol=0.05)
+        np.testing.assert_allclose(
+            world.soft_bodies().extents_m("toy") / model.size_m, 1.0, atol=0.05
+        )
 
 
 def test_a_soft_body_rests_on_a_free_box(urdf: str, box_of_cells: Boxes) -> None:
@@ -75,7 +77,7 @@ def test_a_soft_body_rests_on_a_free_box(urdf: str, box_of_cells: Boxes) -> None
         world.add_table(0.0)
         world.reset_robot(HOME, 0.08)
         world.add_free("cube", np.full(3, 0.06), 0.2, at(0.6, 0.3, 0.0301))
-        world.soft.add("toy", box_of_cells((3, 3, 2)), at(0.6, 0.3, 0.076))
+        world.soft_bodies().add("toy", box_of_cells((3, 3, 2)), at(0.6, 0.3, 0.076))
         for _ in range(240):
             world.step()
         assert world.T_base_object("toy")[2, 3] == pytest.approx(0.074, abs=2e-3)
@@ -87,7 +89,7 @@ def test_every_run_gives_the_same_bits(urdf: str, box_of_cells: Boxes) -> None:
     for _ in range(2):
         with World(urdf, {}, PhysicsConfig()) as world:
             closed_on(world, box_of_cells((3, 3, 3)), 30)
-            digest = hashlib.sha256(world.soft.nodes_m("toy").astype(np.float32).tobytes())
+            digest = hashlib.sha256(world.soft_bodies().nodes_m("toy").astype(np.float32).tobytes())
             digest.update(world.robot.joints_rad().tobytes())
             found.add(digest.hexdigest())
     assert len(found) == 1
@@ -99,9 +101,9 @@ def test_poses_and_extents_at_rest_are_those_given(urdf: str) -> None:
     duck = load_task("five_ducks_into_basket").objects["duck_1"]
     T = se3.transform_from(np.array([0.8, 0.0, 0.6, 0.0]), np.array([0.4, 0.1, 0.5]))
     with World(urdf, {}, PhysicsConfig()) as world:
-        world.soft.add("duck", SoftModel.from_task(duck), T)
+        world.soft_bodies().add("duck", SoftModel.from_task(duck), T)
         np.testing.assert_allclose(world.T_base_object("duck"), T, atol=1e-6)
-        np.testing.assert_allclose(world.soft.extents_m("duck"), duck.size_m, rtol=1e-5)
+        np.testing.assert_allclose(world.soft_bodies().extents_m("duck"), duck.size_m, rtol=1e-5)
         pose = np.array(world.object_pose("duck"))
         np.testing.assert_allclose(se3.transform_from(pose[3:], pose[:3]), T, atol=1e-6)
         assert not world.finger_touches("duck")
@@ -109,6 +111,6 @@ def test_poses_and_extents_at_rest_are_those_given(urdf: str) -> None:
 
 def test_an_unknown_object_is_named_with_those_there_are(urdf: str, box_of_cells: Boxes) -> None:
     with World(urdf, {}, PhysicsConfig()) as world:
-        world.soft.add("toy", box_of_cells((2, 2, 2)), at(0.5, 0.0, 0.5))
+        world.soft_bodies().add("toy", box_of_cells((2, 2, 2)), at(0.5, 0.0, 0.5))
         with pytest.raises(PhysicsError, match="There are: toy"):
             world.T_base_object("cube")

@@ -16,8 +16,8 @@ from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
+from bridge.leaves import has_leaf, load_leaf
 from bridge.terminal import Output
-from twin.leaves import has_leaf, load_leaf
 from twin.scene.backdrop import Backdrop, backdrop_of
 from twin.scene.dataset.training_set import (
     TrainingSet,
@@ -102,7 +102,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     calibration = read_calibration(run)
     models: dict[str, str] = {}
     if config.models.any_named:
-        models = load_leaf("check_models")(config.models, scanned_tasks(sources).task)
+        models = load_leaf("perception", "check_models")(config.models, scanned_tasks(sources).task)
     key = _key(sources, config, calibration, models)
     done = None if config.force else _already_done(run, key)
     if done is not None:
@@ -236,9 +236,9 @@ def _write_parts(
     """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
     output.say("write objects, robot links and the distances to what is static")
     written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
-    if not config.models.any_named and not has_leaf("name_things"):
+    if not config.models.any_named and not has_leaf("perception"):
         return written
-    named: dict[str, Any] = load_leaf("name_things")(
+    named: dict[str, Any] = load_leaf("perception", "name_things")(
         run.scene_dir,
         decomposed,
         training.views,

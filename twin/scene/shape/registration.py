@@ -307,7 +307,9 @@ def _agreement(surfaces: Sequence[SeenSurface], state: _State) -> tuple[np.ndarr
     share[line, owner[rows]] += 1.0
     lever = np.concatenate([slope, np.cross(p[rows] - state.pivot, slope)], axis=1)
     J = np.zeros((len(rows), state.num_unknowns))
-    J[:, : state.moves.size] = (share[:, :, None] * lever[:, None, :]).reshape(len(rows), -1)
+    J[:, : state.moves.size] = (share[:, :, None] * lever[:, None, :]).reshape(
+        len(rows), state.moves.size
+    )
     own = np.einsum("ni,nij->nj", slope, placed.Rs[owner[rows]])
     mine = slope_by_sensor(own, placed.p_camera[rows])
     turned = np.einsum("ni,nkij->nkj", slope, placed.Rs[owner[index]])

@@ -1,0 +1,220 @@
+"""Leaves: what the core works without. Each makes itself known here, once, and is read when needed.
+
+Nothing in the core imports a leaf; a leaf imports the core, and no other leaf.
+"""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+from bridge.errors import MissingDependencyError
+
+
+class Command(NamedTuple):
+    """One command of the front door."""
+
+    name: str
+    """As it is typed: ``record``, ``publish ur``."""
+    target: str
+    """``module:function``."""
+    text: str
+    example: str
+    """What may follow the name."""
+    use: str
+    """What one does with it: the heading that it stands under."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leaf:
+    """Where a leaf lies, how to get it, and what it brings."""
+
+    modules: tuple[str, ...]
+    """Packages and modules that go with it."""
+    extra: str
+    """Brings what it needs."""
+    purpose: str
+    """What one wants it for, as a message ends."""
+    entries: Mapping[str, str] = field(default_factory=dict)
+    """What the core asks of it: ``module:name`` by a name of its own."""
+    commands: tuple[Command, ...] = ()
+
+
+LEAVES: dict[str, Leaf] = {
+    "planner": Leaf(
+        modules=("twin.plan",),
+        extra="replay",
+        purpose="planning",
+        commands=(
+            Command(
+                "plan",
+                "twin.plan.cli:plan",
+                "Plan from words, or for a cell that asks over zenoh.",
+                "runs/monday --task 'put the cube into the box' --dry",
+                "Plan and gate",
+            ),
+        ),
+    ),
+    "perception": Leaf(
+        modules=("twin.scene.semantics", "twin.scene.foundation"),
+        extra="foundation",
+        purpose="naming the things of a scene",
+        entries={
+            "check_models": "twin.scene.foundation.stage:check_models",
+            "name_things": "twin.scene.foundation.things:write_scene_semantics",
+        },
+    ),
+    "soft": Leaf(
+        modules=(
+            "twin.physics.soft",
+            "twin.physics.soft_solver",
+            "twin.physics.soft_world",
+            "dashboards.soft_nodes",
+        ),
+        extra="replay",
+        purpose="replaying soft objects",
+        entries={
+            "shape": "twin.physics.soft:shape_of",
+            "world": "twin.physics.soft_world:SoftWorld",
+            "bent": "dashboards.soft_nodes:bent",
+        },
+    ),
+    "stand-in": Leaf(
+        modules=(
+            "bridge.sources.standin",
+            "dashboards.standin_cli",
+            "dashboards.demo",
+            "dashboards.trials",
+            "dashboards.learned",
+        ),
+        extra="standin",
+        purpose="the stand-in cell",
+        commands=(
+            Command(
+                "demo",
+                "dashboards.standin_cli:demo",
+                "Run the whole loop on the stand-in cell, in minutes.",
+                "runs/demo",
+                "Start here",
+            ),
+            Command(
+                "trials",
+                "dashboards.standin_cli:trials",
+                "Try policies without and with replanning on the same starts.",
+                "runs/study --trials 20",
+                "Start here",
+            ),
+            Command(
+                "publish standin",
+                "bridge.sources.standin.cli:publish_standin",
+                "The stand-in cell: a simulated laboratory.",
+                "--trials 3 --seed 1",
+                "Record",
+            ),
+        ),
+    ),
+    "ur": Leaf(
+        modules=("bridge.sources.ur",),
+        extra="ur",
+        purpose="publishing a UR arm",
+        commands=(
+            Command(
+                "publish ur",
+                "bridge.sources.ur.cli:publish_ur",
+                "A UR arm: joints, tool, gripper, modes.",
+                "192.168.1.10 --cell lab",
+                "Record",
+            ),
+        ),
+    ),
+    "realsense": Leaf(
+        modules=("bridge.sources.realsense",),
+        extra="realsense",
+        purpose="publishing RealSense cameras",
+        commands=(
+            Command(
+                "publish realsense",
+                "bridge.sources.realsense.cli:publish_realsense",
+                "RealSense cameras: colour, depth, calibration.",
+                "--cell lab --camera side=123622270224",
+                "Record",
+            ),
+        ),
+    ),
+    "lerobot": Leaf(
+        modules=("bridge.exchange.lerobot",),
+        extra="video",
+        purpose="exchange with LeRobot",
+        commands=(
+            Command(
+                "import lerobot",
+                "bridge.exchange.lerobot.cli:import_lerobot",
+                "A LeRobotDataset v3.0, one episode file each.",
+                "DIR runs/x --episodes 0-9",
+                "Exchange",
+            ),
+            Command(
+                "export lerobot",
+                "bridge.exchange.lerobot.cli:export_lerobot",
+                "Trials as a LeRobotDataset v3.0.",
+                "runs/x DIR",
+                "Exchange",
+            ),
+        ),
+    ),
+}
+
+
+def has_leaf(name: str) -> bool:
+    """Whether a leaf is here; what it needs may still be missing."""
+    return name in LEAVES and all(map(_is_here, LEAVES[name].modules))
+
+
+def _is_here(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # a package above it is gone, too
+        return False
+
+
+def load_leaf(name: str, entry: str) -> Any:
+    """Return what a leaf brings under a name.
+
+    Raises:
+        MissingDependencyError: When the leaf is not here; names the extra that brings it.
+    """
+    refuse_missing(name)
+    module, _, attribute = LEAVES[name].entries[entry].partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def refuse_missing(name: str) -> None:
+    """Refuse to go on without a leaf.
+
+    Raises:
+        MissingDependencyError: When it is not here; names the extra that brings it.
+    """
+    if has_leaf(name):
+        return
+    leaf = LEAVES.get(name, Leaf(modules=(), extra="all", purpose=f"what is asked ({name})"))
+    missing = [module for module in leaf.modules if not _is_here(module)]
+    package = missing[0] if missing else name
+    raise MissingDependencyError(package=package, extra=leaf.extra, purpose=leaf.purpose)
+
+
+def leaf_commands() -> tuple[Command, ...]:
+    """Commands that leaves bring."""
+    return tuple(command for leaf in LEAVES.values() for command in leaf.commands)
+
+
+def refuse_missing_command(tokens: Sequence[str]) -> None:
+    """Refuse a command whose leaf is not here.
+
+    Raises:
+        MissingDependencyError: Naming the extra that brings it.
+    """
+    typed = " ".join(tokens[:2]) + " "
+    for name, leaf in LEAVES.items():
+        if any(typed.startswith(f"{command.name} ") for command in leaf.commands):
+            refuse_missing(name)

@@ -1,0 +1,103 @@
+"""Video files: frames in. PyAV (the extra [video]) does it.
+
+Colour is H.264, depth HEVC of 12 bits without loss.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.errors import MissingDependencyError
+
+CODEC, DEPTH_CODEC = "libx264", "libx265"
+RGB, PIX_FMT = "rgb24", "gray12le"
+"""Pixels of colour, and of depth codes of 12 bits."""
+KEYFRAME_EVERY = 2
+"""Training reads single frames at random, so every second one can be decoded alone."""
+
+
+def pyav() -> Any:
+    """Return PyAV.
+
+    Raises:
+        MissingDependencyError: Without it.
+    """
+    try:
+        import av  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingDependencyError(package="av", extra="video", purpose="video") from error
+    return av
+
+
+class VideoWriter:
+    """Append frames to one MP4 file at a constant rate."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        fps: int,
+        width: int,
+        height: int,
+        crf: int,
+        is_depth: bool = False,
+        keyframe_every: int = KEYFRAME_EVERY,
+    ) -> None:
+        """Create the file; sizes that are odd get full chroma, for the usual one needs even.
+
+        Args:
+            path: The file; its folder is made where needed.
+            width: Of every frame [px].
+            height: Of every frame [px].
+            is_depth: Frames are 12-bit codes, kept without loss.
+
+        Raises:
+            MissingDependencyError: Without PyAV, or with one that has no encoder for this.
+        """
+        av = pyav()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.num_frames = 0
+        self._frame_class = av.VideoFrame
+        self._intra = av.video.frame.PictureType.I
+        self._container = av.open(str(path), "w")
+        options = {"g": str(keyframe_every), "bf": "0", "preset": "veryfast", "forced-idr": "1"}
+        if is_depth:
+            options["x265-params"] = "lossless=1:bframes=0:log-level=none"
+        else:
+            options["crf"] = str(crf)
+        codec = DEPTH_CODEC if is_depth else CODEC
+        if codec not in av.codecs_available:
+            raise MissingDependencyError(package=f"av with {codec}", extra="video", purpose="video")
+        self._stream = self._container.add_stream(codec, rate=fps, options=options)
+        self._stream.width, self._stream.height = width, height
+        is_even = width % 2 == 0 and height % 2 == 0
+        self.pix_fmt = PIX_FMT if is_depth else "yuv420p" if is_even else "yuv444p"
+        self._stream.pix_fmt = self.pix_fmt
+        self._format = PIX_FMT if is_depth else RGB
+
+    def write(self, pixels: np.ndarray, *, first: bool) -> None:
+        """Append one frame; the first of an episode can be decoded without those before it.
+
+        Args:
+            pixels: RGB, height x width x 3 of uint8; of depth codes, height x width of uint16.
+        """
+        frame = self._frame_class.from_ndarray(pixels, format=self._format)
+        if first:
+            frame.pict_type = self._intra
+        frame.pts = self.num_frames
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+        self.num_frames += 1
+
+    @property
+    def size_bytes(self) -> int:
+        """How large the file is; 0 while the encoder holds everything."""
+        return self.path.stat().st_size if self.path.is_file() else 0
+
+    def close(self) -> None:
+        """Write what the encoder still holds, and the index."""
+        for packet in self._stream.encode(None):
+            self._container.mux(packet)
+        self._container.close()

@@ -1,0 +1,46 @@
+"""The command that runs the stand-in cell."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from bridge.sources.standin.settings import SessionConfig
+from bridge.terminal import Output
+from bridge.wire.config import DEFAULT_ENDPOINT
+
+OUTPUT = Output()
+STANDIN = SessionConfig()
+LOOPBACK = (DEFAULT_ENDPOINT,)
+
+
+def publish_standin(
+    *,
+    config: Annotated[SessionConfig, Parameter(name="*")] = STANDIN,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Run the stand-in cell: a simulated laboratory that records a scan, trials, then probes.
+
+    It needs a recorder (robot-gst record RUN) and, with replanning, a gate (robot-gst gate RUN).
+    SIGINT or SIGTERM finish the open episode.
+    Example: robot-gst publish standin --trials 3 --seed 1
+    Scan only: robot-gst publish standin --trials 0
+    Probes of physics only: robot-gst publish standin --trials 0 --no-scan --probes 4
+    Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
+
+    Args:
+        config: What the session does.
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.source import run_source
+    from bridge.sources.standin.session import StandinSource, describe
+    from bridge.wire.config import WireConfig
+
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    summary = run_source(StandinSource(config), wire, output)
+    output.result(summary, describe(summary))
+    return 0

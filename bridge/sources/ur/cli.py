@@ -1,0 +1,48 @@
+"""The command that publishes a UR arm."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from bridge.sources.ur.config import UrConfig
+from bridge.terminal import Output
+from bridge.wire.config import DEFAULT_ENDPOINT
+
+OUTPUT = Output()
+UR = UrConfig()
+LOOPBACK = (DEFAULT_ENDPOINT,)
+Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
+
+
+def publish_ur(
+    host: str,
+    /,
+    *,
+    config: Annotated[UrConfig, Parameter(name="*")] = UR,
+    duration_s: Duration = None,
+    connect: tuple[str, ...] = LOOPBACK,
+    zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
+    output: Output = OUTPUT,
+) -> int:
+    """Publish a UR arm over RTDE: joints, TCP, gripper, URDF, robot and safety mode. Reads only.
+
+    It runs until SIGINT or SIGTERM; a robot that went away is taken up again.
+    Example: robot-gst publish ur 192.168.1.10 --cell lab --gripper tool_analog_in:0
+
+    Args:
+        host: Name or address of the controller.
+        config: What is read, and how.
+        duration_s: Stop after this long [s].
+        connect: Where the recorder listens.
+        zenoh_config: zenoh configuration (JSON5).
+        output: How to talk.
+    """
+    from bridge.sources.source import run_source
+    from bridge.sources.ur.publish import UrSource, describe_counts
+    from bridge.wire.config import WireConfig
+
+    wire = WireConfig(connect=connect, config=zenoh_config)
+    counts = run_source(UrSource(host, config), wire, output, duration_s=duration_s)
+    output.result(counts, describe_counts(counts))
+    return 0
