@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cyclopts import App, Group, Parameter
 from cyclopts.config import Toml
@@ -285,7 +286,7 @@ def build_app() -> App:
     for command in commands():
         group, _, member = command.name.rpartition(" ")
         parent = groups[group] if group else app
-        heading = {} if group else {"group": headings[command.use]}
+        heading: dict[str, Any] = {} if group else {"group": headings[command.use]}
         parent.command(command.target, name=member, help=_help(command), **heading)
     for group_app in groups.values():
         app.command(group_app)

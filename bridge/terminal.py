@@ -24,6 +24,10 @@ Advance = Callable[[int, str], None]
 """Called as ``advance(done, note)`` by long work."""
 
 
+RARE = Parameter(show=False)
+"""A setting that help leaves out; docs/cli.md lists it, a file for ``--config`` may hold it."""
+
+
 @Parameter(name="*", group="Output", negative=())
 @dataclass(frozen=True, kw_only=True)
 class Output:

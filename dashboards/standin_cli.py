@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.protocol import SEEDS_PER_SESSION
-from bridge.terminal import Output
+from bridge.terminal import RARE, Output
 from dashboards.config import PORTS
 
 BUILT_IN_POLICY = "perturbed"
@@ -51,15 +52,15 @@ class TrialsConfig:
     """After each failed execution, reset, localise and plan anew, once. Counted and shown apart."""
     seed: int = 1
     """Draws the laboratory and the starts."""
-    study_seed: int = 0
+    study_seed: Annotated[int, RARE] = 0
     """Draws the order of the arms on each start, of the starts, and the coins."""
     workers: int = 0
     """Cells at work at once, each with its recorder, gate and planner; 0: one per core."""
     samples: int = 0
     """Varied replays behind each verdict of the replay afterwards."""
-    rate_hz: float = 5.0
+    rate_hz: Annotated[float, RARE] = 5.0
     """Frames per second of each camera."""
-    image_scale: float = 1.0
+    image_scale: Annotated[float, RARE] = 1.0
     """Resize the images of the cell file."""
 
     def __post_init__(self) -> None:
@@ -149,7 +150,7 @@ class DemoConfig:
     @property
     def samples(self) -> int:
         """Varied replays behind each verdict; toys take seconds for each, and have none."""
-        from bridge.task.find import chosen_task_file  # noqa: PLC0415  # not for --help
+        from bridge.task.find import chosen_task_file  # not for --help
 
         soft = any(chosen_task_file(each).task().soft_objects for each in self.tasks)
         return 0 if self.quick or soft else 8

@@ -132,7 +132,10 @@ def _options(app: App, path: tuple[str, ...]) -> Iterator[tuple[str, list[str], 
             inspect.Parameter.POSITIONAL_ONLY,
             inspect.Parameter.VAR_POSITIONAL,
         )
-        if not names or names[0] in EVERYWHERE or only_by_place or argument.children:
+        is_set_elsewhere = argument.parameter.parse is False
+        if not names or names[0] in EVERYWHERE or only_by_place or is_set_elsewhere:
+            continue
+        if argument.children:
             continue
         keys.append(names[0])
         if argument.show:

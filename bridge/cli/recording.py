@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from bridge.record.config import EpisodeAbout, RecorderConfig
-from bridge.terminal import Output, stop_signals
+from bridge.terminal import RARE, Output, stop_signals
 from bridge.wire.config import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def record(
     *,
     episode: str | None = None,
     duration_s: Annotated[float | None, Parameter(name=("--duration", "--duration-s"))] = None,
-    anyway: bool = False,
-    learn: Path | None = None,
+    anyway: Annotated[bool, RARE] = False,
+    learn: Annotated[Path | None, RARE] = None,
     about: Annotated[EpisodeAbout, Parameter(name="*")] = ABOUT,
     config: Annotated[RecorderConfig, Parameter(name="*")] = RECORDER,
     listen: tuple[str, ...] = LOOPBACK,
@@ -114,7 +114,7 @@ def ctl(
     discard: bool = False,
     anyway: bool = False,
     last: int = 20,
-    recorder: str = "main",
+    recorder: Annotated[str, RARE] = "main",
     connect: tuple[str, ...] = LOOPBACK,
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
     output: Output = OUTPUT,

@@ -14,11 +14,12 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from bridge.episode.assigned import TRIAL_SUFFIX
 from bridge.episode.run_folder import RunFolder, file_names, part_paths
 from bridge.errors import UsageError, refuse_outside
+from bridge.terminal import RARE
 
 UNLABELLED = "nobody labelled it"
 """Why the outcome of a trial is unknown that has no label."""
@@ -165,11 +166,11 @@ class CatalogueQuery:
     """without_replanning or with_replanning."""
     policy: tuple[str, ...] = ()
     """Name of the planner or policy."""
-    operator: tuple[str, ...] = ()
+    operator: Annotated[tuple[str, ...], RARE] = ()
     """Who was there."""
     cell: tuple[str, ...] = ()
     """Name of the cell."""
-    robot: tuple[str, ...] = ()
+    robot: Annotated[tuple[str, ...], RARE] = ()
     """Which robot."""
     outcome: tuple[str, ...] = ()
     """success, failure or unknown."""
@@ -187,7 +188,7 @@ class CatalogueQuery:
     """Only those that cannot be read; --no-error only the others."""
     sort: Order = "name"
     """Order of the list."""
-    reverse: bool = False
+    reverse: Annotated[bool, RARE] = False
     """Largest or latest first."""
     limit: int | None = None
     """At most this many."""

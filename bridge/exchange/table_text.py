@@ -10,9 +10,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from bridge.errors import BridgeError, PathNotFoundError, UsageError
+from bridge.terminal import RARE
 
 YES = ("success", "true", "yes", "y", "1", "pass", "passed", "accepted")
 NO = ("failure", "false", "no", "n", "0", "fail", "failed", "refused", "rejected")
@@ -34,7 +35,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+%?")
 class TableOptions:
     """How tables of results are read."""
 
-    map: str = ""
+    map: Annotated[str, RARE] = ""
     """Which column is which, where the names differ: "outcome=Result,task=Scenario"."""
     axes: str = ""
     """Further columns to compare sim and outcome along, with commas: "Lighting,Start region"."""

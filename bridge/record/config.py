@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from bridge.terminal import RARE
 
 BYTES_PER_MB = 1_000_000
 UNBOUNDED = float("inf")
@@ -17,15 +18,15 @@ MAX_BACKLOG_BYTES = 16_000_000
 class QueueConfig:
     """How much may wait in memory, and what is too much to take."""
 
-    camera_queue_mb: int = 256
+    camera_queue_mb: Annotated[int, RARE] = 256
     """Memory for images not yet written [MB]; they are thinned as it fills, then dropped."""
-    small_queue_mb: int = 16
+    small_queue_mb: Annotated[int, RARE] = 16
     """Memory for everything else [MB]; its own, so that images never evict joints."""
-    max_message_mb: float = 64.0
+    max_message_mb: Annotated[float, RARE] = 64.0
     """Larger messages are dropped and counted [MB]."""
-    max_rate_hz: int = 20_000
+    max_rate_hz: Annotated[int, RARE] = 20_000
     """Messages of one topic beyond this many in a second are dropped and counted [1/s]."""
-    max_topics: int = 4096
+    max_topics: Annotated[int, RARE] = 4096
     """Messages of further topics in one episode are dropped and counted."""
 
     def __post_init__(self) -> None:
@@ -44,17 +45,17 @@ class QueueConfig:
 class DiskConfig:
     """How episodes lie on the disk, and how much of it is left alone."""
 
-    min_free_mb: int = 500
+    min_free_mb: Annotated[int, RARE] = 500
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
-    footer_mb: int = 64
+    footer_mb: Annotated[int, RARE] = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
-    split_mb: int = 0
+    split_mb: Annotated[int, RARE] = 0
     """Begin a new file of the same episode after this much [MB]; 0 never does."""
-    split_s: float = 0.0
+    split_s: Annotated[float, RARE] = 0.0
     """Begin a new file of the same episode after this long [s]; 0 never does."""
-    flush_s: float = 0.25
+    flush_s: Annotated[float, RARE] = 0.25
     """What a crash of the recorder may cost, at most [s]."""
-    sync_s: float = 2.0
+    sync_s: Annotated[float, RARE] = 2.0
     """What a power cut may cost, at most [s]."""
 
     def __post_init__(self) -> None:
@@ -74,11 +75,11 @@ class DiskConfig:
 class RecorderConfig:
     """Settings of one recorder; stored in every episode it writes."""
 
-    recorder: str = "main"
+    recorder: Annotated[str, RARE] = "main"
     """Name of this recorder in its control keys ``rec/NAME/ctl/...``."""
     topics: tuple[str, ...] = ("**",)
     """Zenoh key expressions to record; ``**`` is everything."""
-    shares_folder: bool = False
+    shares_folder: Annotated[bool, RARE] = False
     """Let other recorders that have this option, too, record into the run folder at the same time;
     whoever starts episodes gives each an id of its own."""
     contract: str | None = None
@@ -86,19 +87,19 @@ class RecorderConfig:
     ``cell.toml`` holds, if there is one."""
     color: Literal["jpeg", "as_is"] = "jpeg"
     """Raw colour images: compress as JPEG, or keep every byte."""
-    jpeg_quality: int = 90
+    jpeg_quality: Annotated[int, RARE] = 90
     """Of colour that is compressed here, 1 to 100."""
     depth: Literal["raw", "compact"] = "raw"
     """Raw depth images: keep them (every viewer reads those), or compress without loss (RVL)."""
-    msg_folder: Path | None = None
+    msg_folder: Annotated[Path | None, RARE] = None
     """Where the .msg files of your own ROS 2 types lie, as PACKAGE/msg/NAME.msg at any depth."""
-    preview_hz: float = 5.0
+    preview_hz: Annotated[float, RARE] = 5.0
     """At most this many small pictures a second for whoever watches; 0 makes none [1/s]."""
     preroll_s: float = 0.0
     """Begin each episode this long before its start [s]; 0 begins at the start."""
-    preroll_mb: int = 512
+    preroll_mb: Annotated[int, RARE] = 512
     """Memory for those seconds [MB]; with less, an episode begins later."""
-    command_timeout_s: float = 60.0
+    command_timeout_s: Annotated[float, RARE] = 60.0
     """A start or stop that the disk has not carried out after this long is reported [s]."""
     queues: Annotated[QueueConfig, Parameter(name="*")] = QueueConfig()
     """Memory and limits."""
@@ -120,19 +121,19 @@ class EpisodeAbout:
     """scan, trial, retry, probe or imported."""
     task: str = ""
     """Task: its file (my_task.toml), or a name of the run's tasks/ or of datasets/tasks."""
-    instruction: str = ""
+    instruction: Annotated[str, RARE] = ""
     """What the robot was told, in words."""
     condition: str = ""
     """without_replanning or with_replanning."""
     policy: str = ""
     """Name of the planner or policy."""
-    start_id: str | None = None
+    start_id: Annotated[str | None, RARE] = None
     """Declared start; trials with the same one are compared."""
-    operator: str = ""
+    operator: Annotated[str, RARE] = ""
     """Who is there."""
     robot: str = ""
     """Which robot."""
     cell: str = ""
     """Name of the cell, as in its topics."""
-    tags: tuple[str, ...] = ()
+    tags: Annotated[tuple[str, ...], RARE] = ()
     """Words to find it by."""

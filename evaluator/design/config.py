@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
+from bridge.terminal import RARE
 
 
 @Parameter(name="*")
@@ -21,13 +23,13 @@ class StudyOptions:
     """The first one is tried in --arms, the others in the arm without alone."""
     arms: tuple[str, ...] = ("without", "with")
     """Of the first policy: without, with, control."""
-    coin: float | None = None
+    coin: Annotated[float | None, RARE] = None
     """Arm control: the chance of yes to each plan."""
     rounds: int = 5
     """Plans per trial in the arms with and control."""
     seed: int = 1
     """Draws the laboratory and the starts."""
-    study_seed: int = 0
+    study_seed: Annotated[int, RARE] = 0
     """Draws the order of the starts, of the policies and arms on each, and the codes."""
     blind: bool = False
     """Name arms by codes in the operator's list."""
@@ -44,7 +46,7 @@ class StudyOptions:
 class Wanted:
     """What is expected, and what the study is to show; shares from 0 to 1."""
 
-    past: Path | None = None
+    past: Annotated[Path | None, RARE] = None
     """A run, or its results.json: expected rates and the twin's agreement are taken from there."""
     rate: float | None = None
     """Expected success rate of the arm that is compared with."""
@@ -52,19 +54,19 @@ class Wanted:
     """Expected gain over it, which is to be shown: 0.2 is 20 percentage points."""
     correlation: float = 0.0
     """Expected correlation of both outcomes of a start; 0 asks for more starts than more would."""
-    agreement: float | None = None
+    agreement: Annotated[float | None, RARE] = None
     """Expected share of trials in which twin and outcome agree."""
     width: float | None = None
     """Wanted width of the gain's interval, from end to end."""
-    rate_width: float | None = None
+    rate_width: Annotated[float | None, RARE] = None
     """Wanted width of the interval of each arm's rate in each task."""
-    agrees_above: float | None = None
+    agrees_above: Annotated[float | None, RARE] = None
     """The claim that twin and outcome agree in more than this share of trials."""
     power: float = 0.8
     """Chance with which gain and claim are to be shown."""
     alpha: float = 0.05
     """Chance of a false alarm."""
-    per_task: bool = False
+    per_task: Annotated[bool, RARE] = False
     """Ask for the gain in every task alone; otherwise over all tasks together."""
     starts: int | None = None
     """Starts of each task, whatever would be needed; what they can show is said."""

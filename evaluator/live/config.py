@@ -6,6 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from bridge.terminal import RARE
 from bridge.wire.config import DEFAULT_ENDPOINT
 
 
@@ -17,9 +18,9 @@ class LiveConfig:
     """Follow the session that is being recorded into RUN, until SIGINT: after every trial say
     whether to stop or to continue, and which start and condition to run next. With --goal also
     for each success rate."""
-    recorder: str = "main"
+    recorder: Annotated[str, RARE] = "main"
     """Name of the recorder (--live)."""
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: Annotated[tuple[str, ...], RARE] = (DEFAULT_ENDPOINT,)
     """Where the recorder listens (--live)."""
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
     """zenoh configuration (JSON5), for example with access control (--live)."""

@@ -6,9 +6,10 @@ All of a stamp must be equal before two numbers may be compared.
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from bridge.errors import UsageError
+from bridge.terminal import RARE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,13 +152,13 @@ class ImageOptions:
     """METHOD=FOLDER of renders named as the reference; once for each method to compare."""
     reference: Path | None = None
     """Folder of recorded images; the recorded side of the run's held-out views without it."""
-    masks: Path | None = None
+    masks: Annotated[Path | None, RARE] = None
     """Folder of masks named as the reference, white inside; all is scored under them too."""
-    split: str = UNSTATED
+    split: Annotated[str, RARE] = UNSTATED
     """Which images were held out, for the stamp: "every 8th frame". A run says so itself."""
-    lpips_vgg: Path | None = None
+    lpips_vgg: Annotated[Path | None, RARE] = None
     """State dict of torchvision's VGG16 (safetensors or torch); makes LPIPS with VGG."""
-    lpips_alex: Path | None = None
+    lpips_alex: Annotated[Path | None, RARE] = None
     """State dict of torchvision's AlexNet (safetensors or torch); makes LPIPS with AlexNet."""
 
     @property

@@ -171,17 +171,15 @@ def test_a_missing_settings_file_is_wrong_use(capsys: pytest.CaptureFixture[str]
     assert "settings file not found" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", [command[0] for command in robot_gst.COMMANDS])
+@pytest.mark.parametrize("name", [command.name for command in robot_gst.commands()])
 def test_every_command_has_help_with_an_example(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert robot_gst.run([name, "--help"]) == 0
+    assert robot_gst.run([*name.split(), "--help"]) == 0
     assert "Example" in capsys.readouterr().out
 
 
-TARGETS = [command[1] for command in robot_gst.COMMANDS] + [
-    member[1] for _, members in robot_gst.GROUPS.values() for member in members
-]
+TARGETS = [command.target for command in robot_gst.commands()]
 
 
 def help_sources(kind: type) -> list[str]:

@@ -7,8 +7,7 @@ import pytest
 import robot_gst
 from bridge.gone import GONE
 
-THERE = {name for name, *_ in robot_gst.COMMANDS}
-THERE |= {f"{g} {name}" for g, (_, members) in robot_gst.GROUPS.items() for name, *_ in members}
+THERE = {command.name for command in robot_gst.commands()}
 
 
 @pytest.mark.parametrize("name", sorted(GONE))

@@ -17,7 +17,7 @@ def settings(folder: Path, text: str) -> str:
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        ("replays", "has [replays], but no command has that name. There are: demo, trials"),
+        ("replays", "has [replays], but no command has that name. There are: doctor, record"),
         (
             "publish.stand-in",
             "has [publish.stand-in], but no command has that name. There are:",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from cyclopts import App
+from house_budget import options
 
 import robot_gst
 
@@ -45,3 +46,12 @@ def test_a_documented_command_is_understood(line: str, app: App) -> None:
             del tokens[at : at + 2]
         found, *_ = app.parse_args(tokens, print_error=False, exit_on_error=False)
         assert callable(found)
+
+
+def test_help_shows_at_most_fifteen_options_and_the_page_lists_the_others() -> None:
+    _, _, listed = PAGE.partition("## Settings that help leaves out")
+    for command, keys, shown in options():
+        assert len(shown) <= 15, command
+        rows = [line for line in listed.splitlines() if f"`{command}`" in line]
+        missing = {key for key in keys if key not in shown and f"`{key}`" not in "".join(rows)}
+        assert missing == set(), command

@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.terminal import RARE
 from bridge.wire.config import DEFAULT_ENDPOINT
 from twin.replay.config import ReplayConfig
 from twin.scene.settings import convert_duration
@@ -45,7 +46,9 @@ class GateConfig:
     fraction; 0 leaves the nominal replay alone to decide."""
     frame_wait_s: float = 10.0
     """Wait this long for fresh frames before giving up."""
-    replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
+    replay: Annotated[ReplayConfig, Parameter(name="replay"), RARE] = field(
+        default_factory=ReplayConfig
+    )
     """How each plan is replayed."""
 
     def __post_init__(self) -> None:

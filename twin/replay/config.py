@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.terminal import RARE
 from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, require_engine
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
@@ -139,9 +140,9 @@ class ReplayConfig:
     mode: Annotated[Mode, Parameter(parse=False)] = "dynamic"
     """kinematic follows the joints exactly; dynamic lets physics answer. No flag: the commands
     choose it for each trajectory."""
-    engine: Annotated[Literal["pybullet", "mujoco", "both"], Parameter(name="--engine")] = (
-        "pybullet"
-    )
+    engine: Annotated[
+        Literal["pybullet", "mujoco", "both"], Parameter(name="--engine", show=True)
+    ] = "pybullet"
     """What moves rigid bodies: pybullet, mujoco, or both, of which pybullet decides and mujoco is
     reported where it says something else. Soft bodies are pybullet's alone."""
     eps_col_m: float = 0.002
@@ -229,7 +230,9 @@ class ReplayRunConfig:
     robot: str = ""
     """Robot file, by name or path, whose description takes the place of the recorded one; none:
     the robot that each episode was recorded with (docs/robots.md)."""
-    replay: Annotated[ReplayConfig, Parameter(name="replay")] = field(default_factory=ReplayConfig)
+    replay: Annotated[ReplayConfig, Parameter(name="replay"), RARE] = field(
+        default_factory=ReplayConfig
+    )
     """How each trajectory is replayed."""
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
+from bridge.terminal import RARE
 
 _DURATION = re.compile(r"^\s*(\d+(?:\.\d+)?)\s*(s|sec|min|m|h)?\s*$")
 _SECONDS = {None: 1.0, "s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
@@ -56,25 +57,25 @@ class FrameConfig:
 
     max_train_frames: int = 100
     """Frames to fit, shared evenly by episodes and cameras."""
-    train_every: int = 0
+    train_every: Annotated[int, RARE] = 0
     """Learn from every this many frames, whatever they show: a fixed protocol. 0: from the
     sharpest and stillest frame of each stretch of the camera's path."""
     holdout_every: int = 8
     """Every this many frames of a camera, one is kept out of everything: initialisation, poses,
     exposure, fit, objects."""
-    holdout_offset: int | None = None
+    holdout_offset: Annotated[int | None, RARE] = None
     """Which of them, counted from 0; the one in the middle if not given."""
-    max_holdout_frames: int = 24
+    max_holdout_frames: Annotated[int, RARE] = 24
     """Held-out frames to render, spread evenly."""
     max_depth_m: float = 5.0
     """Depth beyond is not trusted."""
     poses: Literal["auto", "tf", "odometry"] = "auto"
     """Where cameras are. tf: /tf; odometry: from the images themselves; auto: what calibrate found,
     else /tf, else odometry."""
-    check_poses: bool = True
+    check_poses: Annotated[bool, RARE] = True
     """Refuse poses that fit the depth only when read in another convention, and cameras that move
     while their poses stand still."""
-    correct_geometry: bool = False
+    correct_geometry: Annotated[bool, RARE] = False
     """Where one number makes the depth of a moving camera agree clearly better (a factor of its
     depth, its focal length, or how late its poses are), use that number instead of the recorded
     one. Without this it is said, and refused where the difference is large."""
@@ -106,19 +107,19 @@ class InitialiseConfig:
 
     max_splats: int = 60_000
     """Budget of the whole fit."""
-    growth: float = 0.5
+    growth: Annotated[float, RARE] = 0.5
     """Share of the budget left to the fit, which splits Gaussians where the error is large;
     voxels grow until the first Gaussians fit in the others."""
-    footprint_factor: float = 1.6
+    footprint_factor: Annotated[float, RARE] = 1.6
     """Voxel size in pixel footprints z/f."""
-    flatness: float = 0.1
+    flatness: Annotated[float, RARE] = 0.1
     """Standard deviation along the normal, as a fraction of the one in the plane."""
-    opacity: float = 0.95
+    opacity: Annotated[float, RARE] = 0.95
     """Opacity of a new Gaussian."""
-    completion: float = 0.1
+    completion: Annotated[float, RARE] = 0.1
     """Share of ``max_splats`` that may be added for what was seen in colour but never measured;
     0: such holes stay black."""
-    flying_fraction: float = 0.03
+    flying_fraction: Annotated[float, RARE] = 0.03
     """A pixel whose depth differs from a neighbour's by more than this share is dropped."""
 
     def __post_init__(self) -> None:
@@ -153,24 +154,24 @@ class FitConfig:
     come on top; scene.json says how long each took."""
     iterations: int = 0
     """Fit exactly this many images: the result is then reproducible, on slow machines too."""
-    loss: Literal["3dgs", "paper"] = "3dgs"
+    loss: Annotated[Literal["3dgs", "paper"], RARE] = "3dgs"
     """3dgs: 0.8 L1 + 0.2 (1 - SSIM); paper: squared error (Eq. 3). Both with depth L1."""
-    depth_weight: float = 0.5
+    depth_weight: Annotated[float, RARE] = 0.5
     """Weight of the L1 depth term (the paper's lambda_d), relative to depth."""
-    slab: float = 0.5
+    slab: Annotated[float, RARE] = 0.5
     """How far a Gaussian may leave the surface that depth fused, along its normal and in units of
     its own size; 0: as far as it likes."""
-    coarse_fraction: float = 0.6
+    coarse_fraction: Annotated[float, RARE] = 0.6
     """Share of the budget spent at half resolution."""
-    appearance_steps: int = 4
+    appearance_steps: Annotated[int, RARE] = 4
     """Conjugate gradient steps whenever the colours are solved in closed form; 0: never. More
     than six follow the noise."""
-    harmonics: Literal[0, 1] = 1
+    harmonics: Annotated[Literal[0, 1], RARE] = 1
     """Degree of the spherical harmonics of colour; 0: one colour from everywhere."""
-    exposure: Literal["gain", "none"] = "gain"
+    exposure: Annotated[Literal["gain", "none"], RARE] = "gain"
     """What is solved for each frame. gain: a brightness per channel (exposure, white balance), on
     average none."""
-    densify: bool = True
+    densify: Annotated[bool, RARE] = True
     """Split Gaussians where the error is large, drop those that show nothing."""
     seed: int = 0
     """Order of the frames, and nothing else: the rest leaves nothing to chance."""
@@ -216,13 +217,13 @@ class ModelConfig:
     """What the segmenter looks for, once for each; default: the names of the task's objects."""
     features: str = ""
     """Put features of dinov3:FOLDER on the Gaussians."""
-    feature_channels: int = 16
+    feature_channels: Annotated[int, RARE] = 16
     """Principal components that are kept of each feature."""
-    feature_stride: int | None = None
+    feature_stride: Annotated[int | None, RARE] = None
     """Image pixels per feature; default: the model's own, 16. Less costs more."""
     clip: str = ""
     """Folder of CLIP: things are found by meaning, not by the words of the lexicon."""
-    model_frames: int = 12
+    model_frames: Annotated[int, RARE] = 12
     """Training frames the models look at, spread evenly."""
     device: str = "auto"
     """Where they run: cpu, cuda, cuda:1; auto takes a GPU if there is one."""

@@ -1,10 +1,12 @@
 """What a session does; imports nothing heavy, so that the command can show its options."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from bridge.episode.metadata import CONDITION_OF, WITH, WITHOUT
 from bridge.errors import UsageError, refuse_outside
 from bridge.task.protocol import SEEDS_PER_SESSION
+from bridge.terminal import RARE
 
 CONDITIONS = (WITHOUT, WITH)
 BUILT_IN, WIRE = "built_in", "wire"
@@ -28,61 +30,61 @@ class SessionConfig:
     """Draws the hidden laboratory and the starts; same seed, same session."""
     scan: bool = True
     """Record a scan first."""
-    scan_id: str = ""
+    scan_id: Annotated[str, RARE] = ""
     """Name of the scan's episode; empty: scan_ and the run's next number."""
     trials: int = 3
     """Starts to try, each once per condition; 0 records the scan only."""
-    first_start: int = 0
+    first_start: Annotated[int, RARE] = 0
     """Leave out so many starts of the session: one that is tried alone is the same start."""
     conditions: tuple[str, ...] = CONDITIONS
     """without_replanning, with_replanning or both."""
     first_trial: int | None = None
     """Number of the first trial's episode; without it the run's numbering goes on."""
-    missing: bool = False
+    missing: Annotated[bool, RARE] = False
     """Record only the trials of which the recorder has none yet with the same task, start,
     condition and policy: completes a session that was interrupted."""
     probes: int = 0
     """Rounds of probe episodes after the trials, for calibrate RUN --physics: each round pushes,
     slides, squeezes and drops the first object."""
-    first_probe: int | None = None
+    first_probe: Annotated[int | None, RARE] = None
     """Number of the first probe's episode; without it the run's numbering goes on."""
     planner: str = BUILT_IN
     """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan
     (robot-gst plan RUN --live)."""
     policy: str = ""
     """How it plans; empty: perturbed for the built-in planner, nominal for one on the wire."""
-    planner_timeout_s: float = 600.0
+    planner_timeout_s: Annotated[float, RARE] = 600.0
     """Last resort on the wall clock against a planner that hangs."""
-    study_arms: tuple[str, ...] = ()
+    study_arms: Annotated[tuple[str, ...], RARE] = ()
     """A study instead of the conditions: without, with, control. Each start once per arm, in an
     order of its own; the gate is asked in every arm and obeyed in one, and what is not executed is
     a failure."""
-    study_seed: int = 0
+    study_seed: Annotated[int, RARE] = 0
     """Draws the order of the arms and the coins."""
-    coin: float | None = None
+    coin: Annotated[float | None, RARE] = None
     """In the arm control, the chance of yes to each plan: the gate's share of yes on development
     seeds."""
     rounds: int = 5
     """Plans the gate may see per trial."""
-    retry: bool = False
+    retry: Annotated[bool, RARE] = False
     """After an execution that failed, put the objects back, look and plan anew: one new start of
     the same trial, in an episode of its own (retry_...), which counts in no rate of trials."""
-    gate_cell: str = ""
+    gate_cell: Annotated[str, RARE] = ""
     """Cell name the gate was started with; empty: the same."""
-    gate_timeout_s: float = 600.0
+    gate_timeout_s: Annotated[float, RARE] = 600.0
     """The cell's clock stands still while the gate judges, so a slow machine changes nothing. This
     limit on the wall clock is the last resort against a gate that hangs: the trial is then void,
     and says so."""
-    ask_always: bool = False
+    ask_always: Annotated[bool, RARE] = False
     """Ask the gate without replanning too; its verdict is recorded and not obeyed, so that the
     gate's refusals meet an outcome as well."""
-    execute_unverified: bool = False
+    execute_unverified: Annotated[bool, RARE] = False
     """With replanning, execute also when no verdict comes; the record says so."""
-    recorder: str = "main"
+    recorder: Annotated[str, RARE] = "main"
     """Name of the recorder to start and stop."""
     rate_hz: float = 5.0
     """Frames per second of each camera during trials."""
-    image_scale: float = 1.0
+    image_scale: Annotated[float, RARE] = 1.0
     """Resize the images of the cell file (320 x 240)."""
     real_time: bool = False
     """Keep pace with the wall clock instead of running as fast as possible."""
