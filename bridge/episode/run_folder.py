@@ -82,15 +82,6 @@ def part_paths(path: Path) -> list[Path]:
     return [path, *(later for number, later in _later_parts(path) if number > index)]
 
 
-def first_part(path: Path) -> Path:
-    """Return the file that the episode of this one begins with; the file itself if unsplit."""
-    episode_id, index = _part_of(path.name)
-    if index == 1:
-        return path
-    first = path.with_name(part_name(episode_id, 1))
-    return first if first.is_file() else min([(index, path), *_later_parts(path)])[1]
-
-
 @dataclass(frozen=True)
 class RunFolder:
     """``episodes/``, ``tasks/``, ``scene/``, ``plans/``, ``derived/``, ``results/``, ``notes/``."""

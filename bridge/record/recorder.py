@@ -16,7 +16,7 @@ from pathlib import Path
 
 from bridge.clock import StepWatch
 from bridge.episode import metadata
-from bridge.episode.catalogue import label_episode, list_episodes, note_finished
+from bridge.episode.catalogue import label_episode, read_entry
 from bridge.episode.contract import find_contract
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
@@ -251,13 +251,8 @@ class Recorder:
 
         answer = self._command(act)
         if not discard:
-            self._enter(answer["episode"])
+            self._tell(self._run.episodes_dir / part_name(answer["episode"], 1))
         return answer
-
-    def _enter(self, episode_id: str) -> None:
-        path = self._run.episodes_dir / part_name(episode_id, 1)
-        note_finished(self._run, path)
-        self._tell(path)
 
     def _say(self, text: str) -> None:
         self.news.append(text)
@@ -288,7 +283,7 @@ class Recorder:
         task = self._task_of(info) if task is None else task
         info = described_by(info, task)
         answer = self._command(lambda command: self._life.snapshot(info, command, task))
-        self._enter(info.id)
+        self._tell(self._run.episodes_dir / part_name(info.id, 1))
         return {**answer, **self._keep(task)}
 
     def label(
@@ -330,10 +325,10 @@ class Recorder:
         return {"ok": True, "episode": name, "note": str(note)}
 
     def episodes(self, last: int) -> Answer:
-        """The last episodes of the run folder, by name, as the catalogue knows them."""
-        entries = list_episodes(self._run)
-        episodes = [asdict(entry) for entry in entries[-last:]]
-        return {"ok": True, "of": len(entries), "episodes": episodes}
+        """The last episodes of the run folder, by name."""
+        paths = self._run.episodes()
+        episodes = [asdict(read_entry(self._run, path)) for path in paths[-last:]]
+        return {"ok": True, "of": len(paths), "episodes": episodes}
 
     def declare_latched(self, topic: str) -> None:
         """Begin later episodes with the last message of a topic; its publisher says so."""
