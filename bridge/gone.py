@@ -39,6 +39,9 @@ GONE: dict[str, str] = {
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
+    "recover --in-place": (
+        "Free some space, or move the file to another disk: a copy is made beside it."
+    ),
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
         "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."

@@ -244,7 +244,7 @@ def doctor(*, output: Output = OUTPUT) -> int:
     return 0 if all(item.ok for item in findings) else 1
 
 
-def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
+def recover(paths: list[Path], /, *, output: Output = OUTPUT) -> int:
     """Repair files whose writer was killed, and report what was lost.
 
     Exit code 0: repaired, 1: nothing could be read in one of them.
@@ -252,7 +252,6 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
 
     Args:
         paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
-        in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
     from bridge.episode import recover as recovery
@@ -267,7 +266,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     reports = []
     for path in files:
         try:
-            reports.append(recovery.recover(path, in_place=True if in_place else None))
+            reports.append(recovery.recover(path))
         except GstError as error:
             if len(files) == 1:
                 raise

@@ -316,16 +316,6 @@ class DataSection:
         for place in places:
             self.book(*place)
 
-    def add_indexes(self, chunk: EncodedChunk, start: int) -> None:
-        """Write the message indexes of a chunk that lies at ``start``, at the end of the file.
-
-        Args:
-            start: Where the chunk begins [bytes from the start of the file].
-        """
-        indexes, offsets = index_records(chunk.index, self.file.offset)
-        self.file.append([indexes])
-        self.book(chunk, start, offsets, len(indexes))
-
     def book(
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:

@@ -79,15 +79,6 @@ class PartFile:
                 rest = rest[written:]
         return offset
 
-    def overwrite(self, offset: int, data: bytes) -> None:
-        """Replace a few bytes inside the file; ``crc`` is the caller's to set anew.
-
-        Args:
-            offset: Where the first byte goes [bytes from the start of the file].
-            data: What replaces as many bytes; it must end inside the file.
-        """
-        os.pwrite(self._descriptor, data, offset)
-
     def sync_data(self) -> None:
         """Force what was written to the disk; safe from another thread.
 
