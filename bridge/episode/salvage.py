@@ -6,7 +6,6 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from mcap.records import Channel, Metadata, Schema
@@ -62,7 +61,7 @@ def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterato
     for found in scan(journal):
         if isinstance(found, Chunk) and key_of(found) not in there:
             there.add(key_of(found))
-            yield replace(found, is_journalled=True)
+            yield found
 
 
 _RECORDS: dict[str, type] = {"episode": EpisodeInfo, "outcome": Outcome, "derived": Derived}
@@ -267,7 +266,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
     buffers: list[Buffer] = [found.raw]
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
-        buffers = [front, found.raw[len(front) :]]
+        buffers = [front, memoryview(found.raw)[len(front) :]]
     crc = 0
     for buffer in buffers:
         crc = crc32(buffer, crc)

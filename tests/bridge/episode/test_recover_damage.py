@@ -13,8 +13,8 @@ from mcap_samples import read_all, some_messages, write_official, write_ours
 
 from bridge.episode import schema
 from bridge.episode.check import check_episode
-from bridge.episode.mcap.damaged import MAX_CHUNK_BYTES
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+from bridge.episode.mcap.walk import MAX_CHUNK_BYTES
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.recover import recover
 from bridge.episode.writer import EpisodeWriter, WriterConfig
