@@ -39,6 +39,10 @@ GONE: dict[str, str] = {
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
+    **dict.fromkeys(
+        ("publish episode --loop", "publish episode --paused", "publish episode --name"),
+        "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
+    ),
     "recover --in-place": (
         "Free some space, or move the file to another disk: a copy is made beside it."
     ),

@@ -18,7 +18,6 @@ from bridge.episode.cdr.messages import (
     JointSample,
     PoseSample,
     VideoFrame,
-    foxglove_stamp_ns,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -131,7 +130,6 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
     schema.COMPRESSED_IMAGE: _color,
     schema.COMPRESSED_VIDEO: VideoFrame.from_protobuf,
-    schema.RAW_AUDIO: lambda data: foxglove_stamp_ns(schema.RAW_AUDIO, data),
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,

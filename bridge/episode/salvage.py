@@ -75,7 +75,7 @@ def is_readable(name: str, values: dict[str, str]) -> bool:
         return True
     try:
         build(_RECORDS[name], from_strings(values))
-    except TypeError:
+    except ValueError:
         return False
     return True
 

@@ -8,13 +8,13 @@ import json
 import struct
 from collections.abc import Callable
 from enum import StrEnum
-from functools import lru_cache, partial
+from functools import lru_cache
 
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
-from bridge.episode.cdr.messages import VideoFrame, foxglove_stamp_ns
+from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -72,27 +72,27 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Messag
     if known.message_encoding == "json":
         version = schema.json_schema_version(type_name)
         return lambda data: _inspect_json(version, data)
-    return lambda data: _inspect_protobuf(type_name, data)
+    return _inspect_video
 
 
 def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] | None:
     """Return what reads the time in a message itself, or None for types without one.
 
     For messages that came without an attachment: ``header.stamp`` of a ROS 2 type, the timestamp
-    of Foxglove's video and audio.
+    of Foxglove's video.
     """
     if record is None:
         return None
-    if record.name in schema.PROTOBUF_MEMBERS and record.message_encoding == "protobuf":
-        return partial(_protobuf_stamp_ns, record.name)
+    if record.name == schema.COMPRESSED_VIDEO and record.message_encoding == "protobuf":
+        return _video_stamp_ns
     if record.schema_encoding == "ros2msg" and codec.begins_with_header(record.data):
         return _header_stamp_ns
     return None
 
 
-def _protobuf_stamp_ns(type_name: str, data: bytes) -> int | None:
+def _video_stamp_ns(data: bytes) -> int | None:
     try:
-        return foxglove_stamp_ns(type_name, data) or None
+        return VideoFrame.from_protobuf(data).stamp_ns or None
     except codec.MalformedMessageError:
         return None
 
@@ -103,12 +103,9 @@ def _header_stamp_ns(data: bytes) -> int | None:
     return None if stamp is None else join_ns(*stamp) or None
 
 
-def _inspect_protobuf(type_name: str, data: bytes) -> MessageState:
+def _inspect_video(data: bytes) -> MessageState:
     try:
-        if type_name == schema.COMPRESSED_VIDEO:
-            VideoFrame.from_protobuf(data)
-        else:
-            foxglove_stamp_ns(type_name, data)
+        VideoFrame.from_protobuf(data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     return GOOD

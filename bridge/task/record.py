@@ -5,7 +5,9 @@ import math
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
 
 from bridge.errors import InvalidRecordError
 
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     import jsonschema_rs
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
+
+
+Record = TypeVar("Record")
 
 
 @cache
@@ -82,6 +87,14 @@ def find_problems(
         return []
     errors = _validator(package, path).iter_errors(record)
     return sorted(errors, key=lambda error: [str(part) for part in error.absolute_path])
+
+
+def made_of(kind: type[Record], record: Mapping[str, Any], *, name: str) -> Record:
+    """Make a dataclass of parsed JSON; fields of later versions are left out."""
+    try:
+        return msgspec.convert(record, kind)
+    except msgspec.ValidationError as error:
+        raise InvalidRecordError(name=name, where="", found=str(error)[:300]) from error
 
 
 def _refuse(text: str) -> float:

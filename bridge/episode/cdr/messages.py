@@ -48,7 +48,8 @@ class VideoFrame:
             for number, value in protobuf.fields(memoryview(data)):
                 if 1 <= number <= 4:
                     if isinstance(value, int):
-                        raise ValueError(_not_bytes(number))
+                        message = f"field {number} is a number"
+                        raise ValueError(message)
                     found[number] = bytes(value)
             return VideoFrame(
                 stamp_ns=_stamp(found.get(1, b"")),
@@ -60,37 +61,6 @@ class VideoFrame:
             raise MalformedMessageError(
                 type_name=schema.COMPRESSED_VIDEO, found=str(error)
             ) from error
-
-
-def foxglove_stamp_ns(type_name: str, data: bytes) -> int:
-    """Walk through a message of one of our protobuf types and return its time [ns].
-
-    Raises:
-        MalformedMessageError: The bytes are no such message.
-    """
-    kinds = {number: kind for _, number, kind, _ in schema.PROTOBUF_MEMBERS[type_name]}
-    stamp_ns = 0
-    try:
-        for number, value in protobuf.fields(memoryview(data)):
-            if number not in kinds:
-                continue
-            if isinstance(value, int):
-                raise ValueError(_not_bytes(number))
-            if kinds[number] == protobuf.FIXED32_TYPE and len(value) != FIXED32_BYTES:
-                message = f"field {number} has {len(value)} bytes, not {FIXED32_BYTES}"
-                raise ValueError(message)
-            if number == 1:
-                stamp_ns = _stamp(bytes(value))
-    except ValueError as error:
-        raise MalformedMessageError(type_name=type_name, found=str(error)) from error
-    return stamp_ns
-
-
-FIXED32_BYTES = 4
-
-
-def _not_bytes(number: int) -> str:
-    return f"field {number} is a number"
 
 
 def _stamp(data: bytes) -> int:

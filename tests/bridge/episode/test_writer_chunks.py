@@ -253,9 +253,7 @@ def write_plain(writer: EpisodeWriter, item: Stored) -> None:
     )
 
 
-def test_what_a_full_disk_holds_can_be_recovered_elsewhere(
-    full_disk: Path, tmp_path: Path
-) -> None:
+def test_what_a_full_disk_holds_can_be_recovered_elsewhere(full_disk: Path, tmp_path: Path) -> None:
     writer = EpisodeWriter(full_disk / "e.mcap", config=WriterConfig(chunk_bytes=20_000))
     items = [Stored("/t", index, index, index, os.urandom(800)) for index in range(1000)]
     count = len(write_until_refused(writer, items))
