@@ -51,7 +51,7 @@ class Verdict:
     seed: int
     scene_hash: str | None = None
     calibration_id: str | None = None
-    p_success: dict[str, float] | None = None
+    p_success: dict[str, int | float] | None = None
     reason: str | None = None
     warnings: tuple[str, ...] = ()
     """What does not change the verdict but a reader should know: the goal held before anything
