@@ -36,6 +36,10 @@ GONE: dict[str, str] = {
         "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."
     ),
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
+    **dict.fromkeys(
+        ("record --split-mb", "record --split-s"),
+        "Stop and start another episode; episodes of several parts are read as before.",
+    ),
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),

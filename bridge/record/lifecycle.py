@@ -236,7 +236,7 @@ class Lifecycle:
             return
 
     def tick(self, now_ns: int) -> None:
-        """Do what time asks for: flush, close seconds, split. Raises OSError for the disk."""
+        """Do what time asks for: flush, close seconds. Raises OSError for the disk."""
         self.ring.trim(now_ns)
         if self.take is not None:
             self.take.tick(now_ns, self._health())
@@ -491,7 +491,6 @@ def counts(take: EpisodeRecording) -> Answer:
         "undecodable": total.undecodable,
         "unknown_type": total.unknown_type,
         "shed": total.shed,
-        "parts": take.num_parts,
         "unnumbered": take.ledger.unnumbered(),
         "breaches": breaches_of(take.presence),
         "unknown_tails": unknown_tails(take.presence),
