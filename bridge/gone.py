@@ -93,11 +93,7 @@ GONE: dict[str, str] = {
 
 
 def refuse_gone(tokens: Sequence[str]) -> None:
-    """Answer a command or a flag that went.
-
-    Raises:
-        UsageError: Naming it, with what to use instead.
-    """
+    """Answer a command or a flag that went."""
     words = [token.partition("=")[0] for token in tokens]
     for command in (" ".join(words[:2]), words[0] if words else ""):
         for name in (command, *(f"{command} {word}" for word in words if word.startswith("--"))):

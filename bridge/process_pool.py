@@ -133,9 +133,6 @@ class Worker:
 
         Args:
             quiet: Drop what it prints as errors; what it prints otherwise is always dropped.
-
-        Raises:
-            OSError: When the system gives no further process.
         """
         places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
         self.process = subprocess.Popen(
@@ -168,10 +165,6 @@ class Worker:
 
         Args:
             timeout_s: For handing it over; ``PATIENCE_S`` for each part of it without a number.
-
-        Raises:
-            WorkerDiedError: When it is gone already.
-            TimeIsUpError: When it has not taken the piece in time; it was ended.
         """
         assert self.process.stdin is not None  # noqa: S101  # for the type checker
         left = memoryview(_packed((function, item)))
@@ -192,13 +185,7 @@ class Worker:
         self._num_begun += 1
 
     def finish(self, timeout_s: float | None = None) -> Answer | Failed:
-        """Wait for the next answer.
-
-        Raises:
-            WorkerDiedError: When the process ended before it answered.
-            TimeIsUpError: When it has not begun to answer yet; it goes on working. One that
-                stopped in the middle of its answer was ended.
-        """
+        """Wait for the next answer."""
         try:
             if not wait([self.outlet], timeout_s):
                 raise TimeIsUpError(f"no answer within {timeout_s:g} s")
@@ -381,9 +368,6 @@ class ProcessPool:
         """See ``Runner``; an item whose process died is tried once more after all others.
 
         The longest go first, so that no process is left with a long one at the end (Graham 1969).
-
-        Raises:
-            NoProcessError: When the system gives none at all; with fewer than asked for it goes on.
         """
         todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
         at_work: dict[Worker, tuple[Item, int]] = {}

@@ -35,9 +35,6 @@ def write_parquet(entries: Sequence[Entry], path: Path) -> None:
 
     Args:
         path: The file to write; an older one is replaced.
-
-    Raises:
-        MissingDependencyError: Without pa.
     """
     try:
         import pyarrow as pa  # noqa: PLC0415  # only for this export
@@ -125,10 +122,6 @@ def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
 
     Args:
         outcome: The label, in place of any that was there.
-
-    Raises:
-        PathNotFoundError: When there is no such episode; lists those that are there.
-        InvalidRecordError: When the outcome does not fit its schema.
     """
     path = sidecar_path(run, episode_id)
     _finished(run, episode_id)
@@ -220,12 +213,7 @@ RUNS_DEEP = 3
 
 
 def find_runs(folder: Path) -> list[RunFolder]:
-    """Return a run, or all runs of a folder of runs, by name.
-
-    Raises:
-        PathNotFoundError: When there is no such folder.
-        UsageError: When there is none in it.
-    """
+    """Return a run, or all runs of a folder of runs, by name."""
     run = RunFolder.open(folder)
     if run.episodes_dir.is_dir():
         return [run]
@@ -272,11 +260,7 @@ def assign_trial(
 
 
 def task_of_run(run: RunFolder, task: str) -> str:
-    """Return the name of a task, given by its name or its file, which the run then keeps.
-
-    Raises:
-        UsageError: When there is none of that name.
-    """
+    """Return the name of a task, given by its name or its file, which the run then keeps."""
     file = chosen_task_file(task, tasks_dir=run.tasks_dir)
     name = file.task().name
     if task.endswith(".toml"):
@@ -285,11 +269,7 @@ def task_of_run(run: RunFolder, task: str) -> str:
 
 
 def refuse_without_task(run: RunFolder, episode_id: str) -> None:
-    """Refuse to label what nobody would count: an imported episode of no task.
-
-    Raises:
-        UsageError: Saying how to make it a trial.
-    """
+    """Refuse to label what nobody would count: an imported episode of no task."""
     if Episode.open(_finished(run, episode_id)).info.kind == "imported":
         raise UsageError(
             f"{episode_id} was imported and is no trial yet: say of which task, --task NAME."

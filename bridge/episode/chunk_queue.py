@@ -123,9 +123,6 @@ class ChunkQueue:
 
         Args:
             limit: No more may wait with it, unless it is the only one.
-
-        Raises:
-            OSError: When the disk refuses; what waits is kept.
         """
         if not self._waiting() or self._waiting() + num_bytes <= limit:
             return

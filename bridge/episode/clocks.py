@@ -462,9 +462,6 @@ def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
 
     Args:
         clock: ``corrected`` takes the sources' offset and drift out of all stamps.
-
-    Raises:
-        EpisodeError: When nobody measured the clocks, or the file cannot be read.
     """
     episode = Episode.open(path)
     if clock == "recorded":

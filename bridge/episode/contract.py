@@ -79,12 +79,7 @@ class Contract:
 
 
 def read_contract(path: Path) -> Contract:
-    """Read a contract.
-
-    Raises:
-        ContractError: When it is no TOML, or holds what a contract cannot hold: names the key, what
-            is allowed there and what was probably meant.
-    """
+    """Read a contract."""
     try:
         values = tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
@@ -102,7 +97,6 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
         name: A TOML file, or a template by name.
 
     Raises:
-        ContractError: When it cannot be used.
         UsageError: When there is no such template; lists those that are there.
     """
     if name is not None:
@@ -112,11 +106,7 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
 
 def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
-    """Build a contract from parsed values.
-
-    Raises:
-        ContractError: When something in it is not what a contract holds.
-    """
+    """Build a contract from parsed values."""
     _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
     version, topics = values.get("schema_version"), values.get("topics")
     if version != SCHEMA_VERSION:
@@ -172,9 +162,6 @@ def write_contract(contract: Contract, path: Path, *, source: str) -> None:
 
     Args:
         source: What it was learned from; goes into its first line.
-
-    Raises:
-        ContractError: When there is one already.
     """
     if path.exists():
         raise ContractError(f"{path} exists already. Move it away, or edit it.")

@@ -46,12 +46,6 @@ def recover(path: Path) -> RecoveryReport:
     ``<id>.mcap.part`` becomes ``<id>.mcap``, or ``<id>_recovered.mcap`` where that name is taken.
     Another broken file stays as it is, and ``<name>_recovered.mcap`` is made of it. A finished
     file is only renamed, if that.
-
-    Raises:
-        PathNotFoundError: When there is no such file.
-        StillWrittenError: While its writer lives.
-        RecoveryError: When the disk has no room, or the copy could not be proved.
-        OSError: When the disk fails.
     """
     if not path.is_file():
         hint = "robot-gst recover takes files, or folders to search for *.mcap.part."

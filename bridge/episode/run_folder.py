@@ -90,12 +90,7 @@ class RunFolder:
 
     @staticmethod
     def open(path: Path) -> "RunFolder":
-        """Open an existing run folder.
-
-        Raises:
-            UsageError: When there is a file.
-            PathNotFoundError: When there is nothing.
-        """
+        """Open an existing run folder."""
         if path.is_file():
             message = f"{path} is a file, not a run. Give the folder that its episodes/ lies in."
             raise UsageError(message)
@@ -169,11 +164,7 @@ class RunFolder:
         return [folder / name for folder in folders for name in file_names(folder, SUFFIX + PART)]
 
     def refuse_empty(self) -> None:
-        """Raise where there is nothing to work on.
-
-        Raises:
-            UsageError: When the folder holds no episode.
-        """
+        """Raise where there is nothing to work on."""
         if not file_names(self.episodes_dir):
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)

@@ -159,10 +159,6 @@ def image_messages(
     Args:
         start_ns: First log time wanted [ns since 1970]; None: from the start.
         end_ns: Log time to stop before [ns since 1970]; None: to the end.
-
-    Raises:
-        EpisodeError: When the file or a frame is damaged.
-        MissingDependencyError: When there is a video and PyAV is not installed.
     """
     decoders: dict[tuple[str, str], VideoDecoder] = {}
     waiting: dict[int, RawMessage] = {}
@@ -407,10 +403,6 @@ def task_file(episode: Episode, name: str = "") -> TaskFile:
     Args:
         episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
         name: Of the task, where the episode itself names none.
-
-    Raises:
-        MissingTaskError: Saying where it looked.
-        EpisodeError: When the attachment is damaged.
     """
     info = episode.info
     attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)

@@ -221,7 +221,6 @@ class EpisodeWriter:
 
         Raises:
             UsageError: When the episode exists, or is being written, or waits to be recovered.
-            BridgeError: When the folder cannot be written.
         """
         self.path = path
         self.part_path = path.with_name(path.name + ".part")
@@ -481,11 +480,7 @@ class EpisodeWriter:
                 self._flush(group)
 
     def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it, and say whether that was needed.
-
-        Raises:
-            OSError: When it cannot be written there.
-        """
+        """Write the file anew where somebody removed it, and say whether that was needed."""
         if self._file.is_there():
             return False
         self.wait_for_disk()

@@ -21,9 +21,6 @@ def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
 
     Args:
         number: The message's place among those read, from 1.
-
-    Raises:
-        EpisodeError: In place of the ``BridgeError`` that came out.
     """
     try:
         yield
@@ -49,7 +46,6 @@ def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
 
     Raises:
         UsageError: When something is there that may not be replaced.
-        BridgeError: When the place cannot be written.
     """
     if out.is_symlink() or out.exists():
         _refuse_strangers(out, force=force)

@@ -70,7 +70,6 @@ def export_bag(
 
     Raises:
         UsageError: When nothing can go into a bag, or ``out`` is in the way.
-        EpisodeError: When the episode is damaged.
     """
     report = ExportReport()
     channels = {

@@ -121,11 +121,7 @@ class SourceRow:
         return number
 
     def figure(self, name: str) -> str:
-        """Return the text of a number with a point, where a decimal comma can only mean that.
-
-        Raises:
-            TableError: For ``1,234``, which is 1.234 to one reader and 1234 to another.
-        """
+        """Return the text of a number with a point, where a decimal comma can only mean that."""
         text = self.text(name)
         if _DECIMAL_COMMA.fullmatch(text):
             digits = text.removesuffix("%").partition(",")[2]
@@ -179,11 +175,7 @@ class TableText:
     """By axis: the column that holds its value."""
 
     def lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the rows below the header with their numbers; blank ones are left out.
-
-        Raises:
-            TableError: When a row has more or fewer fields than the header, or is no text.
-        """
+        """Yield the rows below the header with their numbers; blank ones are left out."""
         width = len(self.header)
         for number, cells in numbered_lines(self.path, self.delimiter):
             if number <= self.header_row:
@@ -232,10 +224,6 @@ def open_table(
     Args:
         path: The file, in UTF-8.
         near: Refuse a column whose name is almost one of ours.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it is no text, or a column is there twice, or almost named like ours.
     """
     if not path.is_file():
         hint = "Give a run folder, or a CSV file."
@@ -313,9 +301,6 @@ def numbered_lines(path: Path, delimiter: str = ",") -> Iterator[tuple[int, list
 
     Args:
         path: The file, in UTF-8.
-
-    Raises:
-        TableError: When it is no text.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -360,9 +345,6 @@ def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> 
 
     Args:
         required: Columns that must be there.
-
-    Raises:
-        TableError: Naming the columns.
     """
     if not table.header:
         hint = f"Columns: {', '.join(known)}"
@@ -387,20 +369,12 @@ def read_rows(
     Args:
         path: The file, in UTF-8.
         required: Columns that must be there.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it is no text, a column is missing or doubled, or a row is ragged.
     """
     return rows_of(require(open_table(path, known, options), required, known))
 
 
 def rows_of(table: TableText) -> list[SourceRow]:
-    """Read all rows of a table.
-
-    Raises:
-        TableError: When there is none, or one is ragged.
-    """
+    """Read all rows of a table."""
     rows = [table.row(number, cells) for number, cells in table.lines()]
     if not rows:
         found = "a header without rows"

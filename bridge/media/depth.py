@@ -97,9 +97,6 @@ def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]
     Args:
         image_format: As the CompressedImage states it; without ``rvl`` it is PNG. A bare PNG file
             is read whatever the format says.
-
-    Raises:
-        UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.
     """
     if data.startswith(PNG_MAGIC):
         return _unpack_png(data)

@@ -40,10 +40,6 @@ class RecorderClient:
 
         Args:
             request: Fields of the command; None for none.
-
-        Raises:
-            RemoteError: When the recorder refused.
-            NoReplyError: When no recorder of that name answered.
         """
         key = control_key(self._recorder, verb)
         payload = json.dumps(request or {}).encode()
@@ -223,12 +219,7 @@ def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
 
 
 def parse_task_file(text: Any) -> TaskFile | None:
-    """Check a task file that came with a request; None stays None.
-
-    Raises:
-        ControlError: When it is not text, or too long.
-        TaskFileError: Listing what is wrong with it.
-    """
+    """Check a task file that came with a request; None stays None."""
     if text is None:
         return None
     if not isinstance(text, str) or len(text) > MAX_BYTES:

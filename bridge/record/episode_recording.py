@@ -180,10 +180,6 @@ class EpisodeRecording:
         Args:
             latched: What was said before and still holds, repeated at the start of the file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
-
-        Raises:
-            UsageError: When the episode exists already.
-            BridgeError: When the folder cannot be written.
         """
         self.info = info
         self.ledger = Ledger(config.queues.max_topics)

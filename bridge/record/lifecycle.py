@@ -40,11 +40,7 @@ class DiskReserve:
         self._descriptor: int | None = None
 
     def hold(self) -> None:
-        """Allocate it, if it is not yet.
-
-        Raises:
-            NoSpaceError: When the disk has not that much left.
-        """
+        """Allocate it, if it is not yet."""
         if self._descriptor is not None or not self._bytes:
             return
         try:

@@ -114,12 +114,7 @@ class Previews:
 
 
 def small_picture(sample: WireSample) -> CompressedColor | None:
-    """Make a JPEG about ``WIDTH`` pixels wide of a colour image, or None of anything else.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself.
-        UnreadableImageError: The picture in it is broken.
-    """
+    """Make a JPEG about ``WIDTH`` pixels wide of a colour image, or None of anything else."""
     if sample.type_name in ("", schema.COMPRESSED_IMAGE):
         original = CompressedColor.from_cdr(sample.data)
         pixels, layout = decode_color(original.data), "RGB"
@@ -326,9 +321,6 @@ def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
 
     Args:
         shared: Only those out that do not share it.
-
-    Raises:
-        FolderTakenError: When another one is at work there.
     """
     descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
     try:

@@ -145,9 +145,6 @@ def run_recorder(
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
-
-    Raises:
-        DiskError: When the episode cannot be written.
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)

@@ -66,9 +66,6 @@ class Recorder:
         Args:
             now_ns: The clock that also stamps received messages.
             wall_ns: The system clock, watched for steps.
-
-        Raises:
-            ContractError: When the contract of the cell cannot be used.
         """
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
@@ -130,11 +127,7 @@ class Recorder:
         self.input_queue.put_image(item, saved)
 
     def read_contract(self) -> None:
-        """Read the contract of the cell anew; it may have been learned or edited.
-
-        Raises:
-            ContractError: When it cannot be used.
-        """
+        """Read the contract of the cell anew; it may have been learned or edited."""
         contract = find_contract(self._run.path, self.config.contract)
         self._life.contract = self.presence.contract = contract
 
@@ -150,7 +143,6 @@ class Recorder:
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
-            MissingTopicsError: When the contract requires topics that are not there.
             BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
@@ -502,12 +494,7 @@ class Recorder:
 
 
 def described_by(info: metadata.EpisodeInfo, task: TaskFile | None) -> metadata.EpisodeInfo:
-    """Add to a description which task file the episode is recorded with.
-
-    Raises:
-        TaskFileError: When the file is no task.
-        ControlError: When name or hash belong to another file.
-    """
+    """Add to a description which task file the episode is recorded with."""
     if task is None:
         if info.task_sha256:
             raise ControlError(

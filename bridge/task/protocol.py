@@ -216,11 +216,7 @@ def _hash(record: Mapping[str, Any]) -> str:
 
 
 def read_protocol(run_path: Path) -> Protocol | None:
-    """Return a run's protocol, None where it has none.
-
-    Raises:
-        InvalidRecordError: When there is one that does not fit its schema.
-    """
+    """Return a run's protocol, None where it has none."""
     path = run_path / FILE_NAME
     return Protocol.from_json(path.read_bytes()) if path.is_file() else None
 

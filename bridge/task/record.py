@@ -55,11 +55,7 @@ def _validator(package: str, path: str) -> "Draft202012Validator":
 def check_record(
     record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
 ) -> Mapping[str, Any]:
-    """Return the record if it fits ``schemas/<name>.schema.json``.
-
-    Raises:
-        InvalidRecordError: With the place and the value that does not fit.
-    """
+    """Return the record if it fits ``schemas/<name>.schema.json``."""
     path = f"schemas/{name}.schema.json"
     version = record.get("schema_version")
     known = _schema(package, path)["version"]

@@ -90,11 +90,7 @@ class ScriptedMotion:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> "ScriptedMotion":
-        """Read a metadata record whose values are parsed.
-
-        Raises:
-            InvalidRecordError: When a field is missing, of another kind, or of a later version.
-        """
+        """Read a metadata record whose values are parsed."""
         version = record.get("schema_version")
         if version != _VERSION:
             found = f"schema version {version!r}, known is {_VERSION}"

@@ -59,9 +59,6 @@ def ask_clocks(session: WireSession, *, timeout_s: float) -> list[ClockAnswer]:
 
     Args:
         session: Of the recorder; its clock is compared with.
-
-    Raises:
-        WireError: When the session is closing.
     """
     asked_ns = session.now_ns()
     answers = []

@@ -65,12 +65,7 @@ class SharedPool:
     """Memory that receivers on this machine read without a copy through the network."""
 
     def __init__(self, num_bytes: int) -> None:
-        """Reserve the pool.
-
-        Raises:
-            WireConfigError: When the machine has not that much shared memory left. Writing to
-                memory that is not there would end the process, so this is asked first.
-        """
+        """Reserve the pool."""
         free = _free_bytes()
         if free is not None and free < num_bytes:
             problem = f"{_MEMORY} has {free / BYTES_PER_MB:.0f} MB left"

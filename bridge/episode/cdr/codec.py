@@ -384,7 +384,6 @@ def decode(type_name: str, data: Buffer) -> Message:
         type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
 
     Raises:
-        MalformedMessageError: When the bytes do not fit the type.
         KeyError: When the type is none of ``ros2_definitions``.
     """
     order = _byte_order(type_name, data)

@@ -59,11 +59,7 @@ def _malformed(found: str) -> MalformedMessageError:
 
 
 def image_header(data: Buffer) -> ImageHeader:
-    """Read the front of a sensor_msgs/Image without touching its pixels.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message, or end before its pixels do.
-    """
+    """Read the front of a sensor_msgs/Image without touching its pixels."""
     if len(data) < 4 or data[1] not in (0, 1):
         raise _malformed(f"{len(data)} bytes without a CDR encapsulation header")
     order = "<" if data[1] == 1 else ">"
@@ -116,9 +112,6 @@ def pixel_rows(
 
     Args:
         pixel_bytes: Bytes of one pixel in the header's encoding: 3 for ``rgb8``, 2 for ``16UC1``.
-
-    Raises:
-        MalformedMessageError: Size, step and length contradict each other, or there is no pixel.
     """
     height, width, step = header.height, header.width, header.step
     row = width * pixel_bytes
@@ -142,9 +135,6 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     Returns:
         CDR of a sensor_msgs/CompressedImage with the same stamp and frame, or None when the
         encoding is none of ``COLOR_LAYOUTS``.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself, or is larger than JPEG allows.
     """
     header = image_header(data)
     if header.encoding not in COLOR_LAYOUTS:
@@ -168,9 +158,6 @@ def depth_to_compact(data: Buffer) -> bytes | None:
     Returns:
         CDR of a sensor_msgs/CompressedImage of format ``RVL_FORMAT`` with the same stamp and
         frame, or None when the encoding is not 16 bit.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself.
     """
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:

@@ -38,11 +38,7 @@ class VideoFrame:
 
     @staticmethod
     def from_protobuf(data: bytes) -> "VideoFrame":
-        """Read a foxglove.CompressedVideo.
-
-        Raises:
-            MalformedMessageError: The bytes are no such message.
-        """
+        """Read a foxglove.CompressedVideo."""
         found: dict[int, bytes] = {}
         try:
             for number, value in protobuf.fields(memoryview(data)):
@@ -214,9 +210,6 @@ def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColo
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message.
     """
     return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
 
@@ -226,9 +219,6 @@ def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
     """
     if type_name != schema.IMAGE:
         return CompressedColor.from_cdr(data)
@@ -291,10 +281,6 @@ class DepthImage:
 
         Args:
             type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-
-        Raises:
-            MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
-            UnreadableImageError: What is compressed cannot be decoded.
         """
         if type_name == schema.IMAGE:
             return DepthImage.from_cdr(data)
@@ -509,11 +495,7 @@ class PointCloudSample:
 
     @staticmethod
     def from_cdr(data: bytes) -> "PointCloudSample":
-        """Read a cloud as ``to_cdr`` writes it.
-
-        Raises:
-            MalformedMessageError: Another layout of fields, or bytes that are no cloud.
-        """
+        """Read a cloud as ``to_cdr`` writes it."""
         message = codec.decode(schema.POINT_CLOUD, data)
         layout = [(item["name"], item["offset"], item["datatype"]) for item in message["fields"]]
         raw, count = bytes(message["data"]), int(message["width"]) * int(message["height"])

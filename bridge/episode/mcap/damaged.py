@@ -118,11 +118,7 @@ _COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
 def read_plain(record: bytes) -> McapRecord | None:
-    """Return a whole header, schema, channel or metadata record, checked to its end.
-
-    Raises:
-        BrokenRecordError: When its fields run past its end, or a schema has id 0.
-    """
+    """Return a whole header, schema, channel or metadata record, checked to its end."""
     found = parse(record[0], record[RECORD_HEAD.size :])
     if isinstance(found, Schema) and found.id == 0:
         message = "a schema has id 0"
@@ -153,11 +149,7 @@ class ChunkHead:
 
 
 def parse_chunk_head(front: bytes) -> ChunkHead:
-    """Read a chunk's head from the first bytes of its record.
-
-    Raises:
-        BrokenRecordError: When they are too few or name an unknown compression.
-    """
+    """Read a chunk's head from the first bytes of its record."""
     if len(front) < _CHUNK_HEAD_BYTES or front[0] != CHUNK:
         message = "no chunk head"
         raise BrokenRecordError(message)

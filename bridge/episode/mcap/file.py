@@ -44,9 +44,6 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
 
     Args:
         data_end: Where its data section ends [bytes from the start of the file].
-
-    Raises:
-        BrokenRecordError: When a record or chunk is damaged.
     """
     builder = _Builder()
     for place in walk(stream, len(MAGIC), data_end):
@@ -236,12 +233,7 @@ class McapFile:
     """What a reader must know of one file before it reads messages."""
 
     def __init__(self, path: Path) -> None:
-        """Read header, summary and metadata. A summary that is left out is built from the data.
-
-        Raises:
-            BrokenRecordError: When the file is no finished MCAP file, or its end is damaged.
-            OSError: When it cannot be read.
-        """
+        """Read header, summary and metadata. A summary that is left out is built from the data."""
         self.path = path
         with path.open("rb") as stream:
             self.header = read_header(stream)
@@ -362,9 +354,6 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
         stream: The file; its position is changed.
         footer: The last record, with the summary's place and CRC (0: not checked).
         footer_at: Where the footer begins [bytes from the start of the file].
-
-    Raises:
-        BrokenRecordError: When it is damaged.
     """
     if not footer.summary_start:
         return None

@@ -246,11 +246,7 @@ def _read_index(offset: int, length: int, front: bytes) -> IndexSpan:
 
 
 def _refuse_renamed_index(file: RecordFile, found: TopMessage) -> None:
-    """An index whose opcode was altered must not pass for a message that nobody sent.
-
-    Raises:
-        BrokenRecordError: When what stands behind a chunk is built like its index to the byte.
-    """
+    """An index whose opcode was altered must not pass for a message that nobody sent."""
     size = _index_bytes(file.read(found.offset, _FRONT_BYTES))
     if size and size % _INDEX_ENTRY_BYTES == 0 and _INDEX_FRONT.size + size == found.length:
         message = "a message index calls itself a message"

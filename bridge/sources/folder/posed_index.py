@@ -90,9 +90,6 @@ class PosedIndex:
 
         The geometric mean of the range of COLMAP's points, else the median distance to the point
         that all optical axes pass nearest.
-
-        Raises:
-            FolderError: When there are no points and the axes do not meet before the cameras.
         """
         if self.sparse_range is not None:
             return math.sqrt(self.sparse_range[0] * self.sparse_range[1])
@@ -111,10 +108,6 @@ def read_posed_index(folder: Path) -> PosedIndex:
 
     Args:
         folder: Holds ``transforms.json``, or COLMAP's text model in itself or in ``sparse/0``.
-
-    Raises:
-        PathNotFoundError: When neither is there, or an image is not.
-        FolderError: When a number makes no sense, or a lens is of an unknown kind.
     """
     if (folder / TRANSFORMS).is_file():
         return _read_transforms(folder)
@@ -202,11 +195,7 @@ def _colmap_image(
 
 
 def _image_below(folder: Path, candidates: Sequence[str], index: Path) -> Path:
-    """The first of some files that is there; nothing outside the folder is read.
-
-    Raises:
-        PathNotFoundError: When none is.
-    """
+    """The first of some files that is there; nothing outside the folder is read."""
     root = folder.resolve()
     for name in candidates:
         try:

@@ -34,11 +34,7 @@ UNDISTORTED_QUALITY = 95
 
 
 def metres_per_unit(index: PosedIndex, config: PosedConfig) -> float:
-    """What lengths of the folder are multiplied with, given or chosen.
-
-    Raises:
-        FolderError: When it was not given and the images do not tell how far they look.
-    """
+    """What lengths of the folder are multiplied with, given or chosen."""
     if config.metres_per_unit is not None:
         return config.metres_per_unit
     return TYPICAL_DISTANCE_M / index.typical_distance()
@@ -62,11 +58,7 @@ def describe_posed(index: PosedIndex, config: PosedConfig) -> dict[str, Any]:
 
 
 def posed_messages(index: PosedIndex, config: PosedConfig) -> Iterator[list[StampedMessage]]:
-    """Yield the messages of one image after another.
-
-    Raises:
-        FolderError: When an image cannot be read or has another size than its camera.
-    """
+    """Yield the messages of one image after another."""
     scale = metres_per_unit(index, config)
     views = {name: Undistortion(lens) for name, lens in index.lenses.items()}
     sent = dict.fromkeys(index.lenses, 0)

@@ -137,8 +137,6 @@ class EpisodeSource:
         """Open an episode and choose what is sent.
 
         Raises:
-            PathNotFoundError: When the file is not there.
-            EpisodeError: When it is no MCAP file, or was never finished.
             UsageError: When nothing is chosen, or a name cannot travel on zenoh.
         """
         self.episode = Episode.open(path)
@@ -194,9 +192,6 @@ class EpisodeSource:
 
         Returns:
             Messages sent in all and by topic, and how late they were [ms].
-
-        Raises:
-            EpisodeError: When the file turns out to be damaged; what lies before was sent.
         """
         for path in self.episode.missing_parts:
             output.say(f"{path.name} is missing; what it held is not played")
