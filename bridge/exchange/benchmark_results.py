@@ -100,7 +100,7 @@ def read_polaris(path: Path) -> list[TrialRecord]:
 
 
 def read_lerobot_eval(path: Path) -> list[TrialRecord]:
-    """Read LeRobot's ``eval_info.json``, of one task (``per_episode``) or several (``per_task``)."""
+    """Read LeRobot's ``eval_info.json`` of one task or several."""
     if not path.is_file():
         hint = "Give the eval_info.json that lerobot-eval wrote."
         raise PathNotFoundError(path=path, what="results file", hint=hint)

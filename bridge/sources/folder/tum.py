@@ -104,7 +104,7 @@ def associate(
 
 
 def read_poses(path: Path) -> PoseTrajectory:
-    """Read "stamp tx ty tz qx qy qz qw" lines; rows with nan are left out, as are repeated stamps."""
+    """Read "stamp tx ty tz qx qy qz qw" lines, without rows of nan and repeated stamps."""
     poses: dict[int, tuple[list[float], list[float]]] = {}
     for line, cells in _rows(path, (8,)):
         stamp_ns = _stamp_ns(path, line, cells[0])
