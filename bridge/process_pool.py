@@ -111,7 +111,6 @@ def do(function: Function, item: Any) -> Answer | Failed:
 
     Args:
         function: What it raises becomes ``Failed``.
-        item: Its only argument.
     """
     try:
         return function(item)
@@ -129,11 +128,7 @@ class Worker:
     """A process that does one piece of work after another, in the order they were begun."""
 
     def __init__(self, *, quiet: bool = False) -> None:
-        """Start it; what it imports, it imports with the first piece of work.
-
-        Args:
-            quiet: Drop what it prints as errors; what it prints otherwise is always dropped.
-        """
+        """Start it; what it imports, it imports with the first piece of work."""
         places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"],
@@ -289,7 +284,6 @@ class Runner(Protocol):
 
         Args:
             function: Of a module that can be imported; what it raises becomes ``Failed``.
-            cost: How long an item takes, in any unit; the longest are begun first.
         """
 
     def __enter__(self) -> "Runner":
@@ -333,7 +327,6 @@ class ProcessPool:
         """Start nothing yet.
 
         Args:
-            size: Processes beside this one, at most.
             prepare: Called with None in each before all else, for what takes long to import.
         """
         self._size, self._prepare, self._quiet = size, prepare, quiet
@@ -426,10 +419,6 @@ class ProcessPool:
 
         This process works too, and does whatever another one did not do: it was killed, hung, ran
         out of memory, or met an exception, which is then raised here, where it always was.
-
-        Args:
-            work: A function of a module that can be imported; follows from the item alone.
-            items: What to work on; they and the results cross between processes.
         """
         try:
             while len(self.workers) < min(self._size, int(len(items) * each_s / WORTH_S)):

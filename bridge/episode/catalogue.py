@@ -31,11 +31,7 @@ from bridge.whole_file import write_whole
 
 
 def write_parquet(entries: Sequence[Entry], path: Path) -> None:
-    """Write one row per episode; columns are the fields of ``Entry``, times in ns.
-
-    Args:
-        path: The file to write; an older one is replaced.
-    """
+    """Write one row per episode; columns are the fields of ``Entry``, times in ns."""
     try:
         import pyarrow as pa  # noqa: PLC0415  # only for this export
         from pyarrow import parquet  # noqa: PLC0415
@@ -118,11 +114,7 @@ def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
 
 
 def label_episode(run: RunFolder, episode_id: str, outcome: Outcome) -> Path:
-    """Write a label beside the run; the episode file is not touched.
-
-    Args:
-        outcome: The label, in place of any that was there.
-    """
+    """Write a label beside the run; the episode file is not touched."""
     path = sidecar_path(run, episode_id)
     _finished(run, episode_id)
     record = json.loads(json.dumps(asdict(outcome)))

@@ -60,7 +60,6 @@ def stamp_of(files: Iterable[Path | str], now_ns: int) -> str:
     """Return size, times and inode of each file; "" when one changed a moment ago.
 
     Args:
-        files: The parts of one episode; one that is not there counts as such.
         now_ns: The system clock, which the files' change times are compared with [ns since 1970].
     """
     marks = []

@@ -162,11 +162,7 @@ class SequenceWatch:
         self._last_backward: int | None = None
 
     def see(self, sequence: int, *, may_skip: bool = False) -> None:
-        """Take the next number in the order of the file.
-
-        Args:
-            may_skip: What is missing before this one was left out on purpose.
-        """
+        """Take the next number in the order of the file."""
         if self._next is None:
             self._next = (sequence + 1) % _WRAP
             return
@@ -214,10 +210,6 @@ class Pauses:
         """Say whether two messages of a topic lie on both sides of a pause [ns].
 
         A message on its way when the recorder was told may be on either side.
-
-        Args:
-            before_ns: Log time of the earlier message.
-            after_ns: Log time of the later one.
         """
         index = bisect_left(self._starts_ns, after_ns) - 1
         return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
@@ -264,11 +256,7 @@ class TopicWatch:
     latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
-        """Take the next message in the order of the file.
-
-        Args:
-            decoder: Reads it; what it finds wrong is counted, and the first fault kept.
-        """
+        """Take the next message in the order of the file."""
         head, result = message.head, self.result
         result.messages += 1
         result.type_name = message.schema.name if message.schema else ""

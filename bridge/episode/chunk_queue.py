@@ -65,7 +65,6 @@ class ChunkQueue:
 
         Args:
             section: The growing file; nobody else writes to it unless ``drain`` has returned.
-            header: What a file like it begins with; the journal does too.
             monotonic: A clock without steps [s].
         """
         self._section = section
@@ -119,11 +118,7 @@ class ChunkQueue:
         return self.small_bytes + self.bulk_bytes
 
     def wait_for_room(self, num_bytes: int, limit: int) -> None:
-        """Wait until a chunk may be added.
-
-        Args:
-            limit: No more may wait with it, unless it is the only one.
-        """
+        """Wait until a chunk may be added."""
         if not self._waiting() or self._waiting() + num_bytes <= limit:
             return
         self.raise_error()

@@ -242,11 +242,7 @@ class StampWatch:
 
 
 def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) -> dict[str, Any]:
-    """Make the record of ``/recorder/clocks``.
-
-    Args:
-        identity: Of its process; another one has another clock.
-    """
+    """Make the record of ``/recorder/clocks``."""
     return {
         "schema_version": 1,
         "source": clock.source,

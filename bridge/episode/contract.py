@@ -94,7 +94,6 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
     Args:
         run: The run folder; its ``cell.toml`` holds unless another is named.
-        name: A TOML file, or a template by name.
 
     Raises:
         UsageError: When there is no such template; lists those that are there.
@@ -158,11 +157,7 @@ def _refuse_unknown(
 
 
 def write_contract(contract: Contract, path: Path, *, source: str) -> None:
-    """Write a contract as a TOML file; one that is there is not replaced.
-
-    Args:
-        source: What it was learned from; goes into its first line.
-    """
+    """Write a contract as a TOML file; one that is there is not replaced."""
     if path.exists():
         raise ContractError(f"{path} exists already. Move it away, or edit it.")
     lines = [
@@ -197,11 +192,7 @@ class Presence:
     """When it began."""
 
     def see(self, stamp_ns: int, pauses: Spans) -> None:
-        """Take the next message.
-
-        Args:
-            pauses: When nothing was to be recorded.
-        """
+        """Take the next message."""
         self.messages += 1
         last_ns = self.last_ns
         if not last_ns:
@@ -268,7 +259,6 @@ def judge(
     """Compare what was there with what was promised.
 
     Args:
-        presences: By topic.
         lost: By topic, messages that were sent and are not in the episode; they are not taken for
             silence of their publisher.
         by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
@@ -421,9 +411,6 @@ def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
 
     Regular streams get rate and silence, latched topics need only be there, and what comes when
     something happens (events, plans) is optional. Ground truth and our own records are left out.
-
-    Args:
-        presences: By topic, of an episode that is clean.
     """
     rules = {
         topic: _learned(topic, presence)

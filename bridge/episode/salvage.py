@@ -284,11 +284,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
 
 
 def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one.
-
-    Args:
-        records: The whole records from the chunk's front, unpacked; they are written so.
-    """
+    """Return the records saved from a cut chunk as a whole one."""
     start_ns, end_ns = contents.time_range()
     head = mcap.chunk_head(
         start_ns=start_ns,

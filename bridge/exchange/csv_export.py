@@ -275,9 +275,6 @@ def export_csv(
 ) -> dict[str, int]:
     """Write ``episodes.csv`` and one CSV file per family of topics that has messages.
 
-    Args:
-        clock: Whose clock stamps are read in.
-
     Raises:
         UsageError: When there is nothing to export, or ``out`` may not be replaced.
     """

@@ -41,9 +41,6 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
     """Yield a folder to fill; it becomes ``out`` when the block ends well, and is removed if not.
 
-    Args:
-        force: Replace what an earlier export wrote there; nothing else is ever replaced.
-
     Raises:
         UsageError: When something is there that may not be replaced.
     """
@@ -100,7 +97,6 @@ def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict
     """Write what the folder is made of: sources with their hashes, software, every choice.
 
     Args:
-        sources: The episode files; each is read once for its hash.
         choices: Whatever else decided about the result; must be JSON.
     """
     record = {

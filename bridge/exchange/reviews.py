@@ -161,11 +161,7 @@ def _plain(name: str) -> str:
 
 
 def read_reviews(path: Path, options: TableOptions = AS_SAVED) -> list[Review]:
-    """Read labels from a CSV, a JSON file, or a folder of them.
-
-    Args:
-        path: The file or folder; files of other kinds are passed over.
-    """
+    """Read labels from a CSV, a JSON file, or a folder of them."""
     if path.is_dir():
         return latest([r for file in _files(path) for r in read_reviews(file, options)])
     if not path.is_file():

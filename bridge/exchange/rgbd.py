@@ -79,7 +79,6 @@ def export_tum(
 
     Args:
         camera: Only this camera; None for all.
-        color: Colour as recorded (JPEG passes through), or decoded to PNG.
     """
     known = camera_ids(episode)
     wanted = known if camera is None else [camera]

@@ -219,12 +219,7 @@ class TableText:
 def open_table(
     path: Path, known: Sequence[str], options: TableOptions = AS_SAVED, *, near: bool = True
 ) -> TableText:
-    """Find out how a table is written and which of its columns are ours.
-
-    Args:
-        path: The file, in UTF-8.
-        near: Refuse a column whose name is almost one of ours.
-    """
+    """Find out how a table is written and which of its columns are ours."""
     if not path.is_file():
         hint = "Give a run folder, or a CSV file."
         raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
@@ -297,11 +292,7 @@ def _header(path: Path, known: Sequence[str]) -> tuple[str, list[str], int]:
 
 
 def numbered_lines(path: Path, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield the lines of a table with their numbers; blank ones and comments are left out.
-
-    Args:
-        path: The file, in UTF-8.
-    """
+    """Yield the lines of a table with their numbers; blank ones and comments are left out."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             for number, cells in enumerate(csv.reader(stream, delimiter=delimiter), start=1):
@@ -367,7 +358,6 @@ def read_rows(
     """Read a table with a header.
 
     Args:
-        path: The file, in UTF-8.
         required: Columns that must be there.
     """
     return rows_of(require(open_table(path, known, options), required, known))

@@ -238,12 +238,7 @@ def _tags(row: SourceRow) -> tuple[tuple[str, str], ...]:
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
-    """Write a trials CSV that ``read_trials`` reads back as it was.
-
-    Args:
-        path: The file to write; an older one is replaced.
-        trials: In the order of the rows.
-    """
+    """Write a trials CSV that ``read_trials`` reads back as it was."""
     path.write_text(trials_text(trials), encoding="utf-8", newline="")
     return path
 

@@ -79,9 +79,6 @@ _RVL_FRONT_BYTES = len(_CONFIG) + 8
 def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False) -> list[bytes]:
     """Encode 16-bit depth given as bytes.
 
-    Args:
-        rows: Pixels of each row, two bytes each; rows may lie apart in memory.
-
     Returns:
         What a CompressedImage of ``RVL_FORMAT`` holds, in two parts.
     """

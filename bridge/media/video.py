@@ -58,9 +58,6 @@ class VideoDecoder:
     ) -> list[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
         """Decode one frame; what comes before the first whole picture gives no image.
 
-        Args:
-            number: Given back with its image; larger than the one before.
-
         Returns:
             Numbers and sRGB images of the frames that can be shown now.
         """

@@ -61,8 +61,6 @@ class RecorderClient:
         Args:
             info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
                 known.
-            task: What the episode is of; it is attached to it.
-            anyway: Also when topics are missing that the contract requires.
         """
         sent = {} if task is None else {"task_file": task.data.decode()}
         request = {"id": episode_id, "info": info or {}, "anyway": anyway, **sent}
@@ -90,11 +88,7 @@ Record = TypeVar("Record")
 
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
-    """Answer the control keys until the session closes.
-
-    Args:
-        recorder: What the commands go to; its configured name is part of the keys.
-    """
+    """Answer the control keys until the session closes."""
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "start", {"id", "info", "anyway", "task_file"})

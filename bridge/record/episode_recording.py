@@ -67,7 +67,6 @@ class Channels:
 
         Args:
             max_topics: Further ones are refused.
-            msg_folder: Definitions of ROS 2 types of one's own.
         """
         self._msg_folder = msg_folder
         self._max_topics = max_topics
@@ -178,7 +177,6 @@ class EpisodeRecording:
         """Create the episode file and say in it who and what it is.
 
         Args:
-            latched: What was said before and still holds, repeated at the start of the file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
         """
         self.info = info
@@ -293,11 +291,7 @@ class EpisodeRecording:
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
-        """Write what has waited long enough, and the drop log of the seconds that are over.
-
-        Args:
-            now_ns: The recorder's clock.
-        """
+        """Write what has waited long enough, and the drop log of the seconds that are over."""
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1
         if before > self._closed_second:
@@ -402,7 +396,6 @@ class EpisodeRecording:
 
         Args:
             outcome: How it ended; None: as it was labelled last.
-            health: Counts of what went wrong in the recorder, by name.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:

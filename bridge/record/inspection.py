@@ -39,7 +39,6 @@ def resolve_type(topic: str, type_name: str) -> str:
     """Trust the publisher's type name; without one, go by the topic.
 
     Args:
-        topic: With its leading slash; one of ours has a type of its own.
         type_name: As the publisher says; "" for unknown.
     """
     return type_name or type_of_topic(topic) or ""

@@ -88,7 +88,6 @@ class PreRoll:
 
         Args:
             seconds: How far back it reaches [s]; 0 holds nothing.
-            max_bytes: Memory; with less than the seconds need, it reaches less far.
         """
         self._span_ns = ns_from_s(seconds)
         self._max_bytes = max_bytes
@@ -440,11 +439,7 @@ class Lifecycle:
         *,
         in_reserve: bool = False,
     ) -> DiskError:
-        """End a recording the disk has refused, and finish its file if there is any way.
-
-        Args:
-            in_reserve: The disk still takes what there is; it is ended before it is full.
-        """
+        """End a recording the disk has refused, and finish its file if there is any way."""
         take = self.take
         path = take.part_path if take else self._run.episodes_dir
         error = DiskError(path=path, cause=cause, is_finished=False)

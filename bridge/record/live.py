@@ -54,7 +54,6 @@ class Previews:
 
         Args:
             rate_hz: At most this many a second for each camera; 0 makes none.
-            shed: Says how far shedding has gone; previews go first.
         """
         self._session = session
         self._recorder = recorder
@@ -317,11 +316,7 @@ class LiveRecorder:
 
 
 def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
-    """Keep other recorders out of a run folder, until the process ends.
-
-    Args:
-        shared: Only those out that do not share it.
-    """
+    """Keep other recorders out of a run folder, until the process ends."""
     descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

@@ -61,12 +61,7 @@ class Recorder:
         task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start the writer thread.
-
-        Args:
-            now_ns: The clock that also stamps received messages.
-            wall_ns: The system clock, watched for steps.
-        """
+        """Start the writer thread."""
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
         self._now_ns = now_ns
@@ -346,11 +341,7 @@ class Recorder:
         self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
-        """Add something to every status and episode; ``ask`` must answer at once.
-
-        Args:
-            ask: Returns what to tell, something JSON can hold; called from several threads.
-        """
+        """Add something to every status and episode; ``ask`` must answer at once."""
         self._status.others[name] = ask
         self._life.others[name] = ask
 

@@ -263,10 +263,6 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:
-    """Fix the chance of yes for each task.
-
-    Args:
-        coins: By name of the task.
-    """
+    """Fix the chance of yes for each task."""
     tasks = tuple(replace(each, coin=coins.get(each.task)) for each in protocol.tasks)
     return replace(protocol, tasks=tasks, coin_from=coin_from)

@@ -104,20 +104,12 @@ def _finite(text: str) -> float:
 
 
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
-    """Parse JSON bytes and check them.
-
-    Args:
-        data: UTF-8 text.
-    """
+    """Parse JSON bytes and check them."""
     return dict(check_record(load_record(data, name=name), name=name, package=package))
 
 
 def load_record(data: bytes, *, name: str) -> dict[str, Any]:
-    """Parse JSON bytes that hold one object of finite numbers, and check no more than that.
-
-    Args:
-        data: UTF-8 text.
-    """
+    """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:

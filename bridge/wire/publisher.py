@@ -113,7 +113,6 @@ class WirePublisher:
         """Send one serialised message made at ``source_ns``.
 
         Args:
-            data: The serialised message; large ones go through shared memory where that is on.
             source_ns: Source time of the message [ns since 1970].
         """
         note = Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)

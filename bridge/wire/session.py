@@ -383,7 +383,6 @@ class WireSession:
 
         Args:
             max_waiting: Requests that may wait for their turn; further ones are refused.
-            side_by_side: Requests that are answered at once, each on its own thread.
         """
         service = Service(key, handler, max_waiting, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)

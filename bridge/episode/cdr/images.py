@@ -129,7 +129,6 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     """Compress a raw colour image; an alpha channel is dropped.
 
     Args:
-        data: CDR of a sensor_msgs/Image.
         quality: JPEG quality, 1 to 100.
 
     Returns:
@@ -151,9 +150,6 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
 
 def depth_to_compact(data: Buffer) -> bytes | None:
     """Compress a raw depth image without loss (RVL).
-
-    Args:
-        data: CDR of a sensor_msgs/Image.
 
     Returns:
         CDR of a sensor_msgs/CompressedImage of format ``RVL_FORMAT`` with the same stamp and

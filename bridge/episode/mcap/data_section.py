@@ -34,11 +34,7 @@ class Summary:
         self._metadata: list[bytes] = []
 
     def add_chunk(self, place: ChunkPlace, counts: dict[int, int]) -> None:
-        """Book a chunk that is in the file, with its number of messages by channel.
-
-        Args:
-            counts: Messages in it by channel id; empty when it holds definitions only.
-        """
+        """Book a chunk that is in the file, with its number of messages by channel."""
         self._chunks.append(mcap_format.chunk_index(place))
         if counts:
             self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
@@ -48,7 +44,6 @@ class Summary:
 
         Args:
             start_ns: Earliest log time among them [ns since 1970].
-            end_ns: Latest log time among them.
         """
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count

@@ -79,7 +79,6 @@ def attachment_entry(
     """Make the index entry of an attachment.
 
     Args:
-        record: Its name, type and times; its data may have been left out.
         data_size: Of the data [bytes].
     """
     return records.AttachmentIndex(
@@ -351,7 +350,6 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
     """Read the summary section with its CRC checked, None where there is none.
 
     Args:
-        stream: The file; its position is changed.
         footer: The last record, with the summary's place and CRC (0: not checked).
         footer_at: Where the footer begins [bytes from the start of the file].
     """

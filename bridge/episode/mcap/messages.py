@@ -58,11 +58,7 @@ def _refuse_strays(
     channel_ids: UInt16[np.ndarray, " num_messages"],
     announced: Bool[np.ndarray, " num_channel_ids"],
 ) -> None:
-    """Raise BrokenRecordError when a message is of a channel that was never announced.
-
-    Args:
-        announced: By channel id: whether the file announced the channel.
-    """
+    """Raise BrokenRecordError when a message is of a channel that was never announced."""
     is_known = announced[channel_ids]
     if not is_known.all():
         channel_id = int(channel_ids[int(np.argmin(is_known))])
@@ -236,7 +232,6 @@ def read_chunk(
     """Unpack a chunk, its CRC checked, and list its messages.
 
     Args:
-        stream: The file; its position is changed.
         data_end: Where the data section ends [bytes from the start of the file].
     """
     offset = index.chunk_start_offset

@@ -117,11 +117,7 @@ def _place(head: bytes, at: int, end: int) -> RecordSpan:
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
-    """Return a record's bytes without opcode and length.
-
-    Args:
-        stream: The file; its position is changed.
-    """
+    """Return a record's bytes without opcode and length."""
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
     if len(body) < place.length:
@@ -203,7 +199,6 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
     Args:
-        stream: The file; its position is changed.
         keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
     """
     stream.seek(place.offset + RECORD_HEAD.size)

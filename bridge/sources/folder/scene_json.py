@@ -34,7 +34,6 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
 
     Args:
         folder: Holds ``scene.json``; the paths in it start here.
-        config: Must not give what the file says itself: intrinsics and the unit of depth.
     """
     path = folder / INDEX_NAME
     refuse_scale_without_use(config, path)

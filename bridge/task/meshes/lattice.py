@@ -54,7 +54,6 @@ def fill(
     """Fill a solid that a box just holds, as ``make_lattice``.
 
     Args:
-        solid: Its signed distance.
         low: Lower corner of the box [m].
     """
     counts = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
