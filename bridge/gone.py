@@ -15,7 +15,7 @@ FIXED = (
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
-    "export catalogue": "List with robot-gst ls RUN --parquet FILE.",
+    "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": (
         "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
@@ -47,6 +47,7 @@ GONE: dict[str, str] = {
         ("publish episode --loop", "publish episode --paused", "publish episode --name"),
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
     ),
+    "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
     "recover --in-place": (
         "Free some space, or move the file to another disk: a copy is made beside it."
     ),

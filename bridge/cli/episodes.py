@@ -303,7 +303,6 @@ def ls(
     /,
     *,
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
-    parquet: Path | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
@@ -315,10 +314,9 @@ def ls(
     Args:
         run: Run folder, or a folder of runs.
         query: Which, and in what order.
-        parquet: Write the list to this file too, as a table for pandas or DuckDB.
         output: How to talk.
     """
-    from bridge.episode.catalogue import find_runs, write_parquet
+    from bridge.episode.catalogue import find_runs
 
     runs = find_runs(run)
     found = _find(runs, query, output)
@@ -327,8 +325,6 @@ def ls(
     if len(runs) > 1:
         names = [each.path.relative_to(run).as_posix() for each, _ in found]
         shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
-    if parquet is not None:
-        write_parquet(shown, parquet)
     lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
     data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
     output.result({"episodes": data}, "\n".join(lines))

@@ -7,7 +7,7 @@ changed.
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,38 +24,10 @@ from bridge.episode.contract import PRESENCE_RECORD, presence_lines
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id
-from bridge.errors import GstError, MissingDependencyError, PathNotFoundError, UsageError
+from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.task.find import chosen_task_file, keep_task_file
 from bridge.task.record import check_record, parse_record
 from bridge.whole_file import write_whole
-
-
-def write_parquet(entries: Sequence[Entry], path: Path) -> None:
-    """Write one row per episode; columns are the fields of ``Entry``, times in ns."""
-    try:
-        import pyarrow as pa  # noqa: PLC0415  # only for this export
-        from pyarrow import parquet  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="pyarrow", extra="report", purpose="exporting the catalogue to Parquet"
-        ) from error
-
-    types: dict[Any, Any] = {
-        str: pa.string(),
-        str | None: pa.string(),
-        int: pa.int64(),
-        int | None: pa.int64(),
-        float: pa.float64(),
-        bool: pa.bool_(),
-        tuple[str, ...]: pa.list_(pa.string()),
-    }
-    names = [(item.name, types[item.type]) for item in fields(Entry)]
-    rows = [{**vars(entry), "tags": list(entry.tags)} for entry in entries]
-    table = pa.Table.from_pylist(rows, schema=pa.schema(names))
-    sink = pa.BufferOutputStream()
-    parquet.write_table(table, sink, compression="zstd")
-    write_whole(path, sink.getvalue().to_pybytes())
-
 
 Advance = Callable[[int, int], None]
 """Called as ``advance(done, total)`` while files are read."""
@@ -132,9 +104,6 @@ def _finished(run: RunFolder, episode_id: str) -> Path:
     return episode
 
 
-_LARGEST = 2**63 - 1
-
-
 def read_entry(run: RunFolder, path: Path) -> Entry:
     """Open an episode and sum it up; a broken one is listed with its error."""
     parts: tuple[Path, ...] = (path,)
@@ -156,7 +125,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         condition=printable(info.condition),
         policy=printable(info.policy),
         start_id=None if info.start_id is None else printable(info.start_id),
-        trial=None if info.trial is None else _fit(info.trial),
+        trial=info.trial,
         operator=printable(info.operator),
         robot=printable(info.robot),
         cell=printable(info.cell),
@@ -164,7 +133,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         tags=tuple(printable(str(tag)) for tag in info.tags),
         outcome=printable(outcome.result) if outcome else "unknown",
         cause=printable(_cause(info.kind, outcome)),
-        start_ns=_fit(episode.start_ns),
+        start_ns=episode.start_ns,
         duration_s=episode.duration_s,
         messages=messages,
         lost=_declared_lost(records.get("drops")),
@@ -190,12 +159,7 @@ def _declared_lost(drops: dict[str, Any] | None) -> int | None:
         return None
     counts: Iterable[Any] = (drops.get(name, 0) for name in ("gaps", "queue_drops", "shed"))
     found = [count for count in counts if isinstance(count, int)]
-    return _fit(sum(found)) if len(found) == 3 else None
-
-
-def _fit(number: int) -> int:
-    """Clamp to what a database column holds; other programs write what they like."""
-    return max(-_LARGEST, min(_LARGEST, number))
+    return sum(found) if len(found) == 3 else None
 
 
 EVERYTHING = CatalogueQuery()

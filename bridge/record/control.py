@@ -6,8 +6,10 @@ that a status is never behind a stop.
 
 import json
 from collections.abc import Callable
-from dataclasses import MISSING, asdict, fields
-from typing import Any, TypeVar, get_origin
+from dataclasses import asdict, fields
+from typing import Any, TypeVar
+
+import msgspec
 
 from bridge.episode import metadata
 from bridge.episode.run_folder import check_episode_id
@@ -237,20 +239,8 @@ def parse_outcome(outcome: Any) -> metadata.Outcome | None:
 def _build(of_type: type[Record], values: Any, what: str) -> Record:
     if not isinstance(values, dict):
         raise ControlError(f"{what} must be a JSON object, got {values!r:.80}.")
-    known = {item.name: item for item in fields(of_type)}  # type: ignore[arg-type]
-    _only(values, what, set(known))
-    missing = [n for n, item in known.items() if item.default is MISSING and n not in values]
-    if missing:
-        raise ControlError(f"{what} needs {', '.join(missing)}.")
-    arguments = {}
-    for name, value in values.items():
-        wanted: Any = known[name].type
-        if get_origin(wanted) is tuple:
-            if not isinstance(value, list | tuple):
-                raise ControlError(f"{what}.{name} must be a list, got {value!r:.80}.")
-            arguments[name] = tuple(value)
-        elif (isinstance(value, bool) and wanted is not bool) or not isinstance(value, wanted):
-            raise ControlError(f"{what}.{name} has the wrong type: {value!r:.80}.")
-        else:
-            arguments[name] = value
-    return of_type(**arguments)
+    _only(values, what, {item.name for item in fields(of_type)})  # type: ignore[arg-type]
+    try:
+        return msgspec.convert(values, of_type)
+    except msgspec.ValidationError as error:
+        raise ControlError(f"{what}: {error}.") from error

@@ -5,7 +5,6 @@ the first and last bytes of a JPEG. ``robot-gst check`` decodes everything after
 """
 
 import json
-import struct
 from collections.abc import Callable
 from enum import StrEnum
 from functools import lru_cache
@@ -114,33 +113,23 @@ def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
             return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
-        codec.decode(type_name, data)
+        message = codec.decode(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
-    if type_name == schema.COMPRESSED_IMAGE and _is_cut_jpeg(data):
-        return MessageState.UNDECODABLE
+    if type_name == schema.COMPRESSED_IMAGE:
+        image = message["data"]
+        is_cut = image[:2] == _JPEG_START and _JPEG_END not in bytes(image[-_TAIL_BYTES:])
+        return MessageState.UNDECODABLE if is_cut else GOOD
     return GOOD
 
 
 def fits(header: ImageHeader) -> bool:
     """Say whether an image has as many bytes as its size and step ask for."""
-    if header.data_length != header.height * header.step:
+    if len(header.pixels) != header.height * header.step:
         return False
     pixel_bytes = 4 if header.encoding == FLOAT_DEPTH else 2
     is_depth = header.encoding in (*DEPTH_ENCODINGS, FLOAT_DEPTH)
     return not is_depth or header.step >= pixel_bytes * header.width
-
-
-def _is_cut_jpeg(data: bytes) -> bool:
-    """Say whether a sensor_msgs/CompressedImage begins as a JPEG and does not end as one."""
-    order = "<I" if data[1] else ">I"
-    at = 12  # behind the encapsulation and the stamp
-    for _ in ("frame_id", "format"):
-        (length,) = struct.unpack_from(order, data, at)
-        at += 4 + length
-        at += -at % 4
-    at += 4
-    return data.startswith(_JPEG_START, at) and _JPEG_END not in data[-_TAIL_BYTES:]
 
 
 def _inspect_json(newest: int, data: bytes) -> MessageState:

@@ -168,7 +168,7 @@ class RawColor:
         if header.encoding not in COLOR_LAYOUTS:
             raise _no_color(header.encoding)
         channels = COLOR_LAYOUTS[header.encoding][1]
-        rows = pixel_rows(data, header, channels)
+        rows = pixel_rows(header, channels)
         return RawColor(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
@@ -258,7 +258,7 @@ class DepthImage:
         """
         header = image_header(data)
         if header.encoding == FLOAT_DEPTH:
-            rows = np.ascontiguousarray(pixel_rows(data, header, 4))
+            rows = np.ascontiguousarray(pixel_rows(header, 4))
             depth_m = rows.view(">f4" if header.is_bigendian else "<f4").astype(np.float32)
             return DepthImage(
                 stamp_ns=header.stamp_ns,
@@ -268,7 +268,7 @@ class DepthImage:
         if header.encoding not in DEPTH_ENCODINGS:
             found = f"encoding {header.encoding!r}, expected '16UC1' or '{FLOAT_DEPTH}'"
             raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
-        rows = np.ascontiguousarray(pixel_rows(data, header, 2))
+        rows = np.ascontiguousarray(pixel_rows(header, 2))
         return DepthImage(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
