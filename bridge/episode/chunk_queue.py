@@ -77,8 +77,6 @@ class ChunkQueue:
         """Nothing is written after an error, until its owner knows and calls again."""
         self._batch_bytes = BATCH_BYTES
         self._busy_since_s: float | None = None
-        self._began_at = 0
-        """Where the write under way begins in the file."""
         self._is_ending = False
         self._changed = threading.Condition()
         self.small_bytes = 0
@@ -131,12 +129,6 @@ class ChunkQueue:
                 )
             )
         self.raise_error()
-
-    def position(self) -> int:
-        """Bytes of the file when everything that waits is in it."""
-        with self._changed:
-            is_busy = self._busy_since_s is not None
-            return (self._began_at if is_busy else self._section.file.offset) + self._waiting()
 
     def drain(self) -> None:
         """Wait until everything is written; then the file is the caller's until the next ``add``.
@@ -201,7 +193,6 @@ class ChunkQueue:
                 turn_of_bulk = bool(small)
                 chunks = small or self._batch()
                 self._busy_since_s = self._monotonic()
-                self._began_at = self._section.file.offset
             error = None
             try:
                 self._section.add_chunks(chunks)

@@ -131,10 +131,6 @@ class RunFolder:
         """Plans made from words, each with the twin's replay of it beside it."""
         return self.path / "plans"
 
-    def holds_plan(self, path: Path) -> bool:
-        """Whether a file lies in ``plans/``, from wherever its path is written."""
-        return path.resolve().parent == self.plans_dir.resolve()
-
     @property
     def results_dir(self) -> Path:
         """What the evaluator computed."""

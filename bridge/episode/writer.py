@@ -238,11 +238,6 @@ class EpisodeWriter:
         self._open = True
 
     @property
-    def bytes_written(self) -> int:
-        """Bytes in the file or on their way; chunks being filled are not among them."""
-        return self._file.offset if self._queue is None else self._queue.position()
-
-    @property
     def backlog_bytes(self) -> int:
         """Bytes of large messages that wait for the disk."""
         return 0 if self._queue is None else self._queue.bulk_bytes
