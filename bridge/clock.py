@@ -60,12 +60,7 @@ class StepWatch:
     def __init__(
         self, now_ns: Callable[[], int], *, wall_ns: Callable[[], int] = time.time_ns
     ) -> None:
-        """Remember how far the clocks are apart now.
-
-        Args:
-            now_ns: A clock without steps.
-            wall_ns: The system clock.
-        """
+        """Remember how far the clocks are apart now."""
         self._now_ns = now_ns
         self._wall_ns = wall_ns
         self._apart_ns = wall_ns() - now_ns()

@@ -19,9 +19,6 @@ def dataset_file(folder: str, name: str, suffix: str = ".toml") -> Path:
     Args:
         folder: Name of a folder of ``datasets/``, in the plural: ``tasks``, ``cells``, ``robots``.
         name: A name without suffix, or the path of a file that ends with ``suffix``.
-
-    Raises:
-        UsageError: Listing the names that exist.
     """
     if name.endswith(suffix) and Path(name).is_file():
         return Path(name)

@@ -60,7 +60,7 @@ EXTRAS = {
 """As ``pyproject.toml`` has them."""
 NATIVE = (
     ("splat rasteriser", "twin.scene._splat", "no scene can be rebuilt"),
-    ("depth codec", "bridge.media._depth", "slow fallback, for playing back only"),
+    ("depth codec", "bridge.media._depth", "no compact depth is written or read"),
     ("checksum", "bridge.episode._crc32", "slower fallback (zlib)"),
 )
 """What our own extensions are for, and how it goes without each."""

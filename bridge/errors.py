@@ -41,9 +41,6 @@ def refuse_outside(
     Args:
         settings: A record whose fields are looked up by name; one that is None is not checked.
         allowed: Least and most by field name; infinity for no upper end.
-
-    Raises:
-        OptionError: Naming the first one that is outside.
     """
     for name, (least, most) in allowed.items():
         value = getattr(settings, name)

@@ -15,7 +15,7 @@ FIXED = (
 GONE: dict[str, str] = {
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
-    "export catalogue": "List with robot-gst ls RUN --parquet FILE.",
+    "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
     "export corrected": (
         "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
@@ -36,8 +36,20 @@ GONE: dict[str, str] = {
         "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."
     ),
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
+    **dict.fromkeys(
+        ("record --split-mb", "record --split-s"),
+        "Stop and start another episode; episodes of several parts are read as before.",
+    ),
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
+    ),
+    **dict.fromkeys(
+        ("publish episode --loop", "publish episode --paused", "publish episode --name"),
+        "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
+    ),
+    "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
+    "recover --in-place": (
+        "Free some space, or move the file to another disk: a copy is made beside it."
     ),
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
@@ -82,11 +94,7 @@ GONE: dict[str, str] = {
 
 
 def refuse_gone(tokens: Sequence[str]) -> None:
-    """Answer a command or a flag that went.
-
-    Raises:
-        UsageError: Naming it, with what to use instead.
-    """
+    """Answer a command or a flag that went."""
     words = [token.partition("=")[0] for token in tokens]
     for command in (" ".join(words[:2]), words[0] if words else ""):
         for name in (command, *(f"{command} {word}" for word in words if word.startswith("--"))):

@@ -111,7 +111,6 @@ def do(function: Function, item: Any) -> Answer | Failed:
 
     Args:
         function: What it raises becomes ``Failed``.
-        item: Its only argument.
     """
     try:
         return function(item)
@@ -129,14 +128,7 @@ class Worker:
     """A process that does one piece of work after another, in the order they were begun."""
 
     def __init__(self, *, quiet: bool = False) -> None:
-        """Start it; what it imports, it imports with the first piece of work.
-
-        Args:
-            quiet: Drop what it prints as errors; what it prints otherwise is always dropped.
-
-        Raises:
-            OSError: When the system gives no further process.
-        """
+        """Start it; what it imports, it imports with the first piece of work."""
         places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
         self.process = subprocess.Popen(
             [sys.executable, "-P", "-c", f"from {__name__} import _serve; _serve()"],
@@ -168,10 +160,6 @@ class Worker:
 
         Args:
             timeout_s: For handing it over; ``PATIENCE_S`` for each part of it without a number.
-
-        Raises:
-            WorkerDiedError: When it is gone already.
-            TimeIsUpError: When it has not taken the piece in time; it was ended.
         """
         assert self.process.stdin is not None  # noqa: S101  # for the type checker
         left = memoryview(_packed((function, item)))
@@ -192,13 +180,7 @@ class Worker:
         self._num_begun += 1
 
     def finish(self, timeout_s: float | None = None) -> Answer | Failed:
-        """Wait for the next answer.
-
-        Raises:
-            WorkerDiedError: When the process ended before it answered.
-            TimeIsUpError: When it has not begun to answer yet; it goes on working. One that
-                stopped in the middle of its answer was ended.
-        """
+        """Wait for the next answer."""
         try:
             if not wait([self.outlet], timeout_s):
                 raise TimeIsUpError(f"no answer within {timeout_s:g} s")
@@ -302,7 +284,6 @@ class Runner(Protocol):
 
         Args:
             function: Of a module that can be imported; what it raises becomes ``Failed``.
-            cost: How long an item takes, in any unit; the longest are begun first.
         """
 
     def __enter__(self) -> "Runner":
@@ -346,7 +327,6 @@ class ProcessPool:
         """Start nothing yet.
 
         Args:
-            size: Processes beside this one, at most.
             prepare: Called with None in each before all else, for what takes long to import.
         """
         self._size, self._prepare, self._quiet = size, prepare, quiet
@@ -381,9 +361,6 @@ class ProcessPool:
         """See ``Runner``; an item whose process died is tried once more after all others.
 
         The longest go first, so that no process is left with a long one at the end (Graham 1969).
-
-        Raises:
-            NoProcessError: When the system gives none at all; with fewer than asked for it goes on.
         """
         todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
         at_work: dict[Worker, tuple[Item, int]] = {}
@@ -442,10 +419,6 @@ class ProcessPool:
 
         This process works too, and does whatever another one did not do: it was killed, hung, ran
         out of memory, or met an exception, which is then raised here, where it always was.
-
-        Args:
-            work: A function of a module that can be imported; follows from the item alone.
-            items: What to work on; they and the results cross between processes.
         """
         try:
             while len(self.workers) < min(self._size, int(len(items) * each_s / WORTH_S)):

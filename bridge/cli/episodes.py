@@ -244,7 +244,7 @@ def doctor(*, output: Output = OUTPUT) -> int:
     return 0 if all(item.ok for item in findings) else 1
 
 
-def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OUTPUT) -> int:
+def recover(paths: list[Path], /, *, output: Output = OUTPUT) -> int:
     """Repair files whose writer was killed, and report what was lost.
 
     Exit code 0: repaired, 1: nothing could be read in one of them.
@@ -252,7 +252,6 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
 
     Args:
         paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
-        in_place: Finish the file itself; without it a copy is made where the disk has space.
         output: How to talk.
     """
     from bridge.episode import recover as recovery
@@ -267,7 +266,7 @@ def recover(paths: list[Path], /, *, in_place: bool = False, output: Output = OU
     reports = []
     for path in files:
         try:
-            reports.append(recovery.recover(path, in_place=True if in_place else None))
+            reports.append(recovery.recover(path))
         except GstError as error:
             if len(files) == 1:
                 raise
@@ -304,7 +303,6 @@ def ls(
     /,
     *,
     query: Annotated[CatalogueQuery, Parameter(name="*")] = EVERYTHING,
-    parquet: Path | None = None,
     output: Output = OUTPUT,
 ) -> int:
     """List the episodes of a run, or of all runs of a folder, or those that pass the filters.
@@ -316,10 +314,9 @@ def ls(
     Args:
         run: Run folder, or a folder of runs.
         query: Which, and in what order.
-        parquet: Write the list to this file too, as a table for pandas or DuckDB.
         output: How to talk.
     """
-    from bridge.episode.catalogue import find_runs, write_parquet
+    from bridge.episode.catalogue import find_runs
 
     runs = find_runs(run)
     found = _find(runs, query, output)
@@ -328,8 +325,6 @@ def ls(
     if len(runs) > 1:
         names = [each.path.relative_to(run).as_posix() for each, _ in found]
         shown = [replace(e, id=f"{name}/{e.id}") for name, e in zip(names, entries, strict=True)]
-    if parquet is not None:
-        write_parquet(shown, parquet)
     lines = episode_table(shown) if shown else [f"no episode in {run} passes these filters"]
     data = [{**vars(entry), "run": str(each.path)} for each, entry in found]
     output.result({"episodes": data}, "\n".join(lines))

@@ -1,8 +1,7 @@
 """Commands that publish a folder or an episode; leaves bring others."""
 
 import contextlib
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,6 @@ from bridge.wire.config import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from bridge.record.control import RecorderClient
-    from bridge.sources.playback.publish import Pace
 
 OUTPUT = Output()
 FOLDER = FolderConfig()
@@ -118,7 +116,6 @@ def publish_episode(
 ) -> int:
     """Play an episode back: the same bytes in the same order, as far apart as they came.
 
-    On a terminal the space bar pauses; so does robot-gst ctl pause --recorder playback.
     Example: robot-gst publish episode runs/monday/episodes/trial_0001.mcap --rate 2 --episode again
     Under other names: robot-gst publish episode FILE --topics "lab/**" --remap /lab:=/twin
 
@@ -153,38 +150,10 @@ def publish_episode(
     )
     with stopping(duration_s) as stop, open_session(wire) as session:
         client = RecorderClient(session, recorder)
-        with _recorded(client, episode, info) as answer, _space_bar(source.pace, output.say):
+        with _recorded(client, episode, info) as answer:
             sent = source.run(session, stop, output)
     text = describe_counts(sent)
     if answer:
         text += f"\n{describe_answer(answer)}"
     output.result({"sent": sent, "recorded": answer or None}, text)
     return 0
-
-
-KEY_PERIOD_S = 0.05
-
-
-@contextlib.contextmanager
-def _space_bar(pace: "Pace", say: Callable[[str], None]) -> Iterator[None]:
-    """Let the space bar pause a playback and go on with it; nothing without a terminal."""
-    from bridge.record.process import pressed_key, single_keys
-
-    ended = threading.Event()
-
-    def watch() -> None:
-        while not ended.wait(KEY_PERIOD_S):
-            if pressed_key() == " ":
-                say(pace.toggle())
-
-    with single_keys() as has_keys:
-        watcher = threading.Thread(target=watch, name="space bar", daemon=True)
-        if has_keys:
-            say("paused; the space bar begins" if pace.is_paused else "the space bar pauses")
-            watcher.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            if has_keys:
-                watcher.join()

@@ -24,9 +24,6 @@ def assigned(info: EpisodeInfo, path: Path) -> EpisodeInfo:
 
     Args:
         path: The file; one that lies in no run's ``episodes/`` has no note.
-
-    Raises:
-        EpisodeError: When the note is damaged.
     """
     if path.parent.name != "episodes":
         return info
@@ -57,11 +54,7 @@ def assign(
     start_id: str | None,
     policy: str | None,
 ) -> Path:
-    """Note that an episode is a trial; what is None stays as it was.
-
-    Raises:
-        UsageError: When it is a scan, a probe or a retry.
-    """
+    """Note that an episode is a trial; what is None stays as it was."""
     if info.kind not in ("trial", "imported"):
         message = f"{path.stem} is a {info.kind}; trials and imported episodes have tasks."
         raise UsageError(message)

@@ -126,7 +126,6 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     """Read every byte of an episode and of its parts, and decode every type this project knows.
 
     Args:
-        path: The episode; the parts behind it are found.
         contract: Judge by this one; None takes the one the episode was recorded under.
     """
     report = CheckReport(path=path)

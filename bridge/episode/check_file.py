@@ -8,7 +8,6 @@ import struct
 import zlib
 from array import array
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,9 +18,9 @@ from mcap.summary import Summary
 
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.file import (
+    Seen,
     attachment_entry,
     chunk_entry,
-    metadata_entry,
     read_footer,
     read_header,
     read_summary,
@@ -43,50 +42,6 @@ from bridge.episode.mcap.walk import (
     unpack_chunk,
     walk,
 )
-
-
-@dataclass(kw_only=True)
-class Seen:
-    """What the walk found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel."""
-    start_ns: int | None = None
-    end_ns: int = 0
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    """Of the chunks whose head can be read."""
-    num_chunks: int = 0
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    num_broken_attachments: int = 0
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-
-    def count(self, head: MessageHead) -> None:
-        """Take a message."""
-        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
-        if self.start_ns is None or head.log_time_ns < self.start_ns:
-            self.start_ns = head.log_time_ns
-        self.end_ns = max(self.end_ns, head.log_time_ns)
-
-    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema, channel or metadata record; yields what is wrong with it.
-
-        Args:
-            record: What was read there; None, and any other kind of record, is passed over.
-        """
-        if isinstance(record, records.Metadata):
-            self.metadata.append(metadata_entry(place, record))
-        elif isinstance(record, records.Schema):
-            if record.id == 0:
-                yield "a schema has the id 0, which means none"
-            if self.schemas.setdefault(record.id, record) != record:
-                yield f"schema {record.id} is announced twice with different contents"
-        elif isinstance(record, records.Channel):
-            if record.schema_id and record.schema_id not in self.schemas:
-                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
-            if self.channels.setdefault(record.id, record) != record:
-                yield f"channel {record.id} is announced twice with different contents"
 
 
 def summary_faults(

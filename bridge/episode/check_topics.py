@@ -18,7 +18,6 @@ from bridge.episode.cdr.messages import (
     JointSample,
     PoseSample,
     VideoFrame,
-    foxglove_stamp_ns,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -131,7 +130,6 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
     schema.COMPRESSED_IMAGE: _color,
     schema.COMPRESSED_VIDEO: VideoFrame.from_protobuf,
-    schema.RAW_AUDIO: lambda data: foxglove_stamp_ns(schema.RAW_AUDIO, data),
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,
@@ -164,11 +162,7 @@ class SequenceWatch:
         self._last_backward: int | None = None
 
     def see(self, sequence: int, *, may_skip: bool = False) -> None:
-        """Take the next number in the order of the file.
-
-        Args:
-            may_skip: What is missing before this one was left out on purpose.
-        """
+        """Take the next number in the order of the file."""
         if self._next is None:
             self._next = (sequence + 1) % _WRAP
             return
@@ -216,10 +210,6 @@ class Pauses:
         """Say whether two messages of a topic lie on both sides of a pause [ns].
 
         A message on its way when the recorder was told may be on either side.
-
-        Args:
-            before_ns: Log time of the earlier message.
-            after_ns: Log time of the later one.
         """
         index = bisect_left(self._starts_ns, after_ns) - 1
         return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
@@ -266,11 +256,7 @@ class TopicWatch:
     latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
-        """Take the next message in the order of the file.
-
-        Args:
-            decoder: Reads it; what it finds wrong is counted, and the first fault kept.
-        """
+        """Take the next message in the order of the file."""
         head, result = message.head, self.result
         result.messages += 1
         result.type_name = message.schema.name if message.schema else ""

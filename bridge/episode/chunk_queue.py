@@ -65,7 +65,6 @@ class ChunkQueue:
 
         Args:
             section: The growing file; nobody else writes to it unless ``drain`` has returned.
-            header: What a file like it begins with; the journal does too.
             monotonic: A clock without steps [s].
         """
         self._section = section
@@ -78,8 +77,6 @@ class ChunkQueue:
         """Nothing is written after an error, until its owner knows and calls again."""
         self._batch_bytes = BATCH_BYTES
         self._busy_since_s: float | None = None
-        self._began_at = 0
-        """Where the write under way begins in the file."""
         self._is_ending = False
         self._changed = threading.Condition()
         self.small_bytes = 0
@@ -119,14 +116,7 @@ class ChunkQueue:
         return self.small_bytes + self.bulk_bytes
 
     def wait_for_room(self, num_bytes: int, limit: int) -> None:
-        """Wait until a chunk may be added.
-
-        Args:
-            limit: No more may wait with it, unless it is the only one.
-
-        Raises:
-            OSError: When the disk refuses; what waits is kept.
-        """
+        """Wait until a chunk may be added."""
         if not self._waiting() or self._waiting() + num_bytes <= limit:
             return
         self.raise_error()
@@ -139,12 +129,6 @@ class ChunkQueue:
                 )
             )
         self.raise_error()
-
-    def position(self) -> int:
-        """Bytes of the file when everything that waits is in it."""
-        with self._changed:
-            is_busy = self._busy_since_s is not None
-            return (self._began_at if is_busy else self._section.file.offset) + self._waiting()
 
     def drain(self) -> None:
         """Wait until everything is written; then the file is the caller's until the next ``add``.
@@ -209,7 +193,6 @@ class ChunkQueue:
                 turn_of_bulk = bool(small)
                 chunks = small or self._batch()
                 self._busy_since_s = self._monotonic()
-                self._began_at = self._section.file.offset
             error = None
             try:
                 self._section.add_chunks(chunks)

@@ -242,11 +242,7 @@ class StampWatch:
 
 
 def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) -> dict[str, Any]:
-    """Make the record of ``/recorder/clocks``.
-
-    Args:
-        identity: Of its process; another one has another clock.
-    """
+    """Make the record of ``/recorder/clocks``."""
     return {
         "schema_version": 1,
         "source": clock.source,
@@ -462,9 +458,6 @@ def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
 
     Args:
         clock: ``corrected`` takes the sources' offset and drift out of all stamps.
-
-    Raises:
-        EpisodeError: When nobody measured the clocks, or the file cannot be read.
     """
     episode = Episode.open(path)
     if clock == "recorded":

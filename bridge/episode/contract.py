@@ -79,12 +79,7 @@ class Contract:
 
 
 def read_contract(path: Path) -> Contract:
-    """Read a contract.
-
-    Raises:
-        ContractError: When it is no TOML, or holds what a contract cannot hold: names the key, what
-            is allowed there and what was probably meant.
-    """
+    """Read a contract."""
     try:
         values = tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
@@ -99,10 +94,8 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
     Args:
         run: The run folder; its ``cell.toml`` holds unless another is named.
-        name: A TOML file, or a template by name.
 
     Raises:
-        ContractError: When it cannot be used.
         UsageError: When there is no such template; lists those that are there.
     """
     if name is not None:
@@ -112,11 +105,7 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
 
 def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
-    """Build a contract from parsed values.
-
-    Raises:
-        ContractError: When something in it is not what a contract holds.
-    """
+    """Build a contract from parsed values."""
     _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
     version, topics = values.get("schema_version"), values.get("topics")
     if version != SCHEMA_VERSION:
@@ -168,14 +157,7 @@ def _refuse_unknown(
 
 
 def write_contract(contract: Contract, path: Path, *, source: str) -> None:
-    """Write a contract as a TOML file; one that is there is not replaced.
-
-    Args:
-        source: What it was learned from; goes into its first line.
-
-    Raises:
-        ContractError: When there is one already.
-    """
+    """Write a contract as a TOML file; one that is there is not replaced."""
     if path.exists():
         raise ContractError(f"{path} exists already. Move it away, or edit it.")
     lines = [
@@ -210,11 +192,7 @@ class Presence:
     """When it began."""
 
     def see(self, stamp_ns: int, pauses: Spans) -> None:
-        """Take the next message.
-
-        Args:
-            pauses: When nothing was to be recorded.
-        """
+        """Take the next message."""
         self.messages += 1
         last_ns = self.last_ns
         if not last_ns:
@@ -281,7 +259,6 @@ def judge(
     """Compare what was there with what was promised.
 
     Args:
-        presences: By topic.
         lost: By topic, messages that were sent and are not in the episode; they are not taken for
             silence of their publisher.
         by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
@@ -434,9 +411,6 @@ def learn_contract(presences: Mapping[str, Presence], *, cell: str) -> Contract:
 
     Regular streams get rate and silence, latched topics need only be there, and what comes when
     something happens (events, plans) is optional. Ground truth and our own records are left out.
-
-    Args:
-        presences: By topic, of an episode that is clean.
     """
     rules = {
         topic: _learned(topic, presence)

@@ -1,4 +1,4 @@
-"""As much of the Protocol Buffers wire format as video and audio messages need, in both directions.
+"""As much of the Protocol Buffers wire format as video messages need, in both directions.
 
 Source: the Protocol Buffers encoding page and ``descriptor.proto``. ``tests/parity`` holds it
 against Google's own package where that is installed.
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 """Wire types."""
-INT64_TYPE, INT32_TYPE, FIXED32_TYPE, STRING_TYPE, MESSAGE_TYPE, BYTES_TYPE = 3, 5, 7, 9, 11, 12
+INT64_TYPE, INT32_TYPE, STRING_TYPE, MESSAGE_TYPE, BYTES_TYPE = 3, 5, 9, 11, 12
 """``FieldDescriptorProto.Type``."""
 _FIXED_SIZES = {FIXED64: 8, FIXED32: 4}
 _MAX_VARINT_BYTES = 10

@@ -47,10 +47,6 @@ def open_parts(path: Path) -> Parts:
 
     A part says in its ``split`` record whether it is the last. Recovered parts may not say it:
     then the highest number that is there counts as the last.
-
-    Raises:
-        BrokenRecordError: When the first file is no finished MCAP file.
-        OSError: When the first file cannot be read.
     """
     first = McapFile(path)
     name = name_of_part(path)
@@ -176,11 +172,6 @@ class Episode:
         """Open a finished MCAP file, and the parts behind it where an episode was split.
 
         A part that is missing does not prevent reading the others: see ``missing_parts``.
-
-        Raises:
-            PathNotFoundError: When the file is not there.
-            EpisodeError: When it is no MCAP file, or was never finished.
-            SchemaVersionError: When it was written by a newer major version.
         """
         if not path.is_file():
             raise PathNotFoundError(path=path, what="episode", hint="robot-gst ls RUN lists them.")
@@ -315,9 +306,6 @@ class Episode:
             topics: Topics wanted; None for all.
             start_ns: First log time wanted, included [ns since 1970]; None: from the start.
             end_ns: Log time to stop before, excluded; None: to the end.
-
-        Raises:
-            EpisodeError: When a file turns out to be damaged.
         """
         wanted = None if topics is None else frozenset(topics)
         if wanted is not None and not wanted:
@@ -345,11 +333,7 @@ class Episode:
         return found
 
     def attachment(self, name: str) -> bytes | None:
-        """Return the bytes of the first attachment of this name with its CRC checked, or None.
-
-        Raises:
-            EpisodeError: When it is damaged.
-        """
+        """Return the bytes of the first attachment of this name with its CRC checked, or None."""
         for file in self.files:
             try:
                 found = file.attachment(name)

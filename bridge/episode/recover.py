@@ -15,7 +15,7 @@ from pathlib import Path
 from bridge.episode.check_file import Faults, FileCheck
 from bridge.episode.chunk_queue import JOURNAL, journal_path
 from bridge.episode.mcap.damaged import RecordFile, finished_data
-from bridge.episode.mcap.part_file import PartFile, lock_dead, sync_folder
+from bridge.episode.mcap.part_file import lock_dead, sync_folder
 from bridge.episode.mcap.scan import scan
 from bridge.episode.recovery_report import (
     RECORD_NAME,
@@ -24,12 +24,7 @@ from bridge.episode.recovery_report import (
     to_metadata,
 )
 from bridge.episode.run_folder import PART, SUFFIX, RunFolder
-from bridge.episode.salvage import (
-    CopyTarget,
-    InPlaceTarget,
-    NeedsCopyError,
-    scan_with_journal,
-)
+from bridge.episode.salvage import CopyTarget, scan_with_journal
 from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 TEMPORARY, UNREADABLE = ".recovering", ".unreadable"
@@ -45,44 +40,27 @@ class StillWrittenError(RecoveryError):
     """The writer of a part is alive."""
 
 
-def recover(path: Path, *, in_place: bool | None = None) -> RecoveryReport:
+def recover(path: Path) -> RecoveryReport:
     """Recover one file.
 
     ``<id>.mcap.part`` becomes ``<id>.mcap``, or ``<id>_recovered.mcap`` where that name is taken.
     Another broken file stays as it is, and ``<name>_recovered.mcap`` is made of it. A finished
     file is only renamed, if that.
-
-    Args:
-        in_place: Finish the file itself instead of a copy; None does so only for a part, and only
-            when the disk has no room for a copy.
-
-    Raises:
-        PathNotFoundError: When there is no such file.
-        StillWrittenError: While its writer lives.
-        RecoveryError: When the disk has no room, or the copy could not be proved.
-        OSError: When the disk fails.
     """
     if not path.is_file():
         hint = "robot-gst recover takes files, or folders to search for *.mcap.part."
         raise PathNotFoundError(path=path, what="file", hint=hint)
     is_part = path.name.endswith(PART)
-    write = in_place if in_place is not None else is_part
-    with _locked(path, write=write) as descriptor:
+    with _locked(path, write=is_part) as descriptor:
         source = RecordFile(descriptor)
         finished = _report_finished(path, source)
         if finished is not None:
             _drop_journal(path, finished)
             return finished
-        if in_place is None:
-            has_room = shutil.disk_usage(path.parent).free >= source.size + SPARE_BYTES
-            if not has_room and not is_part:
-                raise _no_room(path, source.size)
-            in_place = not has_room
+        if shutil.disk_usage(path.parent).free < source.size + SPARE_BYTES:
+            raise _no_room(path, source.size)
         with _journal_of(path) as journal:
-            if in_place:
-                report = _recover_in_place(path, source, journal)
-            else:
-                report = _recover_copy(path, source, journal)
+            report = _recover_copy(path, source, journal)
         _drop_journal(path, report)
         return report
 
@@ -201,28 +179,6 @@ def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) ->
         temporary.unlink(missing_ok=True)
 
 
-def _recover_in_place(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
-    tally = RecoveryTally()
-    target = InPlaceTarget(source, PartFile(path, source.descriptor))
-    try:
-        for found in scan_with_journal(source, journal):
-            tally.take(found)
-            target.take(found)
-    except NeedsCopyError as error:
-        raise _no_room(path, source.size) from error
-    report = tally.report(path, None, finished=False)
-    if not tally.has_data:
-        return report
-    try:
-        target.finish(RECORD_NAME, to_metadata(report))
-    except OSError as error:
-        message = (
-            f"{path} could not be finished: {error.strerror}. Free some space, then try again."
-        )
-        raise RecoveryError(message) from error
-    return replace(report, output=_publish(path) if path.name.endswith(PART) else path)
-
-
 def _prove(path: Path) -> None:
     """Read the copy back; its CRC covers every byte that was found whole before."""
     with path.open("rb") as stream:
@@ -279,6 +235,6 @@ def _free_name(path: Path, *, taken: bool) -> Path:
 
 def _no_room(path: Path, size: int) -> RecoveryError:
     return RecoveryError(
-        f"{path} needs {size / 1e6:.0f} MB beside it for a copy. Free some space, "
-        "move it to another disk, or pass --in-place where its end only is broken."
+        f"{path} needs {size / 1e6:.0f} MB beside it for a copy. Free some space, or move it to "
+        "another disk."
     )

@@ -161,7 +161,6 @@ class RecoveryTally:
 
         Args:
             output: The finished episode; None when there is none.
-            finished: The file was whole before; its reason is then that of an earlier recovery.
         """
         counts: dict[str, int] = {}
         last: dict[str, int] = {}

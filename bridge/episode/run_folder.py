@@ -82,15 +82,6 @@ def part_paths(path: Path) -> list[Path]:
     return [path, *(later for number, later in _later_parts(path) if number > index)]
 
 
-def first_part(path: Path) -> Path:
-    """Return the file that the episode of this one begins with; the file itself if unsplit."""
-    episode_id, index = _part_of(path.name)
-    if index == 1:
-        return path
-    first = path.with_name(part_name(episode_id, 1))
-    return first if first.is_file() else min([(index, path), *_later_parts(path)])[1]
-
-
 @dataclass(frozen=True)
 class RunFolder:
     """``episodes/``, ``tasks/``, ``scene/``, ``plans/``, ``derived/``, ``results/``, ``notes/``."""
@@ -99,12 +90,7 @@ class RunFolder:
 
     @staticmethod
     def open(path: Path) -> "RunFolder":
-        """Open an existing run folder.
-
-        Raises:
-            UsageError: When there is a file.
-            PathNotFoundError: When there is nothing.
-        """
+        """Open an existing run folder."""
         if path.is_file():
             message = f"{path} is a file, not a run. Give the folder that its episodes/ lies in."
             raise UsageError(message)
@@ -145,10 +131,6 @@ class RunFolder:
         """Plans made from words, each with the twin's replay of it beside it."""
         return self.path / "plans"
 
-    def holds_plan(self, path: Path) -> bool:
-        """Whether a file lies in ``plans/``, from wherever its path is written."""
-        return path.resolve().parent == self.plans_dir.resolve()
-
     @property
     def results_dir(self) -> Path:
         """What the evaluator computed."""
@@ -178,11 +160,7 @@ class RunFolder:
         return [folder / name for folder in folders for name in file_names(folder, SUFFIX + PART)]
 
     def refuse_empty(self) -> None:
-        """Raise where there is nothing to work on.
-
-        Raises:
-            UsageError: When the folder holds no episode.
-        """
+        """Raise where there is nothing to work on."""
         if not file_names(self.episodes_dir):
             message = f"no episodes in {self.path}. Record some: robot-gst record {self.path}."
             raise UsageError(message)

@@ -6,7 +6,6 @@ use the index see nothing else. Message indexes, summary and footer are made ane
 
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from mcap.records import Channel, Metadata, Schema
@@ -26,10 +25,7 @@ from bridge.episode.mcap.scan import (
     AttachmentSpan,
     Chunk,
     CutChunk,
-    Damage,
-    DataEnd,
     Found,
-    IndexSpan,
     Plain,
     TopMessage,
     scan,
@@ -65,7 +61,7 @@ def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterato
     for found in scan(journal):
         if isinstance(found, Chunk) and key_of(found) not in there:
             there.add(key_of(found))
-            yield replace(found, is_journalled=True)
+            yield found
 
 
 _RECORDS: dict[str, type] = {"episode": EpisodeInfo, "outcome": Outcome, "derived": Derived}
@@ -79,7 +75,7 @@ def is_readable(name: str, values: dict[str, str]) -> bool:
         return True
     try:
         build(_RECORDS[name], from_strings(values))
-    except TypeError:
+    except ValueError:
         return False
     return True
 
@@ -270,7 +266,7 @@ def verbatim(found: Chunk) -> EncodedChunk:
     buffers: list[Buffer] = [found.raw]
     if has_wrong_times(found):
         front = bytes(found.raw[:at]) + _TIMES.pack(start_ns, end_ns)
-        buffers = [front, found.raw[len(front) :]]
+        buffers = [front, memoryview(found.raw)[len(front) :]]
     crc = 0
     for buffer in buffers:
         crc = crc32(buffer, crc)
@@ -287,14 +283,10 @@ def verbatim(found: Chunk) -> EncodedChunk:
     )
 
 
-def salvaged_head(records: bytes, contents: Contents) -> bytes:
-    """Return the head of an unpacked chunk with the records that were saved from a cut one.
-
-    Args:
-        contents: What is in them; its log times become the chunk's.
-    """
+def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
+    """Return the records saved from a cut chunk as a whole one."""
     start_ns, end_ns = contents.time_range()
-    return mcap.chunk_head(
+    head = mcap.chunk_head(
         start_ns=start_ns,
         end_ns=end_ns,
         size=len(records),
@@ -302,16 +294,6 @@ def salvaged_head(records: bytes, contents: Contents) -> bytes:
         compression="",
         data_size=len(records),
     )
-
-
-def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
-    """Return the records saved from a cut chunk as a whole one.
-
-    Args:
-        records: The whole records from the chunk's front, unpacked; they are written so.
-    """
-    head = salvaged_head(records, contents)
-    start_ns, end_ns = contents.time_range()
     return EncodedChunk(
         buffers=[head, records],
         length=len(head) + len(records),
@@ -323,142 +305,3 @@ def salvaged(records: bytes, contents: Contents) -> EncodedChunk:
         uncompressed_size=len(records),
         index=contents.index,
     )
-
-
-# Only the end of the file is touched: what is whole stays, the torn rest is cut off, and the
-# closing part is written. Killed at any moment, it can be done again.
-
-
-class NeedsCopyError(Exception):
-    """The damage is not at the end only. Never leaves recovery."""
-
-
-class InPlaceTarget:
-    """The same file. ``take`` everything first; nothing is written before ``finish``."""
-
-    def __init__(self, source: RecordFile, part: PartFile) -> None:
-        """Book into ``part``, which is the source itself opened for writing."""
-        self._source = source
-        self.section = DataSection(part)
-        self._end = 0
-        self._chunk: Chunk | None = None
-        self._indexes: list[IndexSpan] = []
-        self._journalled: list[EncodedChunk] = []
-        self._cut: CutChunk | None = None
-
-    def take(self, found: Found) -> None:
-        """Book one thing.
-
-        Raises:
-            NeedsCopyError: For damage with something whole after it, and for definitions that
-                were lost with it.
-        """
-        match found:
-            case IndexSpan():
-                self._indexes.append(found)
-            case Damage():
-                if not found.at_end:
-                    raise NeedsCopyError
-            case CutChunk() if found.head.compression == "":
-                self._define(found.contents)
-                self._cut = found
-            case CutChunk() | DataEnd():
-                pass
-            case Chunk() if found.is_journalled:
-                self._define(found.contents)
-                self._journalled.append(verbatim(replace(found, raw=memoryview(bytes(found.raw)))))
-            case _:
-                self._close_chunk()
-                self._take_whole(found)
-                self._end = found.end
-
-    def _take_whole(self, found: Chunk | Plain | TopMessage | AttachmentSpan) -> None:
-        summary = self.section.summary
-        match found:
-            case Chunk():
-                if has_wrong_times(found):
-                    raise NeedsCopyError
-                self._define(found.contents)
-                self._chunk = found
-            case Plain(record=Metadata(name=name)):
-                summary.add_metadata(name, offset=found.offset, length=found.length)
-            case Plain() if found.opcode in (mcap.SCHEMA, mcap.CHANNEL):
-                self._book(found.raw)
-            case TopMessage():
-                self._require(found.channel_id)
-                stamp_ns = found.log_time_ns
-                summary.add_messages({found.channel_id: 1}, start_ns=stamp_ns, end_ns=stamp_ns)
-            case AttachmentSpan():
-                summary.add_attachment(
-                    found.name,
-                    media_type=found.media_type,
-                    log_time_ns=found.log_time_ns,
-                    create_time_ns=found.create_time_ns,
-                    data_size=found.data_size,
-                    offset=found.offset,
-                    length=found.length,
-                )
-
-    def _book(self, raw: bytes) -> None:
-        summary = self.section.summary
-        match read_plain(raw):
-            case Schema(id=schema_id):
-                summary.schemas.setdefault(schema_id, raw)
-            case Channel(id=channel_id, schema_id=schema_id):
-                if schema_id and schema_id not in summary.schemas:
-                    raise NeedsCopyError
-                summary.channels.setdefault(channel_id, raw)
-
-    def _define(self, contents: Contents) -> None:
-        for raw in contents.definitions:
-            self._book(raw)
-        for channel_id in contents.index:
-            self._require(channel_id)
-
-    def _require(self, channel_id: int) -> None:
-        if channel_id not in self.section.summary.channels:
-            raise NeedsCopyError
-
-    def _close_chunk(self) -> None:
-        """Tell the summary of a chunk, and of its message indexes if all of them are right."""
-        chunk, self._chunk = self._chunk, None
-        indexes, self._indexes = self._indexes, []
-        if chunk is None:
-            return
-        offsets = {}
-        for span in indexes:
-            raw = self._source.read(span.offset, span.length)
-            for channel_id, entries in chunk.contents.index.items():
-                if raw == mcap.message_index(channel_id, entries):
-                    offsets[channel_id] = span.offset
-        right = offsets.keys() == chunk.contents.index.keys()
-        index_length = indexes[-1].end - chunk.end if indexes and right else 0
-        encoded = verbatim(chunk)
-        self.section.book(encoded, chunk.offset, offsets if right else {}, index_length)
-
-    def finish(self, metadata_name: str, values: dict[str, str]) -> PartFile:
-        """Cut off what is torn, write the rest and sync.
-
-        Raises:
-            OSError: When there is no room even for that; what was whole still is.
-        """
-        file = self.section.file
-        if self._cut is not None:
-            self._close_chunk()
-            self._end = self._cut.offset
-            head = salvaged_head(self._cut.records, self._cut.contents)
-            file.overwrite(self._cut.offset, head)
-            self._end += len(head) + len(self._cut.records)
-        file.truncate(self._end, self._source.crc(0, self._end))
-        if self._cut is not None:
-            self.section.add_indexes(
-                salvaged(self._cut.records, self._cut.contents), self._cut.offset
-            )
-        elif self._chunk is not None:
-            self.section.add_indexes(verbatim(self._chunk), self._chunk.offset)
-        for encoded in self._journalled:
-            self.section.add_chunk(encoded)
-        self.section.add_metadata(metadata_name, values)
-        self.section.seal()
-        file.sync_data()
-        return file

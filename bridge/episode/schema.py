@@ -147,7 +147,6 @@ ENTRY = "recorder/Entry"
 ADVICE = "gst/Advice"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
-RAW_AUDIO = "foxglove.RawAudio"
 
 _JSON_SCHEMAS = {
     PLAN: ("bridge.task", "schemas/plan.schema.json"),
@@ -190,36 +189,17 @@ def schema_for(name: str) -> Schema | None:
         return Schema(
             name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
         )
-    if name in PROTOBUF_MEMBERS:
+    if name == COMPRESSED_VIDEO:
         return Schema(
             name=name,
             schema_encoding="protobuf",
             message_encoding="protobuf",
-            data=_foxglove_descriptor(name),
+            data=_video_descriptor(),
         )
     return None
 
 
-_TIME = ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp")
-PROTOBUF_MEMBERS = {
-    COMPRESSED_VIDEO: (
-        _TIME,
-        ("frame_id", 2, protobuf.STRING_TYPE, ""),
-        ("data", 3, protobuf.BYTES_TYPE, ""),
-        ("format", 4, protobuf.STRING_TYPE, ""),
-    ),
-    RAW_AUDIO: (
-        _TIME,
-        ("data", 2, protobuf.BYTES_TYPE, ""),
-        ("format", 3, protobuf.STRING_TYPE, ""),
-        ("sample_rate", 4, protobuf.FIXED32_TYPE, ""),
-        ("number_of_channels", 5, protobuf.FIXED32_TYPE, ""),
-    ),
-}
-"""Foxglove's types with their time in field 1: name, number, type of each field."""
-
-
-def _foxglove_descriptor(name: str) -> bytes:
+def _video_descriptor() -> bytes:
     timestamp = "google/protobuf/timestamp.proto"
     return protobuf.file_descriptor(
         name=timestamp,
@@ -227,11 +207,16 @@ def _foxglove_descriptor(name: str) -> bytes:
         message="Timestamp",
         members=[("seconds", 1, protobuf.INT64_TYPE, ""), ("nanos", 2, protobuf.INT32_TYPE, "")],
     ) + protobuf.file_descriptor(
-        name=name.replace(".", "/") + ".proto",
+        name=COMPRESSED_VIDEO.replace(".", "/") + ".proto",
         package="foxglove",
-        message=name.removeprefix("foxglove."),
+        message=COMPRESSED_VIDEO.removeprefix("foxglove."),
         imports=[timestamp],
-        members=PROTOBUF_MEMBERS[name],
+        members=[
+            ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp"),
+            ("frame_id", 2, protobuf.STRING_TYPE, ""),
+            ("data", 3, protobuf.BYTES_TYPE, ""),
+            ("format", 4, protobuf.STRING_TYPE, ""),
+        ],
     )
 
 

@@ -159,10 +159,6 @@ def image_messages(
     Args:
         start_ns: First log time wanted [ns since 1970]; None: from the start.
         end_ns: Log time to stop before [ns since 1970]; None: to the end.
-
-    Raises:
-        EpisodeError: When the file or a frame is damaged.
-        MissingDependencyError: When there is a video and PyAV is not installed.
     """
     decoders: dict[tuple[str, str], VideoDecoder] = {}
     waiting: dict[int, RawMessage] = {}
@@ -203,7 +199,6 @@ def rgbd_frames(
     """Yield posed frames in time order; colour without depth nearby is passed over.
 
     Args:
-        episode: Must have colour and depth of the camera.
         tree: The episode's frames where they are known; None reads them from it.
     """
     tree = transform_tree(episode) if tree is None else tree
@@ -330,11 +325,7 @@ def executed_interval_ns(episode: Episode, plan_id: str) -> tuple[int, int] | No
 def execution_ns(
     records: Iterable[Mapping[str, Any]], plan_id: str
 ) -> tuple[int | None, int | None]:
-    """Source times [ns] at which a plan's execution started and ended, as far as events say.
-
-    Args:
-        records: Events in the order they were recorded.
-    """
+    """Source times [ns] at which a plan's execution started and ended, as far as events say."""
     start: int | None = None
     for event in records:
         if event.get("plan_id") != plan_id:
@@ -406,11 +397,6 @@ def task_file(episode: Episode, name: str = "") -> TaskFile:
 
     Args:
         episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
-        name: Of the task, where the episode itself names none.
-
-    Raises:
-        MissingTaskError: Saying where it looked.
-        EpisodeError: When the attachment is damaged.
     """
     info = episode.info
     attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)

@@ -144,11 +144,7 @@ def is_latched(topic: str) -> bool:
 
 
 def refuse_bad_name(what: str, name: str) -> None:
-    """Check that a name can stand between two slashes.
-
-    Raises:
-        UsageError: When it cannot.
-    """
+    """Check that a name can stand between two slashes."""
     if not _NAME.fullmatch(name):
         raise UsageError(
             f"{what} name {name!r} cannot be part of a topic. "

@@ -57,12 +57,7 @@ class TransformTree:
         return sorted(set(self._parents) | set(self._parents.values()))
 
     def root_of(self, frame: str) -> str:
-        """Follow parents up to the frame that has none.
-
-        Raises:
-            FrameNotFoundError: When no transform names the frame.
-            AmbiguousFrameError: When transforms lead to several places.
-        """
+        """Follow parents up to the frame that has none."""
         if frame not in self._parents and frame not in self._parents.values():
             raise FrameNotFoundError(frame=frame, known=self.frames())
         seen: list[str] = []
@@ -79,10 +74,6 @@ class TransformTree:
         """When a frame's pose was stated; in between it is interpolated.
 
         Of several transforms on the way to the root, the one that was stated most often counts.
-
-        Raises:
-            FrameNotFoundError: When no transform names the frame.
-            AmbiguousFrameError: When transforms lead to several places.
         """
         root, stamps = self.root_of(frame), np.zeros(0, dtype=np.int64)
         while frame != root:
@@ -96,10 +87,6 @@ class TransformTree:
         Args:
             frame: Name of the frame.
             stamp_ns: Source time [ns since 1970]; between recorded transforms it is interpolated.
-
-        Raises:
-            FrameNotFoundError: When no transform names the frame; lists those that exist.
-            AmbiguousFrameError: When transforms lead to several places.
         """
         T: Float[np.ndarray, "4 4"] = self.Ts_root_frame(frame, np.array([stamp_ns]))[0]
         return T

@@ -79,13 +79,7 @@ class Channels:
         message_encoding: str,
         about: About = (),
     ) -> Channel:
-        """Return the channel of a topic.
-
-        Args:
-            record: Schema of the messages, or none.
-            message_encoding: Used where there is no schema.
-            about: What the channel's metadata says; another text is another channel.
-        """
+        """Return the channel of a topic."""
         # Comparing schemas by identity spares hashing their text for every message; the value
         # keeps the schema alive, so that its identity is not given to another.
         quick_key = (topic, id(record), message_encoding, about)
@@ -144,7 +138,6 @@ def is_large(type_name: str, length: int) -> bool:
     """Say whether a message of this many bytes belongs to a stream with chunks of its own.
 
     Args:
-        type_name: Of the message; some types, such as images, are large whatever they weigh.
         length: Of this message [bytes].
     """
     return type_name in _LARGE_TYPES or length >= LARGE_BYTES
@@ -161,9 +154,6 @@ def is_worth_compressing(type_name: str, front: bytes) -> bool:
     """Judge a stream by its type and the front of its first message: zstd for depth and unknown.
 
     Raw colour is left as it is: zstd takes a quarter off it for more CPU time than JPEG.
-
-    Args:
-        front: First bytes of its first message, with the encoding of an image in them.
     """
     if type_name in _PACKED_TYPES:
         return b"compressedDepth rvl" in front
@@ -221,7 +211,6 @@ class EpisodeWriter:
 
         Raises:
             UsageError: When the episode exists, or is being written, or waits to be recovered.
-            BridgeError: When the folder cannot be written.
         """
         self.path = path
         self.part_path = path.with_name(path.name + ".part")
@@ -247,11 +236,6 @@ class EpisodeWriter:
             )
         self._sync = BackgroundSync(self._file, config.sync_s) if config.sync_s else None
         self._open = True
-
-    @property
-    def bytes_written(self) -> int:
-        """Bytes in the file or on their way; chunks being filled are not among them."""
-        return self._file.offset if self._queue is None else self._queue.position()
 
     @property
     def backlog_bytes(self) -> int:
@@ -316,13 +300,10 @@ class EpisodeWriter:
         """Append one message with the given schema, or none; the bytes are kept as they are.
 
         Args:
-            data: The serialised message, in one buffer or several; not looked at.
             schema_record: What it is; None where nobody knows.
-            message_encoding: Used where there is no schema, which else says it itself.
             log_time_ns: When it was received [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
             sequence: The publisher's number of it; None counts on from the message before.
-            about: Metadata of its channel: one topic with two texts has two channels.
         """
         channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
@@ -411,7 +392,6 @@ class EpisodeWriter:
         """Append one JSON record.
 
         Args:
-            record: Written as it is; not checked against its schema.
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
         """
         data = json.dumps(record, separators=(",", ":")).encode()
@@ -481,11 +461,7 @@ class EpisodeWriter:
                 self._flush(group)
 
     def keep_name(self) -> bool:
-        """Write the file anew where somebody removed it, and say whether that was needed.
-
-        Raises:
-            OSError: When it cannot be written there.
-        """
+        """Write the file anew where somebody removed it, and say whether that was needed."""
         if self._file.is_there():
             return False
         self.wait_for_disk()

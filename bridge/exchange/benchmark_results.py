@@ -26,10 +26,6 @@ def read_simpler(folder: Path) -> list[TrialRecord]:
 
     ``<policy>/<scene>/<control>/<task>/rob_<pose>/success_obj_<start>_<statistics>.mp4``; folders
     that are not there stay empty. The start is the robot's pose and the object's.
-
-    Raises:
-        PathNotFoundError: When the folder is not there.
-        TableError: Without a video named so, or when one start both succeeded and failed.
     """
     if not folder.is_dir():
         hint = "Give the folder SIMPLER logged into."
@@ -80,9 +76,6 @@ def read_polaris(path: Path) -> list[TrialRecord]:
     """Read PolaRiS' ``eval_results.csv``: the task is the folder it lies in.
 
     ``success`` there is latched (ever reached); ``progress`` is partial credit, 0 to 1.
-
-    Raises:
-        TableError: Naming the row that cannot be believed.
     """
     trials: dict[str, TrialRecord] = {}
     for row in read_rows(path, ("episode", "success"), POLARIS_COLUMNS):
@@ -107,12 +100,7 @@ def read_polaris(path: Path) -> list[TrialRecord]:
 
 
 def read_lerobot_eval(path: Path) -> list[TrialRecord]:
-    """Read LeRobot's ``eval_info.json``, of one task (``per_episode``) or several (``per_task``).
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it holds no outcomes per episode.
-    """
+    """Read LeRobot's ``eval_info.json`` of one task or several."""
     if not path.is_file():
         hint = "Give the eval_info.json that lerobot-eval wrote."
         raise PathNotFoundError(path=path, what="results file", hint=hint)

@@ -256,11 +256,7 @@ class _Sheet:
 
 
 def episode_files(source: Path, *, derived: bool) -> tuple[list[Path], Path]:
-    """Return the episode files of a run, or the one given, and the folder they are named from.
-
-    Raises:
-        UsageError: When there is nothing to export.
-    """
+    """Return the episode files of a run, or the one given, and the folder they are named from."""
     if not source.is_dir():
         return [source], source.parent
     run = RunFolder.open(source)
@@ -279,11 +275,7 @@ def export_csv(
 ) -> dict[str, int]:
     """Write ``episodes.csv`` and one CSV file per family of topics that has messages.
 
-    Args:
-        clock: Whose clock stamps are read in.
-
     Raises:
-        EpisodeError: Naming the episode, topic and message that cannot be read.
         UsageError: When there is nothing to export, or ``out`` may not be replaced.
     """
     files, base = episode_files(source, derived=derived)

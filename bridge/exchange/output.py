@@ -21,9 +21,6 @@ def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
 
     Args:
         number: The message's place among those read, from 1.
-
-    Raises:
-        EpisodeError: In place of the ``BridgeError`` that came out.
     """
     try:
         yield
@@ -44,12 +41,8 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 def new_folder(out: Path, *, force: bool) -> Iterator[Path]:
     """Yield a folder to fill; it becomes ``out`` when the block ends well, and is removed if not.
 
-    Args:
-        force: Replace what an earlier export wrote there; nothing else is ever replaced.
-
     Raises:
         UsageError: When something is there that may not be replaced.
-        BridgeError: When the place cannot be written.
     """
     if out.is_symlink() or out.exists():
         _refuse_strangers(out, force=force)
@@ -104,7 +97,6 @@ def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict
     """Write what the folder is made of: sources with their hashes, software, every choice.
 
     Args:
-        sources: The episode files; each is read once for its hash.
         choices: Whatever else decided about the result; must be JSON.
     """
     record = {

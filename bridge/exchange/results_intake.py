@@ -88,13 +88,7 @@ def is_large(path: Path) -> bool:
 
 
 def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
-    """Read a file, or a folder of SIMPLER videos; its content tells what it is.
-
-    Raises:
-        PathNotFoundError: When it is not there.
-        TableError: Naming the row that cannot be believed.
-        UsageError: When it is nothing that can be read.
-    """
+    """Read a file, or a folder of SIMPLER videos; its content tells what it is."""
     if path.is_dir():
         trials = read_simpler(path)
         return _rollouts(path, SIMPLER, trials, f"{len(trials)} videos named by their outcome")
@@ -204,11 +198,7 @@ def _listed(path: Path) -> list[dict[str, Any]] | None:
 
 
 def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[Taken], list[Left]]:
-    """Find what can be read in a folder of results, and say what was left and why.
-
-    Raises:
-        PathNotFoundError: When it is not a folder.
-    """
+    """Find what can be read in a folder of results, and say what was left and why."""
     if not folder.is_dir():
         raise PathNotFoundError(path=folder, what="folder of results", hint="Give a folder.")
     files = sorted(path for path in folder.rglob("*") if path.is_file())[:MOST_FILES]

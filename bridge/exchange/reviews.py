@@ -60,11 +60,7 @@ class Review:
         return self.result, self.cause, self.note, self.flag
 
     def write(self, run_path: Path) -> Path:
-        """Keep the label in a run; an earlier one of the same rater is replaced.
-
-        Raises:
-            InvalidRecordError: When it does not fit the schema.
-        """
+        """Keep the label in a run; an earlier one of the same rater is replaced."""
         path = _path(run_path, self.trial_id, self.rater)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, self._to_json())
@@ -103,11 +99,7 @@ class ReviewConflictError(BridgeError):
 
 
 def saved_review(run_path: Path, trial_id: str, rater: str) -> SavedReview:
-    """Return the label that a rater gave a trial in the run's own files.
-
-    Raises:
-        InvalidRecordError: When the file does not fit the schema.
-    """
+    """Return the label that a rater gave a trial in the run's own files."""
     path = _path(run_path, trial_id, rater)
     try:
         data = path.read_bytes()
@@ -125,10 +117,6 @@ def save_review(
 
     Args:
         review: The label; None takes it away.
-
-    Raises:
-        ReviewConflictError: When another version is there, which says something else.
-        InvalidRecordError: When the label does not fit the schema.
     """
     path = _path(run_path, trial_id, rater)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -173,16 +161,7 @@ def _plain(name: str) -> str:
 
 
 def read_reviews(path: Path, options: TableOptions = AS_SAVED) -> list[Review]:
-    """Read labels from a CSV, a JSON file, or a folder of them.
-
-    Args:
-        path: The file or folder; files of other kinds are passed over.
-
-    Raises:
-        PathNotFoundError: When it is not there.
-        TableError: Naming the row of a CSV that is no label.
-        InvalidRecordError: When a JSON file does not fit the schema.
-    """
+    """Read labels from a CSV, a JSON file, or a folder of them."""
     if path.is_dir():
         return latest([r for file in _files(path) for r in read_reviews(file, options)])
     if not path.is_file():

@@ -79,11 +79,6 @@ def export_tum(
 
     Args:
         camera: Only this camera; None for all.
-        color: Colour as recorded (JPEG passes through), or decoded to PNG.
-
-    Raises:
-        EpisodeError: When there is no such camera, or an image cannot be read.
-        UsageError: When ``out`` may not be replaced.
     """
     known = camera_ids(episode)
     wanted = known if camera is None else [camera]

@@ -57,13 +57,7 @@ class ImportReport:
 
 
 def find_files(source: Path) -> list[Path]:
-    """Return the files of a bag in their order; a single file is its own bag.
-
-    Raises:
-        PathNotFoundError: When there is nothing, or a file that ``metadata.yaml`` lists is gone.
-        BagFormatError: When the bag is stored or compressed in a way that is not known here.
-        MissingDependencyError: When ``metadata.yaml`` cannot be read for want of a YAML reader.
-    """
+    """Return the files of a bag in their order; a single file is its own bag."""
     if source.is_file():
         return [source]
     if not source.is_dir():
@@ -146,10 +140,6 @@ def import_bag(
     Args:
         source: A file, or a folder with ``metadata.yaml`` or several files.
         task: Name of the task it is a trial of; "": it is not known to be one.
-
-    Raises:
-        EpisodeError: When a file is damaged or was never finished.
-        UsageError: When the episode exists already.
     """
     check_episode_id(episode_id)
     sources = find_files(source)

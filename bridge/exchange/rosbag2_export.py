@@ -65,12 +65,8 @@ def export_bag(
 ) -> ExportReport:
     """Write an episode as a bag.
 
-    Args:
-        json_as_string: JSON records become std_msgs/String instead of being left out.
-
     Raises:
         UsageError: When nothing can go into a bag, or ``out`` is in the way.
-        EpisodeError: When the episode is damaged.
     """
     report = ExportReport()
     channels = {

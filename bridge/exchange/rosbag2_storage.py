@@ -33,11 +33,7 @@ class BagFormatError(BridgeError):
 
 
 def unpack_file(path: Path, folder: Path) -> Path:
-    """Return a file as it was before rosbag2 compressed it; one that is not compressed itself.
-
-    Raises:
-        EpisodeError: When it is damaged.
-    """
+    """Return a file as it was before rosbag2 compressed it; one that is not compressed itself."""
     with path.open("rb") as stream:
         if stream.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
             return path
@@ -53,11 +49,7 @@ def unpack_file(path: Path, folder: Path) -> Path:
 
 
 def unpack_message(path: Path, data: bytes) -> bytes:
-    """Return a message as it was before rosbag2 compressed it; any other as it is.
-
-    Raises:
-        EpisodeError: When it is damaged, or larger than ``MAX_UNPACKED_BYTES``.
-    """
+    """Return a message as it was before rosbag2 compressed it; any other as it is."""
     if not data.startswith(ZSTD_MAGIC):
         return data
     unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
@@ -100,11 +92,7 @@ class SqliteBag:
     """A finished database of rosbag2; nothing in it is changed."""
 
     def __init__(self, path: Path) -> None:
-        """Open it.
-
-        Raises:
-            EpisodeError: When it is no such database, or damaged.
-        """
+        """Open it."""
         self.path = path
         try:
             self._database = sqlite3.connect(
@@ -143,11 +131,7 @@ class SqliteBag:
         return {str(name): (str(encoding), str(text)) for name, encoding, text in rows}
 
     def messages(self) -> Iterator[BagMessage]:
-        """Yield every message by time, then as it was written; a bag has one time for each.
-
-        Raises:
-            EpisodeError: When the database or a compressed message is damaged.
-        """
+        """Yield every message by time, then as it was written; a bag has one time for each."""
         try:
             rows = self._database.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id"

@@ -122,11 +122,7 @@ class SourceRow:
         return number
 
     def figure(self, name: str) -> str:
-        """Return the text of a number with a point, where a decimal comma can only mean that.
-
-        Raises:
-            TableError: For ``1,234``, which is 1.234 to one reader and 1234 to another.
-        """
+        """Return the text of a number with a point, where a decimal comma can only mean that."""
         text = self.text(name)
         if _DECIMAL_COMMA.fullmatch(text):
             digits = text.removesuffix("%").partition(",")[2]
@@ -180,11 +176,7 @@ class TableText:
     """By axis: the column that holds its value."""
 
     def lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the rows below the header with their numbers; blank ones are left out.
-
-        Raises:
-            TableError: When a row has more or fewer fields than the header, or is no text.
-        """
+        """Yield the rows below the header with their numbers; blank ones are left out."""
         width = len(self.header)
         for number, cells in numbered_lines(self.path, self.delimiter):
             if number <= self.header_row:
@@ -228,16 +220,7 @@ class TableText:
 def open_table(
     path: Path, known: Sequence[str], options: TableOptions = AS_SAVED, *, near: bool = True
 ) -> TableText:
-    """Find out how a table is written and which of its columns are ours.
-
-    Args:
-        path: The file, in UTF-8.
-        near: Refuse a column whose name is almost one of ours.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it is no text, or a column is there twice, or almost named like ours.
-    """
+    """Find out how a table is written and which of its columns are ours."""
     if not path.is_file():
         hint = "Give a run folder, or a CSV file."
         raise PathNotFoundError(path=path, what="run folder or table", hint=hint)
@@ -310,14 +293,7 @@ def _header(path: Path, known: Sequence[str]) -> tuple[str, list[str], int]:
 
 
 def numbered_lines(path: Path, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield the lines of a table with their numbers; blank ones and comments are left out.
-
-    Args:
-        path: The file, in UTF-8.
-
-    Raises:
-        TableError: When it is no text.
-    """
+    """Yield the lines of a table with their numbers; blank ones and comments are left out."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             for number, cells in enumerate(csv.reader(stream, delimiter=delimiter), start=1):
@@ -361,9 +337,6 @@ def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> 
 
     Args:
         required: Columns that must be there.
-
-    Raises:
-        TableError: Naming the columns.
     """
     if not table.header:
         hint = f"Columns: {', '.join(known)}"
@@ -386,22 +359,13 @@ def read_rows(
     """Read a table with a header.
 
     Args:
-        path: The file, in UTF-8.
         required: Columns that must be there.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: When it is no text, a column is missing or doubled, or a row is ragged.
     """
     return rows_of(require(open_table(path, known, options), required, known))
 
 
 def rows_of(table: TableText) -> list[SourceRow]:
-    """Read all rows of a table.
-
-    Raises:
-        TableError: When there is none, or one is ragged.
-    """
+    """Read all rows of a table."""
     rows = [table.row(number, cells) for number, cells in table.lines()]
     if not rows:
         found = "a header without rows"

@@ -68,11 +68,7 @@ SIDES_OF_TRIAL = ("recorded", "sim_planned", "sim_executed", "verdict", "k")
 
 
 def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
-    """Open a table of trials.
-
-    Raises:
-        TableError: When it has no task, or neither ids nor outcomes.
-    """
+    """Open a table of trials."""
     table = open_table(path, COLUMNS, options)
     if any(name in table.header for name in SIDES_OF_TRIAL):
         return require(table, ("task",), COLUMNS)
@@ -80,11 +76,7 @@ def open_trials(path: Path, options: TableOptions = AS_SAVED) -> TableText:
 
 
 def read_trials(path: Path, options: TableOptions = AS_SAVED) -> list[TrialRecord]:
-    """Read and check a trials CSV.
-
-    Raises:
-        TableError: For a doubled trial id, an impossible count, or two units in one task.
-    """
+    """Read and check a trials CSV."""
     return trials_of(rows_of(open_trials(path, options)))
 
 
@@ -95,9 +87,6 @@ def read_trials_by_side(path: Path, options: TableOptions = AS_SAVED) -> list[Tr
 
     Args:
         options: Columns whose names differ from ours; ``outcome`` is one of them, as a rule.
-
-    Raises:
-        TableError: For an unknown side, and as ``read_trials``.
     """
     table = require(open_table(path, (*COLUMNS, "side"), options), ("task", "side"), COLUMNS)
     if OUTCOME not in table.header:
@@ -128,11 +117,7 @@ def _on_its_side(row: SourceRow, stand_in: str) -> SourceRow:
 
 
 def read_trials_json(path: Path, items: Sequence[dict[str, object]]) -> list[TrialRecord]:
-    """Read trials that a JSON file lists as objects with our columns as keys.
-
-    Raises:
-        TableError: As ``read_trials``; rows are counted from 1.
-    """
+    """Read trials that a JSON file lists as objects with our columns as keys."""
     return trials_of(json_rows(path, items, COLUMNS))
 
 
@@ -159,11 +144,7 @@ def _json_text(value: object) -> str:
 
 
 def trials_of(rows: Sequence[SourceRow]) -> list[TrialRecord]:
-    """Check the rows of a table of trials, each alone and beside the others.
-
-    Raises:
-        TableError: For a doubled trial id, an impossible count, or two units in one task.
-    """
+    """Check the rows of a table of trials, each alone and beside the others."""
     seen: dict[str, int] = {}
     units: dict[str, tuple[str, int]] = {}
     trials = []
@@ -185,9 +166,6 @@ def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, i
 
     Args:
         units: By task: its unit and the row that gave it first; a new task is added.
-
-    Raises:
-        TableError: Naming both rows.
     """
     unit, first = units.setdefault(trial.task, (trial.unit, row.row))
     if unit != trial.unit:
@@ -198,11 +176,7 @@ def check_unit(row: SourceRow, trial: TrialRecord, units: dict[str, tuple[str, i
 
 
 def read_trial(row: SourceRow) -> TrialRecord:
-    """Read and check one row.
-
-    Raises:
-        TableError: For what no trial can be.
-    """
+    """Read and check one row."""
     for name in ("trial_id", "task"):
         if not row.text(name) and (name == "task" or name in row.values):
             raise row.refuse(f"{name} is empty", f"Every trial needs a {name}")
@@ -264,12 +238,7 @@ def _tags(row: SourceRow) -> tuple[tuple[str, str], ...]:
 
 
 def write_trials(path: Path, trials: Iterable[TrialRecord]) -> Path:
-    """Write a trials CSV that ``read_trials`` reads back as it was.
-
-    Args:
-        path: The file to write; an older one is replaced.
-        trials: In the order of the rows.
-    """
+    """Write a trials CSV that ``read_trials`` reads back as it was."""
     path.write_text(trials_text(trials), encoding="utf-8", newline="")
     return path
 
@@ -304,12 +273,7 @@ def trials_path(run: RunFolder) -> Path:
 
 
 def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialRecord]:
-    """Check a trials CSV and keep it in the run, with all columns and in one spelling.
-
-    Raises:
-        TableError: Naming the row that cannot be believed; nothing is written then.
-        UsageError: When the run has imported trials already.
-    """
+    """Check a trials CSV and keep it in the run, with all columns and in one spelling."""
     trials = read_trials(table)
     path = trials_path(run)
     if path.exists() and not force:

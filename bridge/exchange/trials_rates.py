@@ -45,20 +45,12 @@ class RateRecord:
 
 
 def read_rates(path: Path, options: TableOptions = AS_SAVED) -> list[RateRecord]:
-    """Read and check a rates CSV.
-
-    Raises:
-        TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
-    """
+    """Read and check a rates CSV."""
     return rates_of(read_rows(path, ("task", "side"), COLUMNS, options))
 
 
 def rates_of(rows: Sequence[SourceRow]) -> list[RateRecord]:
-    """Check the rows of a table of rates, each alone and beside the others.
-
-    Raises:
-        TableError: For a rate that is no count of n, doubled cells, or units that differ in a task.
-    """
+    """Check the rows of a table of rates, each alone and beside the others."""
     records: list[RateRecord] = []
     for row in rows:
         record = read_rate(row)
@@ -68,11 +60,7 @@ def rates_of(rows: Sequence[SourceRow]) -> list[RateRecord]:
 
 
 def check_beside(row: SourceRow, record: RateRecord, earlier: Sequence[RateRecord]) -> None:
-    """Refuse a cell that is there already, and a second unit in one task.
-
-    Raises:
-        TableError: Naming both rows.
-    """
+    """Refuse a cell that is there already, and a second unit in one task."""
     for other in earlier:
         if other.task == record.task and other.unit != record.unit:
             raise row.refuse(
@@ -99,13 +87,7 @@ def _key(record: RateRecord) -> tuple[str, str, str, str]:
 
 
 def read_rate(row: SourceRow) -> RateRecord:
-    """Read one row of a rates CSV; other columns than ours are not looked at.
-
-    Raises:
-        ImpossibleRateError: For a rate that is no count of n.
-        AmbiguousRateError: For a rate that is several counts of n.
-        TableError: For everything else that no rate can be.
-    """
+    """Read one row of a rates CSV; other columns than ours are not looked at."""
     if not row.text("task"):
         raise row.refuse("task is empty", "Every rate needs its task")
     side, unit = row.text("side").lower(), row.text("unit") or "trial"
@@ -141,11 +123,7 @@ def read_rate(row: SourceRow) -> RateRecord:
 
 
 def printed_rate(row: SourceRow) -> tuple[Fraction, Fraction] | None:
-    """Return the rate as printed and half a unit of its last digit, both as fractions of 1.
-
-    Raises:
-        TableError: For what is not a rate.
-    """
+    """Return the rate as printed and half a unit of its last digit, both as fractions of 1."""
     texts = {name: row.figure(name) for name in ("rate", "rate_percent")}
     given = {name: text for name, text in texts.items() if text}
     if len(given) == 2:

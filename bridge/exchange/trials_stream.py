@@ -32,12 +32,7 @@ SINGLE = ("trial_id", "start_id", "p_success", "progress", "sim_progress")
 
 
 def count_trials(path: Path, options: TableOptions = AS_SAVED) -> list[tuple[TrialRecord, int]]:
-    """Count equal rows of a trials CSV; their ids are empty.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        TableError: Naming the row that cannot be believed, or that is there twice.
-    """
+    """Count equal rows of a trials CSV; their ids are empty."""
     table = open_trials(path, options)
     with tempfile.TemporaryDirectory(prefix="robot-gst-ids-") as folder, _Ids(Path(folder)) as ids:
         found = _count(table, ids)

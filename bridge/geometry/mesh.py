@@ -24,9 +24,6 @@ def sample_triangles(
 ]:
     """Spread points over triangles, evenly over their area.
 
-    Args:
-        in_order: Go through the triangles in equal steps of area instead of drawing them.
-
     Returns:
         The triangle of each point, and its share of the way from the first corner to the second
         and to the third: ``a + u (b - a) + v (c - a)``.

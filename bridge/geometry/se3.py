@@ -232,11 +232,7 @@ def pose_record(T: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
 
 
 def pose_from_record(record: Any) -> Float[np.ndarray, "4 4"]:
-    """Read what ``pose_record`` made.
-
-    Raises:
-        InvalidRecordError: When it is not three and four finite numbers, not all of the four 0.
-    """
+    """Read what ``pose_record`` made."""
     try:
         q = np.array(record["q_wxyz"], dtype=np.float64)
         p = np.array(record["p_m"], dtype=np.float64)

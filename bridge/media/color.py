@@ -89,11 +89,7 @@ def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
 
 @contextmanager
 def open_image(data: bytes) -> Iterator["Image"]:
-    """Open an image of limited size with Pillow; whatever it says of broken bytes is one error.
-
-    Raises:
-        UnreadableImageError: When the image is too large, or turns out broken inside the block.
-    """
+    """Open an image of limited size with Pillow; whatever it says of broken bytes is one error."""
     from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for PNG
 
     try:

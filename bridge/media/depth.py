@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
+from bridge.errors import BridgeError
 from bridge.media.color import MAX_PIXELS, UnreadableImageError, open_image
 
 ROTATED_ENCODING = "rotated3"
@@ -58,16 +59,19 @@ def from_metres(
 
 # Every image starts with 12 bytes that matter to 32-bit depth only (an int32 and two float32).
 # RVL then states its columns and rows (int32) before the nibble stream; PNG follows as a file.
+# RVL is Wilson, "Fast lossless depth image compression" (2017): runs of zeros and of measurements
+# alternate; each run is its length, each measurement the zigzag difference to the one before it;
+# numbers are 3 bits a nibble, lowest first, the top bit saying that more follow; the first nibble
+# is the highest of a little-endian 32-bit word.
 
 try:
     from bridge.media._depth import decode_rvl, encode_rvl
-
-    NATIVE = True
 except ImportError:
-    from bridge.media.rvl import decode_rvl, encode_rvl
 
-    NATIVE = False
-"""``NATIVE``: the built extension codes; its NumPy twin is about fifty times slower."""
+    def _not_built(*_: object) -> bytes:
+        raise BridgeError("the depth codec is not built. robot-gst doctor says how to build it.")
+
+    decode_rvl = encode_rvl = _not_built
 
 PNG_MAGIC = b"\x89PNG"
 _EXPECTED = "16-bit depth as PNG or RVL"
@@ -78,9 +82,6 @@ _RVL_FRONT_BYTES = len(_CONFIG) + 8
 
 def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False) -> list[bytes]:
     """Encode 16-bit depth given as bytes.
-
-    Args:
-        rows: Pixels of each row, two bytes each; rows may lie apart in memory.
 
     Returns:
         What a CompressedImage of ``RVL_FORMAT`` holds, in two parts.
@@ -97,9 +98,6 @@ def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]
     Args:
         image_format: As the CompressedImage states it; without ``rvl`` it is PNG. A bare PNG file
             is read whatever the format says.
-
-    Raises:
-        UnreadableImageError: The format is not 16-bit depth, or the bytes are broken.
     """
     if data.startswith(PNG_MAGIC):
         return _unpack_png(data)

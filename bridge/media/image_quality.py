@@ -65,10 +65,6 @@ def psnr_db(
         recorded: In 0..1.
         replayed: In 0..1.
         mask: Pixels that count; None: all.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: When the error is exactly zero, or the mask is empty.
     """
     check_same_shape(recorded, replayed)
     squared = (recorded - replayed) ** 2
@@ -97,9 +93,6 @@ def aligned(
         replayed_u8: The one to brighten: 8 bits, or numbers in 0..1.
         alignment: ``raw`` changes nothing, ``gain`` fits a factor, ``affine`` a factor and an
             offset.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
     """
     check_same_shape(recorded_u8, replayed_u8)
     replayed = as_float(replayed_u8)
@@ -116,11 +109,7 @@ def aligned(
 
 
 def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
-    """Refuse images of different size.
-
-    Raises:
-        ImageShapeError: With both sizes.
-    """
+    """Refuse images of different size."""
     if recorded.shape != replayed.shape:
         raise ImageShapeError(
             found=f"the recorded image is {recorded.shape}, the replayed one {replayed.shape}"
@@ -349,9 +338,6 @@ class SsimMaps:
 
         Args:
             mask: Pixels whose windows count; None: all.
-
-        Raises:
-            UndefinedStatisticError: When the mask holds no window centre.
         """
         values = {"valid": self.valid, "zero": self.zero, "reflect": self.reflect}[padding]
         if mask is not None:
@@ -377,10 +363,6 @@ def ssim_maps(
     Args:
         recorded: In 0..1.
         replayed: In 0..1.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: When the image is smaller than the window.
     """
     _refuse_small(recorded, replayed)
     zero = _maps(recorded, replayed, "zero")
@@ -404,10 +386,6 @@ def ssim(
         recorded: In 0..1.
         replayed: In 0..1.
         mask: Pixels whose windows count; None: all.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: With the reason.
     """
     _refuse_small(recorded, replayed)
     if mask is not None:

@@ -33,10 +33,6 @@ class VideoDecoder:
 
         Args:
             video_format: One of ``DECODERS``.
-
-        Raises:
-            MissingDependencyError: PyAV is not installed.
-            VideoDecodingError: The format is not known, or FFmpeg was built without it.
         """
         try:
             import av  # noqa: PLC0415  # only the extra [video] brings it
@@ -62,14 +58,8 @@ class VideoDecoder:
     ) -> list[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
         """Decode one frame; what comes before the first whole picture gives no image.
 
-        Args:
-            number: Given back with its image; larger than the one before.
-
         Returns:
             Numbers and sRGB images of the frames that can be shown now.
-
-        Raises:
-            VideoDecodingError: The frame is damaged.
         """
         packet = self._av.Packet(data)
         packet.pts = number

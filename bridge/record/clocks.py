@@ -40,11 +40,7 @@ class ClockBook:
         tell: Callable[[News], None] = lambda news: None,
         write: Callable[[Record], None] = lambda record: None,
     ) -> None:
-        """Know no source.
-
-        Args:
-            tell: Called with each clock that was set.
-        """
+        """Know no source."""
         self._tell = tell
         self._write = write
         self._lock = threading.Lock()
@@ -144,11 +140,7 @@ class StampJumps:
         self._watch = StampWatch()
 
     def look(self, records: list[Record]) -> list[News]:
-        """Look through the drop records of some seconds.
-
-        Args:
-            records: In the order of their seconds.
-        """
+        """Look through the drop records of some seconds."""
         found: dict[tuple[int, bool], dict[str, int]] = {}
         for record in records:
             delay_ns = record["clock_offset_ns"]

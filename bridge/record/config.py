@@ -49,10 +49,6 @@ class DiskConfig:
     """No episode starts with less free space than this, and an open one is finished at it [MB]."""
     footer_mb: Annotated[int, RARE] = 64
     """Space held back so that an episode can be finished on a full disk [MB]; 0 holds none."""
-    split_mb: Annotated[int, RARE] = 0
-    """Begin a new file of the same episode after this much [MB]; 0 never does."""
-    split_s: Annotated[float, RARE] = 0.0
-    """Begin a new file of the same episode after this long [s]; 0 never does."""
     flush_s: Annotated[float, RARE] = 0.25
     """What a crash of the recorder may cost, at most [s]."""
     sync_s: Annotated[float, RARE] = 2.0
@@ -60,7 +56,7 @@ class DiskConfig:
 
     def __post_init__(self) -> None:
         """Refuse negative sizes and times."""
-        sizes = ("min_free_mb", "footer_mb", "split_mb", "split_s")
+        sizes = ("min_free_mb", "footer_mb")
         refuse_outside(self, dict.fromkeys(sizes, (0, UNBOUNDED)))
         refuse_outside(self, dict.fromkeys(("flush_s", "sync_s"), (0.01, UNBOUNDED)))
 

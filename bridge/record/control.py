@@ -6,8 +6,10 @@ that a status is never behind a stop.
 
 import json
 from collections.abc import Callable
-from dataclasses import MISSING, asdict, fields
-from typing import Any, TypeVar, get_origin
+from dataclasses import asdict, fields
+from typing import Any, TypeVar
+
+import msgspec
 
 from bridge.episode import metadata
 from bridge.episode.run_folder import check_episode_id
@@ -40,10 +42,6 @@ class RecorderClient:
 
         Args:
             request: Fields of the command; None for none.
-
-        Raises:
-            RemoteError: When the recorder refused.
-            NoReplyError: When no recorder of that name answered.
         """
         key = control_key(self._recorder, verb)
         payload = json.dumps(request or {}).encode()
@@ -65,8 +63,6 @@ class RecorderClient:
         Args:
             info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
                 known.
-            task: What the episode is of; it is attached to it.
-            anyway: Also when topics are missing that the contract requires.
         """
         sent = {} if task is None else {"task_file": task.data.decode()}
         request = {"id": episode_id, "info": info or {}, "anyway": anyway, **sent}
@@ -94,11 +90,7 @@ Record = TypeVar("Record")
 
 
 def serve_control(session: WireSession, recorder: Recorder) -> list[Service]:
-    """Answer the control keys until the session closes.
-
-    Args:
-        recorder: What the commands go to; its configured name is part of the keys.
-    """
+    """Answer the control keys until the session closes."""
 
     def start(request: dict[str, Any]) -> dict[str, Any]:
         _only(request, "start", {"id", "info", "anyway", "task_file"})
@@ -223,12 +215,7 @@ def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
 
 
 def parse_task_file(text: Any) -> TaskFile | None:
-    """Check a task file that came with a request; None stays None.
-
-    Raises:
-        ControlError: When it is not text, or too long.
-        TaskFileError: Listing what is wrong with it.
-    """
+    """Check a task file that came with a request; None stays None."""
     if text is None:
         return None
     if not isinstance(text, str) or len(text) > MAX_BYTES:
@@ -252,20 +239,8 @@ def parse_outcome(outcome: Any) -> metadata.Outcome | None:
 def _build(of_type: type[Record], values: Any, what: str) -> Record:
     if not isinstance(values, dict):
         raise ControlError(f"{what} must be a JSON object, got {values!r:.80}.")
-    known = {item.name: item for item in fields(of_type)}  # type: ignore[arg-type]
-    _only(values, what, set(known))
-    missing = [n for n, item in known.items() if item.default is MISSING and n not in values]
-    if missing:
-        raise ControlError(f"{what} needs {', '.join(missing)}.")
-    arguments = {}
-    for name, value in values.items():
-        wanted: Any = known[name].type
-        if get_origin(wanted) is tuple:
-            if not isinstance(value, list | tuple):
-                raise ControlError(f"{what}.{name} must be a list, got {value!r:.80}.")
-            arguments[name] = tuple(value)
-        elif (isinstance(value, bool) and wanted is not bool) or not isinstance(value, wanted):
-            raise ControlError(f"{what}.{name} has the wrong type: {value!r:.80}.")
-        else:
-            arguments[name] = value
-    return of_type(**arguments)
+    _only(values, what, {item.name for item in fields(of_type)})  # type: ignore[arg-type]
+    try:
+        return msgspec.convert(values, of_type)
+    except msgspec.ValidationError as error:
+        raise ControlError(f"{what}: {error}.") from error

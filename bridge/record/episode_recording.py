@@ -1,5 +1,6 @@
 """One episode while it is being recorded. Used by the writer thread only."""
 
+import contextlib
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -10,6 +11,7 @@ from typing import Any
 from bridge.episode import metadata, schema
 from bridge.episode.contract import (
     PRESENCE_RECORD,
+    RECORD_NAME,
     Contract,
     Span,
     TopicReport,
@@ -17,15 +19,17 @@ from bridge.episode.contract import (
     judge,
     unknown_tails,
 )
+from bridge.episode.run_folder import SUFFIX
 from bridge.episode.topics import CLOCKS, DROPS, EVENT, cell_topic
+from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.clocks import StampJumps
 from bridge.record.config import RecorderConfig
-from bridge.record.episode_files import EpisodeFiles
 from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
 from bridge.record.ledger import Ledger
 from bridge.record.presence import News
 from bridge.record.queue import Command, Dropped, Item, second_of
+from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.task_file import TaskFile
 from bridge.wire.rmw import ros_schema, type_hash_of
 from bridge.wire.session import WireSample
@@ -63,7 +67,6 @@ class Channels:
 
         Args:
             max_topics: Further ones are refused.
-            msg_folder: Definitions of ROS 2 types of one's own.
         """
         self._msg_folder = msg_folder
         self._max_topics = max_topics
@@ -174,12 +177,7 @@ class EpisodeRecording:
         """Create the episode file and say in it who and what it is.
 
         Args:
-            latched: What was said before and still holds, repeated at the start of each file.
             others: What else goes into the ``recorder`` record, by name; asked at the end.
-
-        Raises:
-            UsageError: When the episode exists already.
-            BridgeError: When the folder cannot be written.
         """
         self.info = info
         self.ledger = Ledger(config.queues.max_topics)
@@ -201,46 +199,56 @@ class EpisodeRecording:
         self._records: deque[dict[str, Any]] = deque()
         self._clock_steps_ns: list[int] = []
         self._is_summed_up = False
-        self._parts = EpisodeFiles(folder, info, config.disk, start_ns, contract, task)
+        disk = config.disk
+        self._writer = EpisodeWriter(
+            folder / f"{info.id}{SUFFIX}",
+            config=WriterConfig(
+                flush_s=disk.flush_s, sync_s=disk.sync_s, backlog_bytes=disk.backlog_bytes
+            ),
+        )
         try:
+            self._say_what_it_is(contract, task)
             self._repeat_latched(start_ns)
             for record in clocks:
                 self.write_clock(record, start_ns)
         except OSError as error:
-            self._parts.discard()
+            self._writer.discard()
             raise BridgeError(
                 f"cannot write {self.part_path}: {error.strerror}. Choose another folder."
             ) from error
 
+    def _say_what_it_is(self, contract: Contract | None, task: TaskFile | None) -> None:
+        self._writer.describe(self.info)
+        if contract is not None:
+            self._writer.add_metadata(RECORD_NAME, contract.to_record())
+        if task is not None:
+            self._writer.attach(
+                ATTACHMENT, task.data, media_type=MEDIA_TYPE, log_time_ns=self.start_ns
+            )
+
     @property
     def part_path(self) -> Path:
         """The file while it is open."""
-        return self._parts.open_path
+        return self._writer.part_path
 
     @property
     def path(self) -> Path:
-        """The episode's file when it is finished; its first one if it is split."""
-        return self._parts.first_path
+        """The episode's file when it is finished."""
+        return self._writer.path
 
     def keep_name(self) -> bool:
         """Write the file anew where somebody removed it; raises OSError when that fails."""
-        return self._parts.writer.keep_name()
+        return self._writer.keep_name()
 
     @property
     def keeps_up(self) -> bool:
         """Whether little enough waits for the disk to give it more images."""
-        return self._parts.writer.backlog_bytes < self._config.disk.backlog_bytes
+        return self._writer.backlog_bytes < self._config.disk.backlog_bytes
 
     @property
     def disk(self) -> dict[str, float]:
         """How far the disk is behind, for the status."""
-        writer = self._parts.writer
-        return {"write_lag_s": writer.lag_s, "busy_s": writer.busy_s}
-
-    @property
-    def num_parts(self) -> int:
-        """Files so far."""
-        return self._parts.index
+        return {"write_lag_s": self._writer.lag_s, "busy_s": self._writer.busy_s}
 
     def _repeat_latched(self, stamp_ns: int) -> None:
         samples = self._latched()
@@ -271,7 +279,7 @@ class EpisodeRecording:
         source_ns = sample.source_ns
         if source_ns is None and channel.stamp_ns is not None:
             source_ns = channel.stamp_ns(sample.data)
-        self._parts.writer.write_foreign(
+        self._writer.write_foreign(
             sample.topic,
             sample.data,
             schema_record=channel.record,
@@ -283,20 +291,13 @@ class EpisodeRecording:
         )
 
     def tick(self, now_ns: int, health: dict[str, int]) -> None:
-        """Write what has waited long enough, and the drop log of the seconds that are over.
-
-        Args:
-            now_ns: The recorder's clock.
-        """
+        """Write what has waited long enough, and the drop log of the seconds that are over."""
         # A message may wait in the queue while its second ends: give it one second more.
         before = second_of(now_ns) - 1
         if before > self._closed_second:
             self._closed_second = before
             self._write_ledger(before, now_ns, health)
-        if self._parts.is_full(now_ns):
-            self._parts.roll(now_ns)
-            self._repeat_latched(now_ns)
-        self._parts.tick()
+        self._writer.tick()
 
     def _write_ledger(self, before: int | None, now_ns: int, health: dict[str, int]) -> None:
         closed = list(self.ledger.close_seconds(before))
@@ -311,7 +312,7 @@ class EpisodeRecording:
         self, topic: str, record: dict[str, Any], type_name: str, stamp_ns: int
     ) -> None:
         log_ns = self._channels.later(topic, stamp_ns)
-        self._parts.writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
+        self._writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
         """Append readings of a source's clock.
@@ -395,16 +396,15 @@ class EpisodeRecording:
 
         Args:
             outcome: How it ended; None: as it was labelled last.
-            health: Counts of what went wrong in the recorder, by name.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:
             self._sum_up(end_ns, reason, outcome or self.outcome)
             self._is_summed_up = True
-        return self._parts.close()
+        return self._writer.close()
 
     def _sum_up(self, end_ns: int, reason: str, outcome: metadata.Outcome | None) -> None:
-        writer = self._parts.writer
+        writer = self._writer
         if outcome is not None:
             writer.add_metadata("outcome", metadata.to_strings(outcome))
         writer.add_metadata("drops", self.ledger.to_metadata())
@@ -418,7 +418,6 @@ class EpisodeRecording:
             "latched_messages_repeated": self._num_latched,
             "clock_steps_ns": self._clock_steps_ns,
             "paused": paused,
-            "parts": self.num_parts,
             **{name: ask() for name, ask in self._others.items()},
         }
         values = {name: json.dumps(value, default=str) for name, value in recorder.items()}
@@ -437,12 +436,13 @@ class EpisodeRecording:
             "unnumbered": self.ledger.unnumbered(),
         }
         values = {name: json.dumps(value) for name, value in record.items()}
-        self._parts.writer.add_metadata(PRESENCE_RECORD, values)
+        self._writer.add_metadata(PRESENCE_RECORD, values)
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""
-        self._parts.discard()
+        self._writer.discard()
 
     def abandon(self) -> None:
         """Stop without finishing; the ``.part`` file stays."""
-        self._parts.abandon()
+        with contextlib.suppress(OSError):  # the disk that failed may fail again
+            self._writer.abandon()

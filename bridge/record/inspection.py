@@ -5,16 +5,15 @@ the first and last bytes of a JPEG. ``robot-gst check`` decodes everything after
 """
 
 import json
-import struct
 from collections.abc import Callable
 from enum import StrEnum
-from functools import lru_cache, partial
+from functools import lru_cache
 
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
-from bridge.episode.cdr.messages import VideoFrame, foxglove_stamp_ns
+from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -39,7 +38,6 @@ def resolve_type(topic: str, type_name: str) -> str:
     """Trust the publisher's type name; without one, go by the topic.
 
     Args:
-        topic: With its leading slash; one of ours has a type of its own.
         type_name: As the publisher says; "" for unknown.
     """
     return type_name or type_of_topic(topic) or ""
@@ -72,27 +70,27 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Messag
     if known.message_encoding == "json":
         version = schema.json_schema_version(type_name)
         return lambda data: _inspect_json(version, data)
-    return lambda data: _inspect_protobuf(type_name, data)
+    return _inspect_video
 
 
 def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] | None:
     """Return what reads the time in a message itself, or None for types without one.
 
     For messages that came without an attachment: ``header.stamp`` of a ROS 2 type, the timestamp
-    of Foxglove's video and audio.
+    of Foxglove's video.
     """
     if record is None:
         return None
-    if record.name in schema.PROTOBUF_MEMBERS and record.message_encoding == "protobuf":
-        return partial(_protobuf_stamp_ns, record.name)
+    if record.name == schema.COMPRESSED_VIDEO and record.message_encoding == "protobuf":
+        return _video_stamp_ns
     if record.schema_encoding == "ros2msg" and codec.begins_with_header(record.data):
         return _header_stamp_ns
     return None
 
 
-def _protobuf_stamp_ns(type_name: str, data: bytes) -> int | None:
+def _video_stamp_ns(data: bytes) -> int | None:
     try:
-        return foxglove_stamp_ns(type_name, data) or None
+        return VideoFrame.from_protobuf(data).stamp_ns or None
     except codec.MalformedMessageError:
         return None
 
@@ -103,12 +101,9 @@ def _header_stamp_ns(data: bytes) -> int | None:
     return None if stamp is None else join_ns(*stamp) or None
 
 
-def _inspect_protobuf(type_name: str, data: bytes) -> MessageState:
+def _inspect_video(data: bytes) -> MessageState:
     try:
-        if type_name == schema.COMPRESSED_VIDEO:
-            VideoFrame.from_protobuf(data)
-        else:
-            foxglove_stamp_ns(type_name, data)
+        VideoFrame.from_protobuf(data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     return GOOD
@@ -118,33 +113,23 @@ def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
             return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
-        codec.decode(type_name, data)
+        message = codec.decode(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
-    if type_name == schema.COMPRESSED_IMAGE and _is_cut_jpeg(data):
-        return MessageState.UNDECODABLE
+    if type_name == schema.COMPRESSED_IMAGE:
+        image = message["data"]
+        is_cut = image[:2] == _JPEG_START and _JPEG_END not in bytes(image[-_TAIL_BYTES:])
+        return MessageState.UNDECODABLE if is_cut else GOOD
     return GOOD
 
 
 def fits(header: ImageHeader) -> bool:
     """Say whether an image has as many bytes as its size and step ask for."""
-    if header.data_length != header.height * header.step:
+    if len(header.pixels) != header.height * header.step:
         return False
     pixel_bytes = 4 if header.encoding == FLOAT_DEPTH else 2
     is_depth = header.encoding in (*DEPTH_ENCODINGS, FLOAT_DEPTH)
     return not is_depth or header.step >= pixel_bytes * header.width
-
-
-def _is_cut_jpeg(data: bytes) -> bool:
-    """Say whether a sensor_msgs/CompressedImage begins as a JPEG and does not end as one."""
-    order = "<I" if data[1] else ">I"
-    at = 12  # behind the encapsulation and the stamp
-    for _ in ("frame_id", "format"):
-        (length,) = struct.unpack_from(order, data, at)
-        at += 4 + length
-        at += -at % 4
-    at += 4
-    return data.startswith(_JPEG_START, at) and _JPEG_END not in data[-_TAIL_BYTES:]
 
 
 def _inspect_json(newest: int, data: bytes) -> MessageState:

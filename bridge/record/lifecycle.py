@@ -40,11 +40,7 @@ class DiskReserve:
         self._descriptor: int | None = None
 
     def hold(self) -> None:
-        """Allocate it, if it is not yet.
-
-        Raises:
-            NoSpaceError: When the disk has not that much left.
-        """
+        """Allocate it, if it is not yet."""
         if self._descriptor is not None or not self._bytes:
             return
         try:
@@ -92,7 +88,6 @@ class PreRoll:
 
         Args:
             seconds: How far back it reaches [s]; 0 holds nothing.
-            max_bytes: Memory; with less than the seconds need, it reaches less far.
         """
         self._span_ns = ns_from_s(seconds)
         self._max_bytes = max_bytes
@@ -236,7 +231,7 @@ class Lifecycle:
             return
 
     def tick(self, now_ns: int) -> None:
-        """Do what time asks for: flush, close seconds, split. Raises OSError for the disk."""
+        """Do what time asks for: flush, close seconds. Raises OSError for the disk."""
         self.ring.trim(now_ns)
         if self.take is not None:
             self.take.tick(now_ns, self._health())
@@ -444,11 +439,7 @@ class Lifecycle:
         *,
         in_reserve: bool = False,
     ) -> DiskError:
-        """End a recording the disk has refused, and finish its file if there is any way.
-
-        Args:
-            in_reserve: The disk still takes what there is; it is ended before it is full.
-        """
+        """End a recording the disk has refused, and finish its file if there is any way."""
         take = self.take
         path = take.part_path if take else self._run.episodes_dir
         error = DiskError(path=path, cause=cause, is_finished=False)
@@ -491,7 +482,6 @@ def counts(take: EpisodeRecording) -> Answer:
         "undecodable": total.undecodable,
         "unknown_type": total.unknown_type,
         "shed": total.shed,
-        "parts": take.num_parts,
         "unnumbered": take.ledger.unnumbered(),
         "breaches": breaches_of(take.presence),
         "unknown_tails": unknown_tails(take.presence),

@@ -54,7 +54,6 @@ class Previews:
 
         Args:
             rate_hz: At most this many a second for each camera; 0 makes none.
-            shed: Says how far shedding has gone; previews go first.
         """
         self._session = session
         self._recorder = recorder
@@ -114,12 +113,7 @@ class Previews:
 
 
 def small_picture(sample: WireSample) -> CompressedColor | None:
-    """Make a JPEG about ``WIDTH`` pixels wide of a colour image, or None of anything else.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself.
-        UnreadableImageError: The picture in it is broken.
-    """
+    """Make a JPEG about ``WIDTH`` pixels wide of a colour image, or None of anything else."""
     if sample.type_name in ("", schema.COMPRESSED_IMAGE):
         original = CompressedColor.from_cdr(sample.data)
         pixels, layout = decode_color(original.data), "RGB"
@@ -129,7 +123,7 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
         if header.encoding not in COLOR_LAYOUTS:
             return None
         layout, channels = COLOR_LAYOUTS[header.encoding]
-        rows = pixel_rows(sample.data, header, channels)
+        rows = pixel_rows(header, channels)
         pixels = rows.reshape(header.height, header.width, channels)
         stamp_ns, frame_id = header.stamp_ns, header.frame_id
     step = -(-pixels.shape[1] // WIDTH)
@@ -322,14 +316,7 @@ class LiveRecorder:
 
 
 def _lock_folder(run: RunFolder, *, shared: bool) -> int | None:
-    """Keep other recorders out of a run folder, until the process ends.
-
-    Args:
-        shared: Only those out that do not share it.
-
-    Raises:
-        FolderTakenError: When another one is at work there.
-    """
+    """Keep other recorders out of a run folder, until the process ends."""
     descriptor = os.open(run.episodes_dir, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

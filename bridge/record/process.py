@@ -58,11 +58,7 @@ def pressed_key() -> str:
 
 
 def next_info(run: RunFolder, about: EpisodeAbout) -> EpisodeInfo:
-    """Describe the next episode: the first free number after the kind's name.
-
-    Args:
-        about: What all episodes of this process have in common; its kind names them.
-    """
+    """Describe the next episode: the first free number after the kind's name."""
     taken = {path.name.split(".")[0] for path in run.episodes_dir.iterdir()}
     number = 1
     while f"{about.kind}_{number:04d}" in taken:
@@ -139,15 +135,11 @@ def run_recorder(
     """Record until ``stop`` is set, the duration is over, or the disk fails.
 
     Args:
-        episode: Start this one at once instead of waiting for a command.
         anyway: Start ``episode`` although topics are missing that the contract requires; else it
             waits for them.
 
     Returns:
         The answer to the last stop if this call stopped an episode, else None.
-
-    Raises:
-        DiskError: When the episode cannot be written.
     """
     with open_session(wire) as session:
         run = RunFolder.create(run_path)

@@ -125,7 +125,6 @@ def next_level(level: LoadShedding, fill: float) -> LoadShedding:
     """Return the level that belongs to a fill of 0 to 1, given the level so far.
 
     Args:
-        level: What is left out now.
         fill: Share of the budget for bulk that is taken, 0 to 1.
     """
     wanted = max(item for item in LoadShedding if fill >= BEGINS_AT[item])
@@ -138,7 +137,6 @@ def keep_every(level: LoadShedding, kind: str) -> int:
     """Return n when only every n-th image of a kind (color, depth or "") is to be kept.
 
     Args:
-        level: What is left out now.
         kind: ``color``, ``depth``, or "" for what no encoder knows as an image.
     """
     if kind == "color":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from bridge.clock import StepWatch
 from bridge.episode import metadata
-from bridge.episode.catalogue import label_episode, list_episodes, note_finished
+from bridge.episode.catalogue import label_episode, read_entry
 from bridge.episode.contract import find_contract
 from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
 from bridge.errors import BridgeError, GstError
@@ -61,15 +61,7 @@ class Recorder:
         task: TaskFile | None = None,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start the writer thread.
-
-        Args:
-            now_ns: The clock that also stamps received messages.
-            wall_ns: The system clock, watched for steps.
-
-        Raises:
-            ContractError: When the contract of the cell cannot be used.
-        """
+        """Start the writer thread."""
         self.config = config or RecorderConfig()
         self.failed = threading.Event()
         self._now_ns = now_ns
@@ -130,11 +122,7 @@ class Recorder:
         self.input_queue.put_image(item, saved)
 
     def read_contract(self) -> None:
-        """Read the contract of the cell anew; it may have been learned or edited.
-
-        Raises:
-            ContractError: When it cannot be used.
-        """
+        """Read the contract of the cell anew; it may have been learned or edited."""
         contract = find_contract(self._run.path, self.config.contract)
         self._life.contract = self.presence.contract = contract
 
@@ -150,7 +138,6 @@ class Recorder:
 
         Raises:
             UsageError: When the id is unsafe, taken, or another episode is being recorded.
-            MissingTopicsError: When the contract requires topics that are not there.
             BridgeError: When the folder cannot be written, or has too little space.
         """
         check_episode_id(info.id)
@@ -251,13 +238,8 @@ class Recorder:
 
         answer = self._command(act)
         if not discard:
-            self._enter(answer["episode"])
+            self._tell(self._run.episodes_dir / part_name(answer["episode"], 1))
         return answer
-
-    def _enter(self, episode_id: str) -> None:
-        path = self._run.episodes_dir / part_name(episode_id, 1)
-        note_finished(self._run, path)
-        self._tell(path)
 
     def _say(self, text: str) -> None:
         self.news.append(text)
@@ -288,7 +270,7 @@ class Recorder:
         task = self._task_of(info) if task is None else task
         info = described_by(info, task)
         answer = self._command(lambda command: self._life.snapshot(info, command, task))
-        self._enter(info.id)
+        self._tell(self._run.episodes_dir / part_name(info.id, 1))
         return {**answer, **self._keep(task)}
 
     def label(
@@ -330,10 +312,10 @@ class Recorder:
         return {"ok": True, "episode": name, "note": str(note)}
 
     def episodes(self, last: int) -> Answer:
-        """The last episodes of the run folder, by name, as the catalogue knows them."""
-        entries = list_episodes(self._run)
-        episodes = [asdict(entry) for entry in entries[-last:]]
-        return {"ok": True, "of": len(entries), "episodes": episodes}
+        """The last episodes of the run folder, by name."""
+        paths = self._run.episodes()
+        episodes = [asdict(read_entry(self._run, path)) for path in paths[-last:]]
+        return {"ok": True, "of": len(paths), "episodes": episodes}
 
     def declare_latched(self, topic: str) -> None:
         """Begin later episodes with the last message of a topic; its publisher says so."""
@@ -359,11 +341,7 @@ class Recorder:
         self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
-        """Add something to every status and episode; ``ask`` must answer at once.
-
-        Args:
-            ask: Returns what to tell, something JSON can hold; called from several threads.
-        """
+        """Add something to every status and episode; ``ask`` must answer at once."""
         self._status.others[name] = ask
         self._life.others[name] = ask
 
@@ -507,12 +485,7 @@ class Recorder:
 
 
 def described_by(info: metadata.EpisodeInfo, task: TaskFile | None) -> metadata.EpisodeInfo:
-    """Add to a description which task file the episode is recorded with.
-
-    Raises:
-        TaskFileError: When the file is no task.
-        ControlError: When name or hash belong to another file.
-    """
+    """Add to a description which task file the episode is recorded with."""
     if task is None:
         if info.task_sha256:
             raise ControlError(

@@ -153,9 +153,6 @@ def watch_ros2(
 
     Subscribe to the topics first: what is published meanwhile then arrives twice rather than not
     at all, and the second copy is left out or counted as repeated.
-
-    Args:
-        msg_folder: Definitions of ROS 2 types of one's own.
     """
     return Ros2Graph(session, recorder, msg_folder)
 

@@ -63,11 +63,7 @@ class SequenceTracker:
         self._num_holes = 0
 
     def observe(self, sample: WireSample, ticket: int = 0) -> Step:
-        """Compare a message's number with the one expected; without a number nothing is known.
-
-        Args:
-            ticket: Its place in the order of arrival.
-        """
+        """Compare a message's number with the one expected; without a number nothing is known."""
         if sample.sequence is None or sample.source_gid is None:
             return _NEXT
         stream = self._streams.get((sample.topic, sample.source_gid))

@@ -102,11 +102,7 @@ class WireListener:
     """Takes messages and liveliness tokens on network threads; judges them at the end."""
 
     def __init__(self, session: WireSession, key: str, *, enough: int | None = None) -> None:
-        """Begin to listen.
-
-        Raises:
-            WireConfigError: When the key cannot be one.
-        """
+        """Begin to listen."""
         self._lock = threading.Lock()
         self._tracker = SequenceTracker()
         self._heard: dict[tuple[str, str, str], TopicHeard] = {}

@@ -288,9 +288,6 @@ def robot_of(urdf: str) -> Robot:
 
     That is the record the description carries; else the robot file that has the name of the URDF;
     else the default robot, with which old episodes were recorded.
-
-    Raises:
-        UsageError: It carries a record that is damaged.
     """
     carried = re.search(rf"<{RECORD_TAG}\b[^>]*>(.*?)</{RECORD_TAG}>", urdf, re.DOTALL)
     if carried is not None:
@@ -349,11 +346,7 @@ def robot_name(urdf: str) -> str:
 
 
 def _robot_from(table: Mapping[str, Any]) -> Robot:
-    """Make the record of a table, names with their prefix.
-
-    Raises:
-        ValueError: Naming the field.
-    """
+    """Make the record of a table, names with their prefix."""
     gripper = dict(table.get("gripper", {}))
     fingers = tuple(_record(Finger, item, "gripper.fingers") for item in gripper.pop("fingers", ()))
     robot: Robot = _record(
@@ -503,7 +496,6 @@ def resolve_mesh(uri: str) -> Path:
 
     Raises:
         UsageError: Another package, or a path that leaves the data folder.
-        MissingDependencyError: The package is not installed.
     """
     match = re.fullmatch(r"package://([^/]+)/(.+)", uri)
     if match is None:

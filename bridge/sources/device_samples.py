@@ -49,9 +49,6 @@ class HostClock:
     def map(self, device_ns: int, received_ns: int) -> int | None:
         """Return the host time of a sample, or None while the offset is still being found.
 
-        Args:
-            received_ns: When it arrived here, by the host's clock.
-
         Raises:
             ValueError: When the device's clock went backwards: it was started again.
         """
@@ -102,11 +99,7 @@ class NumberedPublisher:
         self.lost = 0
 
     def put(self, number: int, data: bytes, *, source_ns: int) -> int:
-        """Send one sample and return how many are missing directly before it.
-
-        Args:
-            number: The device's count of this stream; starting again is no loss.
-        """
+        """Send one sample and return how many are missing directly before it."""
         gap = 0 if self._expected is None else number - self._expected
         if not 0 < gap <= MAX_GAP:
             gap = 0
@@ -150,7 +143,6 @@ class Announcer:
 
         Args:
             key: Names the fact, not None; a later one with an equal key takes its place.
-            message: What is sent; the source time of a repetition is that of its sending.
         """
         self._queue.put(_Entry(message, key))
 

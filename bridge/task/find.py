@@ -56,9 +56,6 @@ def find_task_file(
 
     Args:
         name: Of the task; never read as a path.
-
-    Raises:
-        MissingTaskError: Saying where it looked and what is there.
     """
     looked: list[str] = []
     wanted = attached.sha256

@@ -9,11 +9,7 @@ MODEL_POLICY = "model"
 
 
 def server_of(url: str) -> tuple[str, str, int, str]:
-    """Scheme, host, port and path of a model server's base address.
-
-    Raises:
-        UsageError: When it is none, or holds a secret.
-    """
+    """Scheme, host, port and path of a model server's base address."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.task.record import check_record, load_record, parse_record
+from bridge.task.record import check_record, load_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
 STUDY_ARMS = ("without", "with", "control")
@@ -131,7 +131,7 @@ class Plan:
     @staticmethod
     def from_json(data: bytes) -> "Plan":
         """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
-        return Plan._of(parse_record(data, name="plan"))
+        return made_of(Plan, parse_record(data, name="plan"), name="plan")
 
     @staticmethod
     def outline_from_json(data: bytes) -> "Plan":
@@ -142,24 +142,7 @@ class Plan:
         record = load_record(data, name="plan")
         if isinstance(record.get("tau"), list):
             record["tau"] = record["tau"][:1]
-        return Plan._of(dict(check_record(record, name="plan")))
-
-    @staticmethod
-    def _of(record: dict[str, Any]) -> "Plan":
-        known = {name: record[name] for name in Plan.__dataclass_fields__ if name in record}
-        known["stages"] = tuple(_stage(stage) for stage in record["stages"])
-        known["tau"] = tuple(_waypoint(waypoint) for waypoint in record["tau"])
-        known["keypoints_m"] = tuple(tuple(p) for p in record.get("keypoints_m", []))
-        known["joint_names"] = tuple(record.get("joint_names", []))
-        if known.get("candidate") is not None:
-            ranking = known["candidate"]
-            names = Ranking.__dataclass_fields__
-            known["candidate"] = Ranking(**{name: ranking[name] for name in names})
-        if known.get("steered_by") is not None:
-            clause, bodies = known["steered_by"]["clause"], known["steered_by"].get("bodies", [])
-            known["steered_by"] = SteeredBy(clause=clause, bodies=tuple(bodies))
-        known["grasps"] = tuple(_candidate_grasp(each) for each in record.get("grasps", []))
-        return Plan(**known)
+        return made_of(Plan, check_record(record, name="plan"), name="plan")
 
     def times_ns(self) -> Int[np.ndarray, " num_waypoints"]:
         """Waypoint times from the start of the trajectory."""
@@ -183,32 +166,3 @@ class Plan:
 
 LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm", "grasps")
 """Written only where they say something: plans without them keep their bytes."""
-
-
-def _stage(record: dict[str, Any]) -> Stage:
-    known = {name: record[name] for name in Stage.__dataclass_fields__ if name in record}
-    for name in ("subgoal", "path", "terminal"):
-        known[name] = tuple(record.get(name, []))
-    known["allowed_contacts"] = tuple(
-        (pair[0], pair[1]) for pair in record.get("allowed_contacts", [])
-    )
-    return Stage(**known)
-
-
-def _candidate_grasp(record: dict[str, Any]) -> CandidateGrasp:
-    known = {name: record[name] for name in CandidateGrasp.__dataclass_fields__}
-    return CandidateGrasp(
-        **{**known, "p_m": tuple(record["p_m"]), "q_wxyz": tuple(record["q_wxyz"])}
-    )
-
-
-def _waypoint(record: dict[str, Any]) -> Waypoint:
-    joints = record.get("joints_rad")
-    return Waypoint(
-        t_ns=record["t_ns"],
-        p_m=tuple(record["p_m"]),
-        q_wxyz=tuple(record["q_wxyz"]),
-        g=record["g"],
-        width_m=record.get("width_m"),
-        joints_rad=None if joints is None else tuple(joints),
-    )

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.plan import Plan
-from bridge.task.record import check_record, load_record, parse_record
+from bridge.task.record import check_record, load_record, made_of, parse_record
 from bridge.task.verdict import Verdict
 
 SCHEMA_VERSION = 1
@@ -108,20 +108,16 @@ class PlanRequest:
     def from_json(data: bytes) -> "PlanRequest":
         """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
         record = parse_record(data, name="plan_request")
-        known = {name: record[name] for name in PlanRequest.__dataclass_fields__ if name in record}
-        for name in ("joint_names", "joints_rad"):
-            known[name] = tuple(record[name])
-        known["objects"] = tuple(
-            dict(check_record(item, name="localisation")) for item in record["objects"]
-        )
-        known["refused"] = tuple(
+        for item in record["objects"]:
+            check_record(item, name="localisation")
+        refused = tuple(
             Refusal(
                 plan=Plan.from_json(json.dumps(each["plan"]).encode()),
                 verdict=Verdict.from_json(json.dumps(each["verdict"]).encode()),
             )
-            for each in record.get("refused", [])
+            for each in record.pop("refused", [])
         )
-        return PlanRequest(**known)
+        return replace(made_of(PlanRequest, record, name="plan_request"), refused=refused)
 
 
 @dataclass(frozen=True, kw_only=True)

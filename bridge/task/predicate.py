@@ -66,11 +66,7 @@ class PredicateResult:
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:
-    """Evaluate every success predicate of a task on a rollout's final state.
-
-    Args:
-        rollout: Poses of the objects over time, with contacts where a predicate asks for them.
-    """
+    """Evaluate every success predicate of a task on a rollout's final state."""
     return [_evaluate(spec, task, rollout) for spec in task.success]
 
 
@@ -108,7 +104,6 @@ def already_true_at_start(task: Task, rollout: Rollout) -> bool:
 
     Args:
         task: Of its predicates only goals are looked at, see ``is_goal``.
-        rollout: Of its poses only the first.
     """
     start = Rollout(
         stamps_ns=rollout.stamps_ns[:1],

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from bridge.errors import UsageError
-from bridge.task.record import check_record, parse_record
+from bridge.task.record import check_record, made_of, parse_record
 from bridge.whole_file import write_whole
 
 Item = TypeVar("Item")
@@ -185,21 +185,8 @@ class Protocol:
     def from_json(data: bytes) -> "Protocol":
         """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
         record = parse_record(data, name="protocol")
-        known = {name: record[name] for name in Protocol.__dataclass_fields__ if name in record}
-        known["tasks"] = tuple(StudyTask(**_known(StudyTask, item)) for item in record["tasks"])
-        known["policies"] = tuple(
-            PolicyArms(policy=item["policy"], arms=tuple(item["arms"]))
-            for item in record["policies"]
-        )
-        for name in ("void_causes", "reasons"):
-            if name in record:
-                known[name] = tuple(record[name])
-        if record.get("primary") is not None:
-            known["primary"] = Endpoint(**_known(Endpoint, record["primary"]))
-        others = record.get("secondary", ())
-        known["secondary"] = tuple(Endpoint(**_known(Endpoint, item)) for item in others)
-        known["edited"] = record.get("sha256", "") not in ("", _hash(record))
-        return Protocol(**known)
+        edited = record.get("sha256", "") not in ("", _hash(record))
+        return replace(made_of(Protocol, record, name="protocol"), edited=edited)
 
 
 def arms_in_order(arms: Sequence[str], study_seed: int, start_seed: int) -> list[str]:
@@ -221,10 +208,6 @@ def _shuffled(items: Sequence[Item], *seed: int) -> list[Item]:
     return [items[index] for index in order]
 
 
-def _known(of_type: type[StudyTask] | type[Endpoint], record: dict[str, Any]) -> dict[str, Any]:
-    return {name: record[name] for name in of_type.__dataclass_fields__ if name in record}
-
-
 def _hash(record: Mapping[str, Any]) -> str:
     """Hash everything in a record but its hash, however the file is laid out."""
     others = {name: value for name, value in record.items() if name != "sha256"}
@@ -233,11 +216,7 @@ def _hash(record: Mapping[str, Any]) -> str:
 
 
 def read_protocol(run_path: Path) -> Protocol | None:
-    """Return a run's protocol, None where it has none.
-
-    Raises:
-        InvalidRecordError: When there is one that does not fit its schema.
-    """
+    """Return a run's protocol, None where it has none."""
     path = run_path / FILE_NAME
     return Protocol.from_json(path.read_bytes()) if path.is_file() else None
 
@@ -284,10 +263,6 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:
-    """Fix the chance of yes for each task.
-
-    Args:
-        coins: By name of the task.
-    """
+    """Fix the chance of yes for each task."""
     tasks = tuple(replace(each, coin=coins.get(each.task)) for each in protocol.tasks)
     return replace(protocol, tasks=tasks, coin_from=coin_from)

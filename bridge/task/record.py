@@ -5,7 +5,9 @@ import math
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
 
 from bridge.errors import InvalidRecordError
 
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     import jsonschema_rs
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import ValidationError
+
+
+Record = TypeVar("Record")
 
 
 @cache
@@ -50,11 +55,7 @@ def _validator(package: str, path: str) -> "Draft202012Validator":
 def check_record(
     record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
 ) -> Mapping[str, Any]:
-    """Return the record if it fits ``schemas/<name>.schema.json``.
-
-    Raises:
-        InvalidRecordError: With the place and the value that does not fit.
-    """
+    """Return the record if it fits ``schemas/<name>.schema.json``."""
     path = f"schemas/{name}.schema.json"
     version = record.get("schema_version")
     known = _schema(package, path)["version"]
@@ -84,6 +85,14 @@ def find_problems(
     return sorted(errors, key=lambda error: [str(part) for part in error.absolute_path])
 
 
+def made_of(kind: type[Record], record: Mapping[str, Any], *, name: str) -> Record:
+    """Make a dataclass of parsed JSON; fields of later versions are left out."""
+    try:
+        return msgspec.convert(record, kind)
+    except msgspec.ValidationError as error:
+        raise InvalidRecordError(name=name, where="", found=str(error)[:300]) from error
+
+
 def _refuse(text: str) -> float:
     message = f"{text} is not a number in JSON"
     raise ValueError(message)
@@ -95,20 +104,12 @@ def _finite(text: str) -> float:
 
 
 def parse_record(data: bytes, *, name: str, package: str = "bridge.task") -> dict[str, Any]:
-    """Parse JSON bytes and check them.
-
-    Args:
-        data: UTF-8 text.
-    """
+    """Parse JSON bytes and check them."""
     return dict(check_record(load_record(data, name=name), name=name, package=package))
 
 
 def load_record(data: bytes, *, name: str) -> dict[str, Any]:
-    """Parse JSON bytes that hold one object of finite numbers, and check no more than that.
-
-    Args:
-        data: UTF-8 text.
-    """
+    """Parse JSON bytes that hold one object of finite numbers, and check no more than that."""
     try:
         record = json.loads(data, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:

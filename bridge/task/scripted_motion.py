@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.errors import InvalidRecordError
+from bridge.task.record import made_of
 
 RECORD_NAME = "scripted_motion"
 _VERSION = 1
@@ -89,45 +90,23 @@ class ScriptedMotion:
 
     @staticmethod
     def from_record(record: Mapping[str, Any]) -> "ScriptedMotion":
-        """Read a metadata record whose values are parsed.
-
-        Raises:
-            InvalidRecordError: When a field is missing, of another kind, or of a later version.
-        """
-        try:
-            if record["schema_version"] != _VERSION:
-                found = f"schema version {record['schema_version']!r}, known is {_VERSION}"
-                raise InvalidRecordError(name=RECORD_NAME, where="schema_version", found=found)
-            motion = ScriptedMotion(
-                robot=str(record["robot"]),
-                hand_link=str(record["hand_link"]),
-                joints=tuple(map(str, record["joints"])),
-                base_m=_position(record["base_m"]),
-                targets=tuple(
-                    JointTarget(
-                        t_s=float(item["t_s"]),
-                        joints_rad={k: float(v) for k, v in item["joints_rad"].items()},
-                    )
-                    for item in record["targets"]
-                ),
-                gain_hz=float(record["gain_hz"]),
-                limit_rad_s=float(record["limit_rad_s"]),
-                period_s=float(record["period_s"]),
-                duration_s=float(record["duration_s"]),
-                boxes={name: _box(item) for name, item in record["boxes"].items()},
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InvalidRecordError(
-                name=RECORD_NAME, where="", found=f"{type(error).__name__}: {error}"
-            ) from error
+        """Read a metadata record whose values are parsed."""
+        version = record.get("schema_version")
+        if version != _VERSION:
+            found = f"schema version {version!r}, known is {_VERSION}"
+            raise InvalidRecordError(name=RECORD_NAME, where="schema_version", found=found)
+        motion = made_of(ScriptedMotion, record, name=RECORD_NAME)
         motion._check()
         return motion
 
     def _check(self) -> None:
-        numbers = (self.gain_hz, self.limit_rad_s, self.period_s, self.duration_s)
+        boxes = [value for box in self.boxes.values() for value in (*box.size_m, box.mass_kg)]
+        numbers = (self.gain_hz, self.limit_rad_s, self.period_s, self.duration_s, *boxes)
         if not all(np.isfinite(value) and value > 0 for value in numbers):
             raise InvalidRecordError(
-                name=RECORD_NAME, where="gain, limit, period or duration", found="not above zero"
+                name=RECORD_NAME,
+                where="gain, limit, period, duration, or a box's size or mass",
+                found="not above zero",
             )
         unknown = {name for item in self.targets for name in item.joints_rad} - set(self.joints)
         if unknown:
@@ -136,16 +115,3 @@ class ScriptedMotion:
                 where="targets",
                 found=f"{', '.join(sorted(unknown))} is none of {', '.join(self.joints)}",
             )
-
-
-def _position(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
-def _box(record: Mapping[str, Any]) -> PushedBox:
-    box = PushedBox(size_m=_position(record["size_m"]), mass_kg=float(record["mass_kg"]))
-    if not all(np.isfinite(value) and value > 0 for value in (*box.size_m, box.mass_kg)):
-        message = f"a size or mass that is not above zero: {record}"
-        raise ValueError(message)
-    return box

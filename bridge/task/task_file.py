@@ -188,11 +188,7 @@ class TaskFile:
 
     @staticmethod
     def read(path: Path) -> "TaskFile":
-        """Read a file.
-
-        Raises:
-            UsageError: When it cannot be read.
-        """
+        """Read a file."""
         try:
             with path.open("rb") as stream:
                 return TaskFile(stream.read(MAX_BYTES + 1), str(path))
@@ -206,11 +202,7 @@ class TaskFile:
         return hashlib.sha256(self.data).hexdigest()
 
     def task(self) -> Task:
-        """Parse and check the file; each text once.
-
-        Raises:
-            TaskFileError: Listing everything that is wrong with it.
-        """
+        """Parse and check the file; each text once."""
         found = _parsed(self.data)
         if isinstance(found, Task):
             return found

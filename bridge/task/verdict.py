@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from bridge.task.record import check_record, parse_record
+from bridge.task.record import check_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
 CHECKS = ("start", "task", "limits", "audit")
@@ -51,7 +51,7 @@ class Verdict:
     seed: int
     scene_hash: str | None = None
     calibration_id: str | None = None
-    p_success: dict[str, float] | None = None
+    p_success: dict[str, int | float] | None = None
     reason: str | None = None
     warnings: tuple[str, ...] = ()
     """What does not change the verdict but a reader should know: the goal held before anything
@@ -103,20 +103,7 @@ class Verdict:
     def from_json(data: bytes) -> "Verdict":
         """Parse and check. Raises ``InvalidRecordError`` naming what does not fit."""
         record = parse_record(data, name="verdict")
-        known = {name: record[name] for name in Verdict.__dataclass_fields__ if name in record}
-        for name in ("ik", "clearance", "terminal"):
-            known[name] = _factor(record[name])
-        known["warnings"] = tuple(record.get("warnings") or ())
-        known["findings"] = tuple(record.get("findings") or ())
-        known["grasps"] = tuple(record.get("grasps") or ())
-        checks = record.get("checks") or {}
-        known["checks"] = {name: _factor(item) for name, item in checks.items()}
-        known.setdefault("trajectory", "planned")
-        known.setdefault("mode", "dynamic")
-        return Verdict(**known)
-
-
-def _factor(record: dict[str, Any]) -> Factor:
-    known = {name: record[name] for name in Factor.__dataclass_fields__ if name in record}
-    known["bodies"] = tuple(record.get("bodies", []))
-    return Factor(**known)
+        said = {name: value for name, value in record.items() if value is not None}
+        return made_of(
+            Verdict, {"trajectory": "planned", "mode": "dynamic", **said}, name="verdict"
+        )

@@ -34,7 +34,6 @@ def announce(session: WireSession, *prefixes: str) -> None:
     """Let everybody see that a source is there, and ask its clock, until the session closes.
 
     Args:
-        session: It publishes with; its clock is the one of the stamps.
         prefixes: Beginnings of the source's topics without slash, such as ``lab/cam/side``.
     """
 
@@ -55,14 +54,7 @@ def announce(session: WireSession, *prefixes: str) -> None:
 
 
 def ask_clocks(session: WireSession, *, timeout_s: float) -> list[ClockAnswer]:
-    """Ask every source for its clock; answers that make no sense are left out.
-
-    Args:
-        session: Of the recorder; its clock is compared with.
-
-    Raises:
-        WireError: When the session is closing.
-    """
+    """Ask every source for its clock; answers that make no sense are left out."""
     asked_ns = session.now_ns()
     answers = []
     for sample in session.query_all(f"{CLOCKS}/**", timeout_s=timeout_s, max_mb=1):

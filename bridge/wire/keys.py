@@ -39,11 +39,7 @@ class NamedKey(NamedTuple):
 
 
 def key_from_topic(topic: str) -> str:
-    """Drop the leading slash.
-
-    Raises:
-        BadTopicError: When the name cannot be a zenoh key.
-    """
+    """Drop the leading slash."""
     if not topic.startswith("/"):
         raise BadTopicError(topic=topic, found="it does not start with a slash")
     key = topic[1:]
@@ -93,11 +89,7 @@ _SCHEMA_ENCODINGS = {
 
 
 def definition_key(type_name: str, schema_encoding: str) -> str:
-    """Name the key of a type's definition: ``@schema/jsonschema/acme/Note``.
-
-    Raises:
-        BadTopicError: When the type's name cannot be part of a key.
-    """
+    """Name the key of a type's definition: ``@schema/jsonschema/acme/Note``."""
     return f"{DEFINITIONS}/{key_from_topic(f'/{schema_encoding}/{type_name}')}"
 
 

@@ -65,12 +65,7 @@ class SharedPool:
     """Memory that receivers on this machine read without a copy through the network."""
 
     def __init__(self, num_bytes: int) -> None:
-        """Reserve the pool.
-
-        Raises:
-            WireConfigError: When the machine has not that much shared memory left. Writing to
-                memory that is not there would end the process, so this is asked first.
-        """
+        """Reserve the pool."""
         free = _free_bytes()
         if free is not None and free < num_bytes:
             problem = f"{_MEMORY} has {free / BYTES_PER_MB:.0f} MB left"
@@ -118,7 +113,6 @@ class WirePublisher:
         """Send one serialised message made at ``source_ns``.
 
         Args:
-            data: The serialised message; large ones go through shared memory where that is on.
             source_ns: Source time of the message [ns since 1970].
         """
         note = Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)

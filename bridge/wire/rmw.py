@@ -30,7 +30,6 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
         type_hash: The definition must have this RIHS01 hash; "" takes the newest.
 
     Raises:
-        MissingDependencyError: When rosbags is not installed.
         UsageError: When a file in the folder is not a message definition.
     """
     text = _definition(type_name, type_hash, folder)
@@ -49,7 +48,6 @@ def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
         folder: Message definitions of the user's own, looked at as well; None for none.
 
     Raises:
-        MissingDependencyError: When rosbags is not installed.
         UsageError: When a file in the folder is not a message definition.
     """
     return next(_hashes(type_name, folder), (None, None))[0]
@@ -104,7 +102,6 @@ def read_definitions(folder: Path) -> None:
     """Read a folder of definitions now rather than at the first message.
 
     Raises:
-        MissingDependencyError: When rosbags is not installed.
         UsageError: When a file in the folder is not a message definition, or there is none.
     """
     _store(_release_names()[0], folder)

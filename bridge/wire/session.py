@@ -315,9 +315,6 @@ class WireSession:
         """Tell what a type is that nobody knows, now and to whoever asks later.
 
         Call it before the first message, from the thread that publishes.
-
-        Raises:
-            BadTopicError: When the type's name cannot be part of a key.
         """
         key = keys.definition_key(record.name, record.schema_encoding)
         self.serve(key, lambda request: record.data)
@@ -351,9 +348,6 @@ class WireSession:
         """Open a client of the endpoint this session listens on, else of one it connects to.
 
         What it publishes reaches this session through the network, as everybody else's does.
-
-        Raises:
-            WireError: When that endpoint cannot be reached from here.
         """
         endpoints = self._config.listen or self._config.connect
         own = replace(
@@ -389,7 +383,6 @@ class WireSession:
 
         Args:
             max_waiting: Requests that may wait for their turn; further ones are refused.
-            side_by_side: Requests that are answered at once, each on its own thread.
         """
         service = Service(key, handler, max_waiting, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)
@@ -402,12 +395,7 @@ class WireSession:
         return service
 
     def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """Ask and wait for the answer.
-
-        Raises:
-            RemoteError: When the other side refused; carries its message.
-            NoReplyError: When nobody answered in time.
-        """
+        """Ask and wait for the answer."""
         try:
             replies = list(self._inner.get(key, payload=payload, timeout=timeout_s))
         except zenoh.ZError as error:
@@ -519,13 +507,7 @@ class WireSession:
 
 
 def open_session(config: WireConfig) -> WireSession:
-    """Open a session: loopback unless told otherwise, and never by multicast scouting.
-
-    Raises:
-        NoPeerError: When nobody listens at the endpoints within the timeout.
-        PortTakenError: When another process listens there already.
-        WireConfigError: When the file or an endpoint cannot be understood.
-    """
+    """Open a session: loopback unless told otherwise, and never by multicast scouting."""
     try:
         inner: Any = zenoh.open(zenoh_config(config))
     except zenoh.ZError as error:

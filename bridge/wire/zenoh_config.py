@@ -43,11 +43,7 @@ _OURS_WHERE_THE_FILE_IS_SILENT = {
 
 
 def zenoh_config(config: WireConfig) -> Any:
-    """Start from the file where given; mode, endpoints and scouting are ours in any case.
-
-    Raises:
-        WireConfigError: When the file or an endpoint cannot be understood.
-    """
+    """Start from the file where given; mode, endpoints and scouting are ours in any case."""
     settings: dict[str, Any] = {
         "mode": config.mode,
         "connect/endpoints": list(config.connect),

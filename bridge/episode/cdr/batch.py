@@ -38,7 +38,6 @@ class MessageTemplate:
 
         Args:
             build: Makes the message from a stamp and ``count`` numbers.
-            count: How many doubles are filled in, in the order the message holds them.
         """
         marks = [2.0**-30 * (3 * number + 1) for number in range(count)]
         self._bytes = codec.encode(type_name, build(_STAMP_MARK, marks))

@@ -315,7 +315,6 @@ def encode(type_name: str, message: Mapping[str, Any]) -> bytes:
 
     Args:
         type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-        message: Values by field; a nested message is a mapping itself.
     """
     out = bytearray()
     _write(out, type_name, message)
@@ -384,7 +383,6 @@ def decode(type_name: str, data: Buffer) -> Message:
         type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
 
     Raises:
-        MalformedMessageError: When the bytes do not fit the type.
         KeyError: When the type is none of ``ros2_definitions``.
     """
     order = _byte_order(type_name, data)

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from bridge.clock import join_ns
 from bridge.episode import schema
-from bridge.episode.cdr.codec import ENCAPSULATION_LE, Buffer, MalformedMessageError
+from bridge.episode.cdr.codec import ENCAPSULATION_LE, Buffer, MalformedMessageError, decode
 from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth import RVL_FORMAT, pack_rvl
 
@@ -34,7 +34,7 @@ FLOAT_DEPTH = "32FC1"
 
 @dataclass(frozen=True, kw_only=True)
 class ImageHeader:
-    """Everything a sensor_msgs/Image says of itself, and where in the message its pixels lie."""
+    """Everything a sensor_msgs/Image says of itself, and its pixels, which are not copied."""
 
     sec: int
     nanosec: int
@@ -45,8 +45,7 @@ class ImageHeader:
     is_bigendian: bool
     step: int
     """Bytes from one row to the next."""
-    data_offset: int
-    data_length: int
+    pixels: memoryview
 
     @property
     def stamp_ns(self) -> int:
@@ -59,66 +58,26 @@ def _malformed(found: str) -> MalformedMessageError:
 
 
 def image_header(data: Buffer) -> ImageHeader:
-    """Read the front of a sensor_msgs/Image without touching its pixels.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message, or end before its pixels do.
-    """
-    if len(data) < 4 or data[1] not in (0, 1):
-        raise _malformed(f"{len(data)} bytes without a CDR encapsulation header")
-    order = "<" if data[1] == 1 else ">"
-    try:
-        sec, nanosec = struct.unpack_from(order + "iI", data, 4)
-        frame_id, at = _string(data, 12, order)
-        height, width = struct.unpack_from(order + "II", data, at)
-        encoding, at = _string(data, at + 8, order, align=False)
-        is_bigendian = data[at]
-        at = _aligned(at + 1)
-        step, length = struct.unpack_from(order + "II", data, at)
-    except (struct.error, ValueError, IndexError) as error:
-        raise _malformed(str(error)) from error
-    at += 8
-    if length > len(data) - at:
-        raise _malformed(f"{length} bytes of pixels claimed, {len(data) - at} are there")
+    """Read a sensor_msgs/Image without touching its pixels."""
+    message = decode(schema.IMAGE, data)
     return ImageHeader(
-        sec=sec,
-        nanosec=nanosec,
-        frame_id=frame_id,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=bool(is_bigendian),
-        step=step,
-        data_offset=at,
-        data_length=length,
+        sec=message["header"]["stamp"]["sec"],
+        nanosec=message["header"]["stamp"]["nanosec"],
+        frame_id=message["header"]["frame_id"],
+        height=message["height"],
+        width=message["width"],
+        encoding=message["encoding"],
+        is_bigendian=bool(message["is_bigendian"]),
+        step=message["step"],
+        pixels=message["data"],
     )
 
 
-def _aligned(at: int) -> int:
-    return at + -at % 4  # the encapsulation's 4 bytes do not disturb alignment to 4
-
-
-def _string(data: Buffer, at: int, order: str, *, align: bool = True) -> tuple[str, int]:
-    (length,) = struct.unpack_from(order + "I", data, at)
-    at += 4
-    if length > len(data) - at:
-        message = f"string of {length} bytes runs past the end"
-        raise ValueError(message)
-    text = bytes(data[at : at + length]).rstrip(b"\0").decode()
-    at += length
-    return text, _aligned(at) if align else at
-
-
-def pixel_rows(
-    data: Buffer, header: ImageHeader, pixel_bytes: int
-) -> UInt8[np.ndarray, "rows row"]:
+def pixel_rows(header: ImageHeader, pixel_bytes: int) -> UInt8[np.ndarray, "rows row"]:
     """View the pixels of a message, row padding cut off; nothing is copied.
 
     Args:
         pixel_bytes: Bytes of one pixel in the header's encoding: 3 for ``rgb8``, 2 for ``16UC1``.
-
-    Raises:
-        MalformedMessageError: Size, step and length contradict each other, or there is no pixel.
     """
     height, width, step = header.height, header.width, header.step
     row = width * pixel_bytes
@@ -126,31 +85,26 @@ def pixel_rows(
         raise _malformed(f"an image of {width} x {height} pixels")
     if step < row:
         raise _malformed(f"a step of {step} bytes for rows of {width} {header.encoding} pixels")
-    if header.data_length != step * height:
-        raise _malformed(f"{header.data_length} bytes for {height} rows of {step}")
-    flat = np.frombuffer(data, np.uint8, count=header.data_length, offset=header.data_offset)
-    return flat.reshape(height, step)[:, :row]
+    if len(header.pixels) != step * height:
+        raise _malformed(f"{len(header.pixels)} bytes for {height} rows of {step}")
+    return np.frombuffer(header.pixels, np.uint8).reshape(height, step)[:, :row]
 
 
 def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     """Compress a raw colour image; an alpha channel is dropped.
 
     Args:
-        data: CDR of a sensor_msgs/Image.
         quality: JPEG quality, 1 to 100.
 
     Returns:
         CDR of a sensor_msgs/CompressedImage with the same stamp and frame, or None when the
         encoding is none of ``COLOR_LAYOUTS``.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself, or is larger than JPEG allows.
     """
     header = image_header(data)
     if header.encoding not in COLOR_LAYOUTS:
         return None
     layout, channels = COLOR_LAYOUTS[header.encoding]
-    rows = pixel_rows(data, header, channels)
+    rows = pixel_rows(header, channels)
     image_u8 = rows.reshape(header.height, header.width, channels)
     try:
         jpeg = encode_jpeg(image_u8, quality, layout=layout, subsampling=SUBSAMPLING)
@@ -162,20 +116,14 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
 def depth_to_compact(data: Buffer) -> bytes | None:
     """Compress a raw depth image without loss (RVL).
 
-    Args:
-        data: CDR of a sensor_msgs/Image.
-
     Returns:
         CDR of a sensor_msgs/CompressedImage of format ``RVL_FORMAT`` with the same stamp and
         frame, or None when the encoding is not 16 bit.
-
-    Raises:
-        MalformedMessageError: The message contradicts itself.
     """
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
-    rows = pixel_rows(data, header, 2)
+    rows = pixel_rows(header, 2)
     return _compressed_image(header, RVL_FORMAT, pack_rvl(rows, swap_bytes=header.is_bigendian))
 
 

@@ -38,17 +38,14 @@ class VideoFrame:
 
     @staticmethod
     def from_protobuf(data: bytes) -> "VideoFrame":
-        """Read a foxglove.CompressedVideo.
-
-        Raises:
-            MalformedMessageError: The bytes are no such message.
-        """
+        """Read a foxglove.CompressedVideo."""
         found: dict[int, bytes] = {}
         try:
             for number, value in protobuf.fields(memoryview(data)):
                 if 1 <= number <= 4:
                     if isinstance(value, int):
-                        raise ValueError(_not_bytes(number))
+                        message = f"field {number} is a number"
+                        raise ValueError(message)
                     found[number] = bytes(value)
             return VideoFrame(
                 stamp_ns=_stamp(found.get(1, b"")),
@@ -60,37 +57,6 @@ class VideoFrame:
             raise MalformedMessageError(
                 type_name=schema.COMPRESSED_VIDEO, found=str(error)
             ) from error
-
-
-def foxglove_stamp_ns(type_name: str, data: bytes) -> int:
-    """Walk through a message of one of our protobuf types and return its time [ns].
-
-    Raises:
-        MalformedMessageError: The bytes are no such message.
-    """
-    kinds = {number: kind for _, number, kind, _ in schema.PROTOBUF_MEMBERS[type_name]}
-    stamp_ns = 0
-    try:
-        for number, value in protobuf.fields(memoryview(data)):
-            if number not in kinds:
-                continue
-            if isinstance(value, int):
-                raise ValueError(_not_bytes(number))
-            if kinds[number] == protobuf.FIXED32_TYPE and len(value) != FIXED32_BYTES:
-                message = f"field {number} has {len(value)} bytes, not {FIXED32_BYTES}"
-                raise ValueError(message)
-            if number == 1:
-                stamp_ns = _stamp(bytes(value))
-    except ValueError as error:
-        raise MalformedMessageError(type_name=type_name, found=str(error)) from error
-    return stamp_ns
-
-
-FIXED32_BYTES = 4
-
-
-def _not_bytes(number: int) -> str:
-    return f"field {number} is a number"
 
 
 def _stamp(data: bytes) -> int:
@@ -202,7 +168,7 @@ class RawColor:
         if header.encoding not in COLOR_LAYOUTS:
             raise _no_color(header.encoding)
         channels = COLOR_LAYOUTS[header.encoding][1]
-        rows = pixel_rows(data, header, channels)
+        rows = pixel_rows(header, channels)
         return RawColor(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
@@ -244,9 +210,6 @@ def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColo
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message.
     """
     return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
 
@@ -256,9 +219,6 @@ def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
 
     Args:
         type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
-
-    Raises:
-        MalformedMessageError: The bytes are no such message, or hold no 8-bit colour.
     """
     if type_name != schema.IMAGE:
         return CompressedColor.from_cdr(data)
@@ -298,7 +258,7 @@ class DepthImage:
         """
         header = image_header(data)
         if header.encoding == FLOAT_DEPTH:
-            rows = np.ascontiguousarray(pixel_rows(data, header, 4))
+            rows = np.ascontiguousarray(pixel_rows(header, 4))
             depth_m = rows.view(">f4" if header.is_bigendian else "<f4").astype(np.float32)
             return DepthImage(
                 stamp_ns=header.stamp_ns,
@@ -308,7 +268,7 @@ class DepthImage:
         if header.encoding not in DEPTH_ENCODINGS:
             found = f"encoding {header.encoding!r}, expected '16UC1' or '{FLOAT_DEPTH}'"
             raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
-        rows = np.ascontiguousarray(pixel_rows(data, header, 2))
+        rows = np.ascontiguousarray(pixel_rows(header, 2))
         return DepthImage(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
@@ -321,10 +281,6 @@ class DepthImage:
 
         Args:
             type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-
-        Raises:
-            MalformedMessageError: The bytes are no such message, or hold no 16-bit depth.
-            UnreadableImageError: What is compressed cannot be decoded.
         """
         if type_name == schema.IMAGE:
             return DepthImage.from_cdr(data)
@@ -539,11 +495,7 @@ class PointCloudSample:
 
     @staticmethod
     def from_cdr(data: bytes) -> "PointCloudSample":
-        """Read a cloud as ``to_cdr`` writes it.
-
-        Raises:
-            MalformedMessageError: Another layout of fields, or bytes that are no cloud.
-        """
+        """Read a cloud as ``to_cdr`` writes it."""
         message = codec.decode(schema.POINT_CLOUD, data)
         layout = [(item["name"], item["offset"], item["datatype"]) for item in message["fields"]]
         raw, count = bytes(message["data"]), int(message["width"]) * int(message["height"])

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import lz4.frame
 import zstandard
 from mcap.records import McapRecord, Schema
 
@@ -20,8 +21,7 @@ from bridge.episode.mcap.format import (
     Buffer,
     crc32,
 )
-from bridge.episode.mcap.walk import BrokenRecordError, parse, records_in
-from bridge.errors import MissingDependencyError
+from bridge.episode.mcap.walk import MAX_CHUNK_BYTES, BrokenRecordError, parse, records_in
 
 BLOCK_BYTES = 1 << 20
 
@@ -44,21 +44,6 @@ class RecordFile:
                 break
             data += more
         return data
-
-    def read_into(self, offset: int, room: memoryview) -> int:
-        """Fill ``room`` and return how many bytes there were, fewer only at the end.
-
-        Args:
-            offset: Where to begin [bytes from the start of the file].
-            room: Memory to fill; its length says how many bytes are wanted.
-        """
-        done = 0
-        while done < len(room):
-            count = os.preadv(self.descriptor, [room[done:]], offset + done)
-            if not count:
-                break
-            done += count
-        return done
 
     def blocks(self, offset: int, size: int) -> Iterator[bytes]:
         """Return a range in blocks."""
@@ -126,55 +111,6 @@ def finished_data(file: RecordFile) -> FinishedData | None:
     return FinishedData(end, is_proved=crc != 0)
 
 
-# A megabyte asked of the system for every chunk costs 256 page faults, a third of the time a
-# recovery takes; room that is used again costs none.
-
-
-class Scratch:
-    """Two buffers that grow as needed; what they hold is lost with the next chunk."""
-
-    def __init__(self) -> None:
-        """Begin without any room."""
-        self._record = bytearray()
-        self._unpacked = bytearray()
-
-    def read(self, file: RecordFile, offset: int, size: int) -> memoryview:
-        """Read up to ``size`` bytes, fewer only at the end of the file.
-
-        The memory returned is used again by the next call.
-
-        Args:
-            offset: Where to begin [bytes from the start of the file].
-        """
-        if len(self._record) < size:
-            self._record = bytearray(size)
-        room = memoryview(self._record)[:size]
-        return room[: file.read_into(offset, room)]
-
-    def unpack(self, frame: memoryview, size: int) -> memoryview | None:
-        """Unpack a zstd frame of exactly ``size`` bytes; None when it is something else.
-
-        The memory returned is used again by the next call.
-
-        Args:
-            size: What they must unpack to [bytes].
-        """
-        if len(self._unpacked) < size:
-            self._unpacked = bytearray(size)
-        room = memoryview(self._unpacked)[:size]
-        reader = zstandard.ZstdDecompressor().stream_reader(frame)
-        done = 0
-        while done < size:
-            count = reader.readinto(room[done:])
-            if not count:
-                return None
-            done += count
-        return None if reader.read(1) else room
-
-
-MAX_CHUNK_BYTES = 1 << 29
-"""A chunk or message that claims more, packed or unpacked, is refused: memory is bounded."""
-
 _INDEX_FIELDS = struct.Struct("<HxxxxQ")
 """Channel and log time of a message, after its record head."""
 _CHUNK_HEAD_BYTES = RECORD_HEAD.size + CHUNK_FIELDS.size + 4
@@ -182,11 +118,7 @@ _COMPRESSIONS = (b"", b"lz4", b"zstd")
 
 
 def read_plain(record: bytes) -> McapRecord | None:
-    """Return a whole header, schema, channel or metadata record, checked to its end.
-
-    Raises:
-        BrokenRecordError: When its fields run past its end, or a schema has id 0.
-    """
+    """Return a whole header, schema, channel or metadata record, checked to its end."""
     found = parse(record[0], record[RECORD_HEAD.size :])
     if isinstance(found, Schema) and found.id == 0:
         message = "a schema has id 0"
@@ -217,11 +149,7 @@ class ChunkHead:
 
 
 def parse_chunk_head(front: bytes) -> ChunkHead:
-    """Read a chunk's head from the first bytes of its record.
-
-    Raises:
-        BrokenRecordError: When they are too few or name an unknown compression.
-    """
+    """Read a chunk's head from the first bytes of its record."""
     if len(front) < _CHUNK_HEAD_BYTES or front[0] != CHUNK:
         message = "no chunk head"
         raise BrokenRecordError(message)
@@ -289,43 +217,6 @@ def walk_records(data: Buffer) -> Contents:
     return found
 
 
-def unpack_chunk(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer:
-    """Return a whole chunk's records.
-
-    Args:
-        scratch: Memory that is used again for each chunk; the records may lie in it.
-
-    Raises:
-        BrokenRecordError: When size or CRC are not as claimed.
-        MissingDependencyError: When it is packed with lz4 and that is not installed.
-    """
-    records = _unpack_at_once(head, data, scratch)
-    if records is None:
-        records = unpack_front(head, bytes(data))
-    if len(records) != head.uncompressed_size:
-        message = f"its data unpacks to {len(records)} bytes instead of {head.uncompressed_size}"
-        raise BrokenRecordError(message)
-    if head.crc and crc32(records, 0) != head.crc:
-        message = "its CRC is wrong"
-        raise BrokenRecordError(message)
-    return records
-
-
-def _unpack_at_once(head: ChunkHead, data: memoryview, scratch: Scratch) -> Buffer | None:
-    """Unpack the usual cases quickly: nothing, or one zstd frame that says how much it holds."""
-    if head.compression == "":
-        return data
-    try:
-        if (
-            head.compression == "zstd"
-            and zstandard.frame_content_size(data) == head.uncompressed_size
-        ):
-            return scratch.unpack(data, head.uncompressed_size)
-    except (zstandard.ZstdError, MemoryError):
-        pass
-    return None
-
-
 def unpack_front(head: ChunkHead, data: bytes) -> bytes:
     """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified.
 
@@ -354,12 +245,6 @@ def _unpack_zstd(data: bytes, limit: int) -> bytes:
 
 
 def _unpack_lz4(data: bytes, limit: int) -> bytes:
-    try:
-        import lz4.frame  # noqa: PLC0415 - only other writers' files need it
-    except ImportError as error:
-        raise MissingDependencyError(
-            package="lz4", extra="record", purpose="reading a chunk packed with lz4"
-        ) from error
     unpacked = bytearray()
     try:
         reader = lz4.frame.LZ4FrameDecompressor()

@@ -34,11 +34,7 @@ class Summary:
         self._metadata: list[bytes] = []
 
     def add_chunk(self, place: ChunkPlace, counts: dict[int, int]) -> None:
-        """Book a chunk that is in the file, with its number of messages by channel.
-
-        Args:
-            counts: Messages in it by channel id; empty when it holds definitions only.
-        """
+        """Book a chunk that is in the file, with its number of messages by channel."""
         self._chunks.append(mcap_format.chunk_index(place))
         if counts:
             self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
@@ -48,7 +44,6 @@ class Summary:
 
         Args:
             start_ns: Earliest log time among them [ns since 1970].
-            end_ns: Latest log time among them.
         """
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
@@ -315,16 +310,6 @@ class DataSection:
         self.file.append(buffers, crc=crc)
         for place in places:
             self.book(*place)
-
-    def add_indexes(self, chunk: EncodedChunk, start: int) -> None:
-        """Write the message indexes of a chunk that lies at ``start``, at the end of the file.
-
-        Args:
-            start: Where the chunk begins [bytes from the start of the file].
-        """
-        indexes, offsets = index_records(chunk.index, self.file.offset)
-        self.file.append([indexes])
-        self.book(chunk, start, offsets, len(indexes))
 
     def book(
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int

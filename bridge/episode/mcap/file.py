@@ -24,6 +24,7 @@ from bridge.episode.mcap.walk import (
     BrokenRecordError,
     ByteStream,
     ChunkHead,
+    MessageHead,
     RecordSpan,
     attachment_of,
     message_head,
@@ -43,14 +44,11 @@ def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
 
     Args:
         data_end: Where its data section ends [bytes from the start of the file].
-
-    Raises:
-        BrokenRecordError: When a record or chunk is damaged.
     """
     builder = _Builder()
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
-    return builder.finish()
+    return builder.seen.to_summary()
 
 
 def chunk_entry(place: RecordSpan, chunk: ChunkHead) -> records.ChunkIndex:
@@ -81,7 +79,6 @@ def attachment_entry(
     """Make the index entry of an attachment.
 
     Args:
-        record: Its name, type and times; its data may have been left out.
         data_size: Of the data [bytes].
     """
     return records.AttachmentIndex(
@@ -95,90 +92,115 @@ def attachment_entry(
     )
 
 
+@dataclass(kw_only=True)
+class Seen:
+    """What a walk through the data section found."""
+
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages by channel."""
+    start_ns: int | None = None
+    end_ns: int = 0
+    chunks: list[records.ChunkIndex] = field(default_factory=list)
+    """Of the chunks whose head can be read."""
+    num_chunks: int = 0
+    attachments: list[records.AttachmentIndex] = field(default_factory=list)
+    num_broken_attachments: int = 0
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
+
+    def count(self, head: MessageHead) -> None:
+        """Take a message."""
+        self.counts[head.channel_id] = self.counts.get(head.channel_id, 0) + 1
+        if self.start_ns is None or head.log_time_ns < self.start_ns:
+            self.start_ns = head.log_time_ns
+        self.end_ns = max(self.end_ns, head.log_time_ns)
+
+    def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
+        """Take a schema, channel or metadata record; yields what is wrong with it.
+
+        Args:
+            record: What was read there; None, and any other kind of record, is passed over.
+        """
+        if isinstance(record, records.Metadata):
+            self.metadata.append(metadata_entry(place, record))
+        elif isinstance(record, records.Schema):
+            if record.id == 0:
+                yield "a schema has the id 0, which means none"
+            if self.schemas.setdefault(record.id, record) != record:
+                yield f"schema {record.id} is announced twice with different contents"
+        elif isinstance(record, records.Channel):
+            if record.schema_id and record.schema_id not in self.schemas:
+                yield f"channel {record.id} uses schema {record.schema_id}, not announced before"
+            if self.channels.setdefault(record.id, record) != record:
+                yield f"channel {record.id} is announced twice with different contents"
+
+    def to_summary(self) -> Summary:
+        """Make the summary that such a file should have."""
+        summary = Summary()
+        summary.schemas, summary.channels = self.schemas, self.channels
+        summary.chunk_indexes, summary.attachment_indexes = self.chunks, self.attachments
+        summary.metadata_indexes = self.metadata
+        summary.statistics = records.Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=self.counts,
+            chunk_count=len(self.chunks),
+            message_count=sum(self.counts.values()),
+            message_start_time=self.start_ns or 0,
+            message_end_time=self.end_ns,
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )
+        return summary
+
+
 class _Builder:
     def __init__(self) -> None:
-        self.summary = Summary()
-        self._counts: dict[int, int] = {}
-        self._start_ns: int | None = None
-        self._end_ns = 0
+        self.seen = Seen()
         self._chunk: records.ChunkIndex | None = None
 
     def add(self, stream: ByteStream, place: RecordSpan) -> None:
         """Take one record of the data section."""
-        if place.opcode == mcap_format.MESSAGE:
+        if place.opcode == MESSAGE:
             stream.seek(place.offset)
-            head = message_head(stream.read(MESSAGE_HEAD.size), 0, 0)
-            self._count(head.channel_id, head.log_time_ns)
+            self._count(message_head(stream.read(MESSAGE_HEAD.size), 0, 0))
         elif place.opcode == mcap_format.CHUNK:
             self._add_chunk(stream, place)
         elif place.opcode == mcap_format.ATTACHMENT:
-            self._add_attachment(stream, place)
-        elif place.opcode in (
-            mcap_format.SCHEMA,
-            mcap_format.CHANNEL,
-            mcap_format.METADATA,
-            mcap_format.MESSAGE_INDEX,
-        ):
-            self._note(place, parse(place.opcode, read_body(stream, place)))
+            found, data_size = attachment_of(stream, place, keep=False)
+            self.seen.attachments.append(attachment_entry(place, found, data_size))
+        else:
+            record = parse(place.opcode, read_body(stream, place))
+            if isinstance(record, records.MessageIndex) and self._chunk is not None:
+                self._chunk.message_index_offsets[record.channel_id] = place.offset
+                self._chunk.message_index_length += place.end - place.offset
+            self._define(place, record)
         if place.opcode not in (mcap_format.CHUNK, mcap_format.MESSAGE_INDEX):
             self._chunk = None
 
-    def _note(self, place: RecordSpan, record: records.McapRecord | None) -> None:
-        if isinstance(record, records.Metadata):
-            self.summary.metadata_indexes.append(metadata_entry(place, record))
-        elif isinstance(record, records.MessageIndex) and self._chunk is not None:
-            self._chunk.message_index_offsets[record.channel_id] = place.offset
-            self._chunk.message_index_length += place.end - place.offset
-        else:
-            self._define(record)
+    def _define(self, place: RecordSpan, record: records.McapRecord | None) -> None:
+        for fault in self.seen.define(place, record):
+            raise BrokenRecordError(fault)
 
-    def _define(self, record: records.McapRecord | None) -> None:
-        if isinstance(record, records.Schema):
-            self.summary.schemas[record.id] = record
-        elif isinstance(record, records.Channel):
-            self.summary.channels[record.id] = record
-
-    def _count(self, channel_id: int, log_time_ns: int) -> None:
-        if channel_id not in self.summary.channels:
-            message = f"a message is of channel {channel_id}, which was never announced"
+    def _count(self, head: MessageHead) -> None:
+        if head.channel_id not in self.seen.channels:
+            message = f"a message is of channel {head.channel_id}, which was never announced"
             raise BrokenRecordError(message)
-        self._counts[channel_id] = self._counts.get(channel_id, 0) + 1
-        earliest = log_time_ns if self._start_ns is None else self._start_ns
-        self._start_ns = min(earliest, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+        self.seen.count(head)
 
     def _add_chunk(self, stream: ByteStream, place: RecordSpan) -> None:
         chunk = parse_chunk(read_body(stream, place))
         data = unpack_chunk(chunk, whose=f"the chunk at byte {place.offset}")
         for opcode, at, length in records_in(data):
-            if opcode == mcap_format.MESSAGE:
-                head = message_head(data, at, at)
-                self._count(head.channel_id, head.log_time_ns)
+            if opcode == MESSAGE:
+                self._count(message_head(data, at, at))
             else:
-                body = at + mcap_format.RECORD_HEAD.size
-                self._define(parse(opcode, data[body : body + length]))
+                body = at + RECORD_HEAD.size
+                inside = RecordSpan(opcode, at, length)
+                self._define(inside, parse(opcode, data[body : body + length]))
         self._chunk = chunk_entry(place, chunk)
-        self.summary.chunk_indexes.append(self._chunk)
-
-    def _add_attachment(self, stream: ByteStream, place: RecordSpan) -> None:
-        found, data_size = attachment_of(stream, place, keep=False)
-        self.summary.attachment_indexes.append(attachment_entry(place, found, data_size))
-
-    def finish(self) -> Summary:
-        """Return the summary with its statistics."""
-        summary = self.summary
-        summary.statistics = records.Statistics(
-            attachment_count=len(summary.attachment_indexes),
-            channel_count=len(summary.channels),
-            channel_message_counts=self._counts,
-            chunk_count=len(summary.chunk_indexes),
-            message_count=sum(self._counts.values()),
-            message_start_time=self._start_ns or 0,
-            message_end_time=self._end_ns,
-            metadata_count=len(summary.metadata_indexes),
-            schema_count=len(summary.schemas),
-        )
-        return summary
+        self.seen.chunks.append(self._chunk)
 
 
 _FOOTER_BYTES = RECORD_HEAD.size + FOOTER_FIELDS.size + len(MAGIC)
@@ -210,12 +232,7 @@ class McapFile:
     """What a reader must know of one file before it reads messages."""
 
     def __init__(self, path: Path) -> None:
-        """Read header, summary and metadata. A summary that is left out is built from the data.
-
-        Raises:
-            BrokenRecordError: When the file is no finished MCAP file, or its end is damaged.
-            OSError: When it cannot be read.
-        """
+        """Read header, summary and metadata. A summary that is left out is built from the data."""
         self.path = path
         with path.open("rb") as stream:
             self.header = read_header(stream)
@@ -333,12 +350,8 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
     """Read the summary section with its CRC checked, None where there is none.
 
     Args:
-        stream: The file; its position is changed.
         footer: The last record, with the summary's place and CRC (0: not checked).
         footer_at: Where the footer begins [bytes from the start of the file].
-
-    Raises:
-        BrokenRecordError: When it is damaged.
     """
     if not footer.summary_start:
         return None

@@ -157,7 +157,6 @@ def attachment(
     """Encode an attachment as buffers to be written one after the other.
 
     Args:
-        data: Its contents; not copied.
         log_time_ns: When it was recorded [ns since 1970].
         create_time_ns: When it was made; 0 for unknown.
     """
@@ -217,7 +216,6 @@ def statistics(
     Args:
         start_ns: Earliest log time [ns since 1970], 0 when there is no message.
         end_ns: Latest log time, 0 when there is no message.
-        message_counts: Messages by channel id; their sum is the file's.
     """
     counts = b"".join(struct.pack("<HQ", *item) for item in message_counts.items())
     numbers = (sum(message_counts.values()), schemas, channels, attachments, metadata_records)
@@ -241,11 +239,7 @@ def data_end(crc: int) -> bytes:
 
 
 def summary_section(groups: Iterable[tuple[int, bytes]], start: int) -> bytes:
-    """Encode summary, offsets, footer and magic.
-
-    Args:
-        groups: Opcode and joined records of each kind; empty ones are left out.
-    """
+    """Encode summary, offsets, footer and magic."""
     body, offsets = b"", b""
     for opcode, records in groups:
         if records:

@@ -58,11 +58,7 @@ def _refuse_strays(
     channel_ids: UInt16[np.ndarray, " num_messages"],
     announced: Bool[np.ndarray, " num_channel_ids"],
 ) -> None:
-    """Raise BrokenRecordError when a message is of a channel that was never announced.
-
-    Args:
-        announced: By channel id: whether the file announced the channel.
-    """
+    """Raise BrokenRecordError when a message is of a channel that was never announced."""
     is_known = announced[channel_ids]
     if not is_known.all():
         channel_id = int(channel_ids[int(np.argmin(is_known))])
@@ -71,11 +67,7 @@ def _refuse_strays(
 
 
 def message_table(data: bytes) -> MessageTable:
-    """List the messages in a chunk.
-
-    Raises:
-        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
-    """
+    """List the messages in a chunk."""
     times_ns, channel_ids = array("Q"), array("H")
     starts = array("q")
     for opcode, at, _ in records_in(data):
@@ -240,11 +232,7 @@ def read_chunk(
     """Unpack a chunk, its CRC checked, and list its messages.
 
     Args:
-        stream: The file; its position is changed.
         data_end: Where the data section ends [bytes from the start of the file].
-
-    Raises:
-        BrokenRecordError: When there is none where the index says, or it is damaged.
     """
     offset = index.chunk_start_offset
     place = next(walk(stream, offset, data_end), None)
@@ -312,9 +300,6 @@ def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
 
     Args:
         files: The parts of an episode; their order decides between equal log times.
-
-    Raises:
-        EpisodeError: When a file is damaged or cannot be read.
     """
     opened = [_OpenFile(file, number, select) for number, file in enumerate(files)]
     heap: list[_Entry] = []

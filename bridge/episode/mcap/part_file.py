@@ -33,12 +33,7 @@ class PartFile:
 
     @staticmethod
     def create(path: Path) -> "PartFile":
-        """Create and lock a new file.
-
-        Raises:
-            FileExistsError: When there is one.
-            BlockingIOError: When someone locked it in the same instant.
-        """
+        """Create and lock a new file."""
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -78,15 +73,6 @@ class PartFile:
                 offset += written
                 rest = rest[written:]
         return offset
-
-    def overwrite(self, offset: int, data: bytes) -> None:
-        """Replace a few bytes inside the file; ``crc`` is the caller's to set anew.
-
-        Args:
-            offset: Where the first byte goes [bytes from the start of the file].
-            data: What replaces as many bytes; it must end inside the file.
-        """
-        os.pwrite(self._descriptor, data, offset)
 
     def sync_data(self) -> None:
         """Force what was written to the disk; safe from another thread.
@@ -196,10 +182,6 @@ def open_part(path: Path, *, replace_dead: bool) -> PartFile:
 
     Args:
         replace_dead: Remove a part whose writer died, instead of refusing.
-
-    Raises:
-        UsageError: When the episode exists, or its part does.
-        BridgeError: When the folder cannot be written.
     """
     part_path = path.with_name(path.name + ".part")
     if path.exists():
@@ -245,11 +227,7 @@ def cannot_write(path: Path, error: OSError) -> BridgeError:
 
 
 def lock_dead(path: Path, *, write: bool = True) -> int | None:
-    """Open and lock a file whose writer is gone; None when it is still being written.
-
-    Raises:
-        OSError: When it cannot be opened.
-    """
+    """Open and lock a file whose writer is gone; None when it is still being written."""
     descriptor = os.open(path, (os.O_RDWR if write else os.O_RDONLY) | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

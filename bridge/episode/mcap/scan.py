@@ -14,18 +14,21 @@ from mcap.records import McapRecord
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
     BLOCK_BYTES,
-    MAX_CHUNK_BYTES,
     ChunkHead,
     Contents,
     RecordFile,
-    Scratch,
     parse_chunk_head,
     read_plain,
-    unpack_chunk,
     unpack_front,
     walk_records,
 )
-from bridge.episode.mcap.walk import BrokenRecordError, attachment_fields
+from bridge.episode.mcap.walk import (
+    MAX_CHUNK_BYTES,
+    BrokenRecordError,
+    attachment_fields,
+    parse_chunk,
+    unpack_chunk,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +58,10 @@ class Plain(Span):
 class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
-    raw: memoryview
-    """The whole record, until the walk goes on."""
+    raw: bytes
+    """The whole record."""
     head: ChunkHead
     contents: Contents
-    is_journalled: bool = False
-    """It lies in the journal beside the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,11 +152,8 @@ PRIVATE = 0x80
 
 
 def scan(file: RecordFile) -> Iterator[Found]:
-    """Return what the file holds, in order, without a gap; ends at DataEnd or the last damage.
-
-    The bytes of a chunk (``Chunk.raw``) are gone when the next thing is asked for.
-    """
-    position, scratch = len(mcap.MAGIC), Scratch()
+    """Return what the file holds, in order, without a gap; ends at DataEnd or the last damage."""
+    position = len(mcap.MAGIC)
     before: Found | None = None
     if file.read(0, position) != mcap.MAGIC:
         damage = _step_over(file, 0, "it does not begin like an MCAP file")
@@ -163,7 +161,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         position = damage.end
     while position < file.size:
         try:
-            found = _read_record(file, position, scratch)
+            found = _read_record(file, position)
             if isinstance(found, TopMessage) and isinstance(before, (Chunk, IndexSpan, Damage)):
                 _refuse_renamed_index(file, found)
         except BrokenRecordError as error:
@@ -176,7 +174,7 @@ def scan(file: RecordFile) -> Iterator[Found]:
         before, position = found, found.end
 
 
-def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | None:
+def _read_record(file: RecordFile, offset: int) -> Found | None:
     """Read the record at an offset; None where the summary begins without an end of the data."""
     front = file.read(offset, _FRONT_BYTES)
     if len(front) < mcap.RECORD_HEAD.size:
@@ -194,7 +192,7 @@ def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | Non
         message = f"the file ends inside a {kind}"
         raise BrokenRecordError(message)
     if opcode == mcap.CHUNK:
-        return _read_chunk(file, offset, front, scratch)
+        return _read_chunk(file, offset, front)
     if opcode == mcap.MESSAGE:
         return _read_message(offset, length, front)
     if opcode == mcap.MESSAGE_INDEX:
@@ -211,17 +209,13 @@ def _read_record(file: RecordFile, offset: int, scratch: Scratch) -> Found | Non
     return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
 
-def _read_chunk(file: RecordFile, offset: int, front: bytes, scratch: Scratch) -> Chunk:
+def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     head = parse_chunk_head(front)
     if not head.is_consistent:
         message = "the lengths of a chunk contradict each other or are beyond all limits"
         raise BrokenRecordError(message)
-    raw = scratch.read(file, offset, head.record_bytes)
-    try:
-        records = unpack_chunk(head, raw[head.head_bytes :], scratch)
-    except BrokenRecordError as error:
-        message = f"a chunk is damaged: {error}"
-        raise BrokenRecordError(message) from error
+    raw = file.read(offset, head.record_bytes)
+    records = unpack_chunk(parse_chunk(raw[mcap.RECORD_HEAD.size :]))
     contents = walk_records(records)
     if contents.size != len(records):
         message = "a chunk is damaged: its records are torn"
@@ -252,11 +246,7 @@ def _read_index(offset: int, length: int, front: bytes) -> IndexSpan:
 
 
 def _refuse_renamed_index(file: RecordFile, found: TopMessage) -> None:
-    """An index whose opcode was altered must not pass for a message that nobody sent.
-
-    Raises:
-        BrokenRecordError: When what stands behind a chunk is built like its index to the byte.
-    """
+    """An index whose opcode was altered must not pass for a message that nobody sent."""
     size = _index_bytes(file.read(found.offset, _FRONT_BYTES))
     if size and size % _INDEX_ENTRY_BYTES == 0 and _INDEX_FRONT.size + size == found.length:
         message = "a message index calls itself a message"

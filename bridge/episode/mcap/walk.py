@@ -83,9 +83,6 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     Args:
         start: Where the first record begins [bytes from the start of the stream].
         end: Where the last one must end.
-
-    Raises:
-        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
     """
     at = start
     while at < end:
@@ -96,11 +93,7 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
 
 
 def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
-    """Yield the places of all records of a section of a file that is in memory.
-
-    Raises:
-        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
-    """
+    """Yield the places of all records of a section of a file that is in memory."""
     at, end = start, start + len(section)
     while at < end:
         front = at - start
@@ -124,11 +117,7 @@ def _place(head: bytes, at: int, end: int) -> RecordSpan:
 
 
 def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
-    """Return a record's bytes without opcode and length.
-
-    Args:
-        stream: The file; its position is changed.
-    """
+    """Return a record's bytes without opcode and length."""
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
     if len(body) < place.length:
@@ -187,11 +176,7 @@ _U8, _U16, _U32, _U64 = map(struct.Struct, ("<B", "<H", "<I", "<Q"))
 
 
 def parse(opcode: int, body: bytes) -> records.McapRecord | None:
-    """Read a record other than messages, chunks and attachments; None for unknown opcodes.
-
-    Raises:
-        BrokenRecordError: When its fields run past its end.
-    """
+    """Read a record other than messages, chunks and attachments; None for unknown opcodes."""
     kind = _CLASSES.get(opcode)
     if kind is None:
         return None
@@ -214,11 +199,7 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
     """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
 
     Args:
-        stream: The file; its position is changed.
         keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
-
-    Raises:
-        BrokenRecordError: When its fields run past its end, or its CRC is wrong.
     """
     stream.seek(place.offset + RECORD_HEAD.size)
     fields = attachment_fields(stream.read(min(place.length, PIECE_BYTES)), place.offset)
@@ -254,11 +235,7 @@ class AttachmentFields(NamedTuple):
 
 
 def attachment_fields(front: bytes, offset: int) -> AttachmentFields:
-    """Read the first bytes of the body of the attachment whose record lies at ``offset``.
-
-    Raises:
-        BrokenRecordError: When its fields run past them.
-    """
+    """Read the first bytes of the body of the attachment whose record lies at ``offset``."""
     fields = _Fields(front)
     try:
         times = fields.read8(), fields.read8()
@@ -306,11 +283,7 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk(body: bytes) -> ChunkHead:
-    """Read a chunk record.
-
-    Raises:
-        BrokenRecordError: When its fields run past its end.
-    """
+    """Read a chunk record."""
     try:
         start_ns, end_ns, size, crc = CHUNK_FIELDS.unpack_from(body, 0)
         at = CHUNK_FIELDS.size
@@ -331,11 +304,7 @@ def parse_chunk(body: bytes) -> ChunkHead:
 
 
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
-    """Decompress a chunk and compare its size and CRC.
-
-    Raises:
-        BrokenRecordError: When one of them is wrong, or it is too large to be believed.
-    """
+    """Decompress a chunk and compare its size and CRC."""
     if chunk.size > MAX_CHUNK_BYTES:
         message = f"{whose} claims {chunk.size} bytes, more than {MAX_CHUNK_BYTES}"
         raise BrokenRecordError(message)
@@ -398,11 +367,7 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
 
 
 def records_in(data: Buffer) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, offset and body length of each record in a chunk's unpacked data.
-
-    Raises:
-        BrokenRecordError: When a record claims more bytes than are left, or is of kind 0.
-    """
+    """Yield opcode, offset and body length of each record in a chunk's unpacked data."""
     at, end = 0, len(data)
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
     while at < end:

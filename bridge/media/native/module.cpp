@@ -68,7 +68,7 @@ nb::ndarray<nb::numpy, std::uint16_t> decode_rvl(nb::handle stream, std::size_t 
 }  // namespace
 
 NB_MODULE(_depth, m) {
-    m.doc() = "RVL depth coding; see bridge/media/rvl.py for the stream and its NumPy twin.";
+    m.doc() = "RVL depth coding; bridge/media/depth.py describes the stream.";
     m.def("encode_rvl", &encode_rvl, "pixels"_a,
           "Encode contiguous little-endian 16-bit pixels, given as bytes.");
     m.def("decode_rvl", &decode_rvl, "stream"_a, "num_pixels"_a,

@@ -1,5 +1,5 @@
 // RVL depth coding, after Wilson, "Fast lossless depth image compression" (2017), in the layout
-// of ROS. bridge/media/rvl.py is the same in NumPy and describes the stream.
+// of ROS. bridge/media/depth.py describes the stream.
 #pragma once
 
 #include <cstddef>

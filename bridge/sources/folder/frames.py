@@ -83,9 +83,6 @@ def checked_rotation(
 
     Args:
         R: The matrix as read; each singular value within ``ROTATION_TOLERANCE`` of 1.
-
-    Raises:
-        FolderError: When the matrix is not close to any rotation.
     """
     singular = np.linalg.svd(R, compute_uv=False)
     if np.any(np.abs(singular - 1) > ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
@@ -110,11 +107,7 @@ class StoredColor:
 
 
 def read_color(path: Path) -> StoredColor:
-    """Read a colour image.
-
-    Raises:
-        FolderError: When it is none.
-    """
+    """Read a colour image."""
     try:
         stored = path.read_bytes()
         return StoredColor(stored=stored, image_u8=decode_color(stored))
@@ -127,11 +120,7 @@ def read_color(path: Path) -> StoredColor:
 
 
 def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
-    """Refuse an image of another size than its camera's.
-
-    Raises:
-        FolderError: When the sizes differ.
-    """
+    """Refuse an image of another size than its camera's."""
     if shape != (camera.height, camera.width):
         raise FolderError(
             path=path,
@@ -141,11 +130,7 @@ def check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:
 
 
 def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
-    """Read the numbers of a 16-bit depth image.
-
-    Raises:
-        FolderError: When it is no such image.
-    """
+    """Read the numbers of a 16-bit depth image."""
     try:
         return decode_depth_png(path.read_bytes())
     except (UnreadableImageError, OSError) as error:
@@ -161,9 +146,6 @@ def require_image(path: Path, *, what: str, named_by: str) -> Path:
 
     Args:
         named_by: Who says that it exists, for the error: ``rgb.txt line 3 names it``.
-
-    Raises:
-        PathNotFoundError: Saying who names the file.
     """
     if not path.is_file():
         raise PathNotFoundError(
@@ -187,9 +169,6 @@ def camera_of(
     Args:
         intrinsics: As given by the user, or None.
         nominal: Documented values, valid for 640 x 480 images only.
-
-    Raises:
-        FolderError: When nothing is known for images of this size.
     """
     if intrinsics is None and size != VGA:
         raise FolderError(

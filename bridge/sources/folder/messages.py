@@ -44,12 +44,7 @@ DEFAULTS = FolderConfig()
 
 
 def read_index(folder: Path, config: FolderConfig = DEFAULTS) -> FolderIndex:
-    """Find out a folder's layout and read it; every image it names must exist.
-
-    Raises:
-        PathNotFoundError: When the folder or an image is not there.
-        FolderError: When the layout is unknown, or something in it makes no sense.
-    """
+    """Find out a folder's layout and read it; every image it names must exist."""
     if not folder.is_dir():
         raise PathNotFoundError(
             path=folder, what="RGB-D folder", hint="Give a folder of one of the known layouts."
@@ -160,7 +155,6 @@ def folder_messages(
         start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
 
     Raises:
-        FolderError: When an image cannot be read or has another size than its camera.
         UsageError: When a rate is asked of a folder that has real times.
     """
     times = frame_times_ns(index, config, start_ns)

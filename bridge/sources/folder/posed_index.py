@@ -3,7 +3,7 @@
 COLMAP's ``cameras.txt`` and ``images.txt`` (https://colmap.github.io/format.html) hold poses from
 world to camera and pixel centres at +0.5, as ours; ``points3D.txt`` is read for distances only.
 ``transforms.json`` of NeRF programs holds poses from camera to world with OpenGL's axes (+Y up, +Z
-backwards). Lenses of OpenCV's four coefficients are undistorted, others are refused.
+backwards). Lenses that bend straight lines are refused.
 """
 
 import json
@@ -30,34 +30,15 @@ IMAGE_FOLDERS = ("images", ".")
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
 """COLMAP's models that are read, with the names of their numbers."""
-LENS_KEYS = ("k1", "k2", "p1", "p2")
-REFUSED_KEYS = ("k3", "k4", "k5", "k6")
+BENDING_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
 MOST_PX = 65_500
 """Of a JPEG's side."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
 """Sparse points nearer or farther than these percentiles are taken for outliers."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lens:
-    """A camera as its maker's lens bends it; OpenCV's model of two radial, two tangential terms."""
-
-    camera: Camera
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-
-    @property
-    def is_straight(self) -> bool:
-        """Whether nothing is to be undistorted."""
-        return self.k1 == self.k2 == self.p1 == self.p2 == 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +59,7 @@ class PosedIndex:
     layout: str
     """COLMAP or transforms.json."""
     name: str
-    lenses: dict[str, Lens]
+    cameras: dict[str, Camera]
     images: tuple[PosedImage, ...]
     """In the order of their names."""
     sparse_range: tuple[float, float] | None
@@ -90,9 +71,6 @@ class PosedIndex:
 
         The geometric mean of the range of COLMAP's points, else the median distance to the point
         that all optical axes pass nearest.
-
-        Raises:
-            FolderError: When there are no points and the axes do not meet before the cameras.
         """
         if self.sparse_range is not None:
             return math.sqrt(self.sparse_range[0] * self.sparse_range[1])
@@ -111,10 +89,6 @@ def read_posed_index(folder: Path) -> PosedIndex:
 
     Args:
         folder: Holds ``transforms.json``, or COLMAP's text model in itself or in ``sparse/0``.
-
-    Raises:
-        PathNotFoundError: When neither is there, or an image is not.
-        FolderError: When a number makes no sense, or a lens is of an unknown kind.
     """
     if (folder / TRANSFORMS).is_file():
         return _read_transforms(folder)
@@ -131,17 +105,17 @@ def read_posed_index(folder: Path) -> PosedIndex:
 
 
 def _read_colmap(folder: Path, model: Path) -> PosedIndex:
-    lenses = _colmap_lenses(model / "cameras.txt")
+    cameras = _colmap_cameras(model / "cameras.txt")
     path = model / "images.txt"
     images, range_found = [], _sparse_depths(model / "points3D.txt")
     for number, line in enumerate(_pose_lines(path), start=1):
-        image = _colmap_image(path, number, line, folder, lenses)
+        image = _colmap_image(path, number, line, folder, cameras)
         images.append(image)
     if not images:
         raise FolderError(path=path, found="no image", hint="Reconstruct again.")
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
     return PosedIndex(
-        path=path, layout="COLMAP", name=folder.resolve().name, lenses=lenses, images=ordered,
+        path=path, layout="COLMAP", name=folder.resolve().name, cameras=cameras, images=ordered,
         sparse_range=_range_along(ordered, range_found),
     )  # fmt: skip
 
@@ -152,8 +126,8 @@ def _pose_lines(path: Path) -> list[str]:
     return [line for line in lines[::2] if line.strip()]
 
 
-def _colmap_lenses(path: Path) -> dict[str, Lens]:
-    lenses = {}
+def _colmap_cameras(path: Path) -> dict[str, Camera]:
+    cameras = {}
     for line in path.read_text(errors="replace").splitlines():
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -164,19 +138,19 @@ def _colmap_lenses(path: Path) -> dict[str, Lens]:
             raise FolderError(
                 path=path,
                 found=f"camera {words[0]} has the model {model or 'nothing'!r}",
-                hint=f"Read are {', '.join(PARAMETERS)}; colmap image_undistorter writes PINHOLE.",
+                hint=f"Read are {', '.join(PARAMETERS)}. {STRAIGHTEN}",
             )
         width, height, *numbers = _numbers(path, words[2:], f"camera {words[0]}")
         if len(numbers) != len(names):
             found = f"camera {words[0]}: {len(numbers)} numbers, {model} has {len(names)}"
             raise FolderError(path=path, found=found, hint="Restore the file.")
         of = dict(zip(names, numbers, strict=True))
-        lenses[words[0]] = _lens(path, int(width), int(height), of)
-    return lenses
+        cameras[words[0]] = _camera(path, int(width), int(height), of)
+    return cameras
 
 
 def _colmap_image(
-    path: Path, number: int, line: str, folder: Path, lenses: dict[str, Lens]
+    path: Path, number: int, line: str, folder: Path, cameras: dict[str, Camera]
 ) -> PosedImage:
     words = line.split(maxsplit=9)
     if len(words) < 10:
@@ -187,11 +161,11 @@ def _colmap_image(
     q = np.array([w, x, y, z])
     if not 0.5 < np.linalg.norm(q) < 2:
         raise FolderError(path=path, found=f"image {number}: no quaternion", hint="Restore it.")
-    if words[8] not in lenses:
+    if words[8] not in cameras:
         raise FolderError(
             path=path,
             found=f"image {words[9]} is of camera {words[8]}, which cameras.txt lacks",
-            hint=f"There are {', '.join(lenses) or 'none'}.",
+            hint=f"There are {', '.join(cameras) or 'none'}.",
         )
     T_camera_world = se3.transform_from(q / np.linalg.norm(q), np.array(p))
     return PosedImage(
@@ -202,11 +176,7 @@ def _colmap_image(
 
 
 def _image_below(folder: Path, candidates: Sequence[str], index: Path) -> Path:
-    """The first of some files that is there; nothing outside the folder is read.
-
-    Raises:
-        PathNotFoundError: When none is.
-    """
+    """The first of some files that is there; nothing outside the folder is read."""
     root = folder.resolve()
     for name in candidates:
         try:
@@ -259,17 +229,17 @@ def _read_transforms(folder: Path) -> PosedIndex:
         raise FolderError(
             path=path, found=f"no list of frames ({error})", hint="Restore the file."
         ) from error
-    lenses: dict[str, Lens] = {}
-    names: dict[Lens, str] = {}
+    cameras: dict[str, Camera] = {}
+    names: dict[Camera, str] = {}
     images, assumed = [], {}
     for number, frame in enumerate(frames, start=1):
         if not isinstance(frame, dict):
             raise FolderError(path=path, found=f"frame {number} is no object", hint="Restore it.")
-        lens, centred = _frame_lens(path, number, {**record, **frame})
+        camera, centred = _frame_camera(path, number, {**record, **frame})
         if centred:
             assumed["principal point"] = "the centre of the image"
-        name = names.setdefault(lens, str(len(names) + 1))
-        lenses[name] = lens
+        name = names.setdefault(camera, str(len(names) + 1))
+        cameras[name] = camera
         images.append(
             PosedImage(
                 path=_frame_path(folder, path, frame),
@@ -281,19 +251,19 @@ def _read_transforms(folder: Path) -> PosedIndex:
         raise FolderError(path=path, found="no frame", hint="Restore the file.")
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
     return PosedIndex(
-        path=path, layout=TRANSFORMS, name=folder.resolve().name, lenses=lenses, images=ordered,
+        path=path, layout=TRANSFORMS, name=folder.resolve().name, cameras=cameras, images=ordered,
         sparse_range=None, assumed=assumed,
     )  # fmt: skip
 
 
-def _frame_lens(path: Path, number: int, record: dict[str, Any]) -> tuple[Lens, bool]:
-    """The lens of one frame, and whether its principal point had to be assumed."""
+def _frame_camera(path: Path, number: int, record: dict[str, Any]) -> tuple[Camera, bool]:
+    """The camera of one frame, and whether its principal point had to be assumed."""
     what = f"frame {number}"
     model = str(record.get("camera_model", "OPENCV"))
-    if model not in PARAMETERS or any(record.get(key) for key in REFUSED_KEYS):
-        found = f"{what} has the model {model!r}" if model not in PARAMETERS else f"{what} has k3"
-        hint = "Read are lenses with k1, k2, p1 and p2. Undistort the images."
-        raise FolderError(path=path, found=found, hint=hint)
+    bent = [key for key in BENDING_KEYS if record.get(key)]
+    if bent or model not in (*PARAMETERS, "OPENCV"):
+        found = f"{what} has {bent[0]}" if bent else f"{what} has the model {model!r}"
+        raise FolderError(path=path, found=found, hint=STRAIGHTEN)
     missing = [key for key in ("w", "h") if key not in record]
     if missing or not ("fl_x" in record or "camera_angle_x" in record):
         found = f"{what}: {', '.join(missing) or 'fl_x'} is missing"
@@ -310,8 +280,7 @@ def _frame_lens(path: Path, number: int, record: dict[str, Any]) -> tuple[Lens, 
     fx = number_of("fl_x", 0.5 * width / math.tan(0.5 * angle_rad))
     of = {"fx": fx, "fy": number_of("fl_y", fx)}
     of |= {"cx": number_of("cx", width / 2), "cy": number_of("cy", height / 2)}
-    of |= {key: number_of(key, 0.0) for key in LENS_KEYS}
-    return _lens(path, int(width), int(height), of), "cx" not in record or "cy" not in record
+    return _camera(path, int(width), int(height), of), "cx" not in record or "cy" not in record
 
 
 def _frame_path(folder: Path, index: Path, frame: dict[str, Any]) -> Path:
@@ -336,7 +305,7 @@ def _frame_pose(path: Path, number: int, frame: dict[str, Any]) -> Float[np.ndar
     return np.asarray(T @ OPENCV_FROM_OPENGL)
 
 
-def _lens(path: Path, width: int, height: int, of: dict[str, float]) -> Lens:
+def _camera(path: Path, width: int, height: int, of: dict[str, float]) -> Camera:
     fx = of.get("fx", of.get("f", 0.0))
     fy = of.get("fy", fx)
     if min(fx, fy, width, height) <= 0:
@@ -345,8 +314,7 @@ def _lens(path: Path, width: int, height: int, of: dict[str, float]) -> Lens:
     if max(width, height) > MOST_PX:
         found = f"a camera of {width} x {height} pixels"
         raise FolderError(path=path, found=found, hint=f"At most {MOST_PX} a side are read.")
-    camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=of["cx"], cy=of["cy"])
-    return Lens(camera=camera, **{key: of.get(key, 0.0) for key in LENS_KEYS})
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=of["cx"], cy=of["cy"])
 
 
 def _numbers(path: Path, words: list[Any], what: str) -> list[float]:

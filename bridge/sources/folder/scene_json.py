@@ -34,11 +34,6 @@ def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
 
     Args:
         folder: Holds ``scene.json``; the paths in it start here.
-        config: Must not give what the file says itself: intrinsics and the unit of depth.
-
-    Raises:
-        PathNotFoundError: When an image is not there.
-        FolderError: When a key is missing or makes no sense.
     """
     path = folder / INDEX_NAME
     refuse_scale_without_use(config, path)

@@ -51,10 +51,6 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
 
     Args:
         config: Its intrinsics and unit of depth go before those of the folder and the data set.
-
-    Raises:
-        PathNotFoundError: When a frame lacks its depth image.
-        FolderError: When a pose or an image makes no sense.
     """
     frames, num_unposed = [], 0
     for color_path in find_frames(folder):

@@ -49,11 +49,7 @@ class StampedFile:
 
 
 def read_files(path: Path) -> list[StampedFile]:
-    """Read "stamp file" lines in time order.
-
-    Raises:
-        FolderError: Naming the first line that is none.
-    """
+    """Read "stamp file" lines in time order."""
     files = [
         StampedFile(stamp_ns=_stamp_ns(path, line, cells[0]), name=cells[1], line=line)
         for line, cells in _rows(path, (2,))
@@ -64,11 +60,7 @@ def read_files(path: Path) -> list[StampedFile]:
 
 
 def read_associations(path: Path) -> list[tuple[StampedFile, StampedFile]]:
-    """Read "stamp file stamp file" lines; the column whose folder is called depth is depth.
-
-    Raises:
-        FolderError: Naming the first line that is none.
-    """
+    """Read "stamp file stamp file" lines; the column whose folder is called depth is depth."""
     pairs = []
     for line, cells in _rows(path, (4,)):
         first, second = (
@@ -112,11 +104,7 @@ def associate(
 
 
 def read_poses(path: Path) -> PoseTrajectory:
-    """Read "stamp tx ty tz qx qy qz qw" lines; rows with nan are left out, as are repeated stamps.
-
-    Raises:
-        FolderError: Naming the first line that is no pose.
-    """
+    """Read "stamp tx ty tz qx qy qz qw" lines, without rows of nan and repeated stamps."""
     poses: dict[int, tuple[list[float], list[float]]] = {}
     for line, cells in _rows(path, (8,)):
         stamp_ns = _stamp_ns(path, line, cells[0])
@@ -219,10 +207,6 @@ def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
 
     Args:
         config: Its intrinsics and unit of depth go before those of the folder and the benchmark.
-
-    Raises:
-        PathNotFoundError: When a listed image is not there.
-        FolderError: Naming the line that makes no sense.
     """
     pairs, num_unpaired, path = _pairs(folder)
     pose_path = folder / POSE_LIST

@@ -17,20 +17,14 @@ class PlaybackConfig:
 
     rate: float = 1.0
     """Times as fast as it was recorded."""
-    loop: bool = False
-    """Begin again at the end, until stopped."""
     start_s: float = 0.0
     """Begin so many seconds into the episode; what was latched before is sent first."""
     topics: tuple[str, ...] = ()
     """Only these topics; * stands for one part of a name, ** for any number of them."""
     remap: tuple[str, ...] = ()
     """OLD:=NEW sends a topic, or all below a name (/lab:=/lab2), under another one."""
-    paused: bool = False
-    """Wait for the space bar, or for ctl resume, before the first message."""
     shared_memory_mb: int = 0
     """Send images to a recorder on this machine through so much shared memory [MB]."""
-    name: str = "playback"
-    """Of this playback, for robot-gst ctl pause and resume with --recorder NAME."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense, and names that are not of the form OLD:=NEW."""

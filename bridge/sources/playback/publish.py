@@ -5,7 +5,6 @@ numbers are counted anew: a gap in the new recording was lost on this way, not o
 """
 
 import contextlib
-import json
 import queue
 import sys
 import threading
@@ -32,7 +31,7 @@ from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
 SLICE_S = 0.05
-"""A playback that waits looks this often whether it was paused."""
+"""Who reads ahead looks this often whether the playback has ended."""
 SWITCH_S = 0.0005
 """The thread that reads gives way to the one that sends after this long, not after 5 ms."""
 LATEST_NS = 2**63 - 1
@@ -43,20 +42,14 @@ class Due(NamedTuple):
     """A message and its place in the time of the playback."""
 
     at_ns: int
-    """Log time, counted on through every repetition."""
+    """Log time."""
     item: Stored
 
 
 class Pace:
-    """Says when a message is due; stands still while paused."""
+    """Says when a message is due."""
 
-    def __init__(
-        self,
-        rate: float,
-        *,
-        paused: bool = False,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, rate: float, *, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Begin with the first message.
 
         Args:
@@ -64,38 +57,7 @@ class Pace:
         """
         self._rate = rate
         self._monotonic = monotonic
-        self._lock = threading.Lock()
-        self._running = threading.Event()
-        self._first_ns: int | None = None
-        self._began_s = 0.0
-        self._paused_s = 0.0
-        """When the pause began that lasts."""
-        if not paused:
-            self._running.set()
-
-    @property
-    def is_paused(self) -> bool:
-        """Whether it stands still."""
-        return not self._running.is_set()
-
-    def pause(self) -> None:
-        """Stand still."""
-        with self._lock:
-            if self._running.is_set():
-                self._paused_s = self._monotonic()
-                self._running.clear()
-
-    def resume(self) -> None:
-        """Go on where it stood still."""
-        with self._lock:
-            if not self._running.is_set():
-                self._began_s += self._monotonic() - self._paused_s
-                self._running.set()
-
-    def toggle(self) -> str:
-        """Pause or go on, and say which."""
-        (self.resume if self.is_paused else self.pause)()
-        return "paused" if self.is_paused else "playing"
+        self._first: tuple[int, float] | None = None
 
     def wait(self, at_ns: int, stop: threading.Event) -> float | None:
         """Wait until a message is due.
@@ -103,18 +65,13 @@ class Pace:
         Returns:
             How late it is [s], or None when the playback was stopped.
         """
+        first_ns, began_s = self._first = self._first or (at_ns, self._monotonic())
+        due_s = began_s + (at_ns - first_ns) / (NS_PER_S * self._rate)
         while not stop.is_set():
-            if not self._running.is_set():
-                self._running.wait(SLICE_S)
-                continue
-            if self._first_ns is None:
-                self._first_ns, self._began_s = at_ns, self._monotonic()
-            with self._lock:
-                due_s = self._began_s + (at_ns - self._first_ns) / (NS_PER_S * self._rate)
             left_s = due_s - self._monotonic()
             if left_s <= 0:
                 return -left_s
-            stop.wait(min(left_s, SLICE_S))
+            stop.wait(left_s)
         return None
 
 
@@ -180,14 +137,12 @@ class EpisodeSource:
         """Open an episode and choose what is sent.
 
         Raises:
-            PathNotFoundError: When the file is not there.
-            EpisodeError: When it is no MCAP file, or was never finished.
             UsageError: When nothing is chosen, or a name cannot travel on zenoh.
         """
         self.episode = Episode.open(path)
         self.config = config
         self._defined: set[str] = set()
-        self.pace = Pace(config.rate, paused=config.paused)
+        self.pace = Pace(config.rate)
         counts = {topic: each.count for topic, each in self.episode.topics().items()}
         there = [topic for topic in counts if topic not in OF_RECORDER]
         self.names = rename_topics(config.remap, choose_topics(config.topics, there))
@@ -215,24 +170,11 @@ class EpisodeSource:
         return tuple(self.names.values())
 
     def messages(self) -> Iterator[Due]:
-        """Yield what is sent, again and again with ``loop``; the recorder's drop log stays out."""
-        wanted = frozenset(self.names)
-        before = list(self._latched_before())
-        step_ns = self._pass_ns()
-        shift_ns = 0
-        while True:
-            for item in before:
-                yield Due(shift_ns + self.start_ns, item)
-            for item in merged(self.episode.files, Selection(wanted, self.start_ns)):
-                yield Due(shift_ns + item.log_time_ns, item)
-            if not self.config.loop:
-                return
-            shift_ns += step_ns
-
-    def _pass_ns(self) -> int:
-        """From one pass to the next: the last message is followed as soon as an average one is."""
-        length_ns = self.episode.end_ns - self.start_ns
-        return length_ns + (length_ns // self.num_messages or NS_PER_S)
+        """Yield what is sent; the recorder's drop log stays out."""
+        for item in self._latched_before():
+            yield Due(self.start_ns, item)
+        for item in merged(self.episode.files, Selection(frozenset(self.names), self.start_ns)):
+            yield Due(item.log_time_ns, item)
 
     def _latched_before(self) -> Iterator[Stored]:
         """What was latched when the playback begins: the last of each topic, and all frames."""
@@ -250,13 +192,9 @@ class EpisodeSource:
 
         Returns:
             Messages sent in all and by topic, and how late they were [ms].
-
-        Raises:
-            EpisodeError: When the file turns out to be damaged; what lies before was sent.
         """
         for path in self.episode.missing_parts:
             output.say(f"{path.name} is missing; what it held is not played")
-        self._serve_control(session)
         for cell in sorted({name.split("/")[1] for name in self.topics if name.count("/") > 1}):
             session.declare_alive(f"{cell}/alive")
         publishers = self._publishers(session)
@@ -286,21 +224,6 @@ class EpisodeSource:
             "topics": sent,
             "late_ms": _lateness_ms(late_s),
         }
-
-    def _serve_control(self, session: WireSession) -> None:
-        """Answer ``robot-gst ctl pause`` and ``resume``."""
-
-        def answer(act: Callable[[], None]) -> Callable[[bytes], bytes]:
-            def handler(payload: bytes) -> bytes:
-                act()
-                state = "paused" if self.pace.is_paused else "playing"
-                return json.dumps({"ok": True, "episode": self.name, "state": state}).encode()
-
-            return handler
-
-        # Resume first: whoever was answered on pause can already reach resume.
-        for verb, act in (("resume", self.pace.resume), ("pause", self.pace.pause)):
-            session.serve(f"rec/{self.config.name}/ctl/{verb}", answer(act))
 
     def _publishers(self, session: WireSession) -> dict[tuple[int, int], WirePublisher]:
         """A publisher for each topic with one definition, by file and channel."""

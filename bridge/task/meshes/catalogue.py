@@ -41,9 +41,6 @@ def toy_mesh(name: str, size_m: tuple[float, float, float]) -> ToyMesh:
     Args:
         name: One of ``toys.DESIGNS``.
         size_m: Outer extents [m].
-
-    Raises:
-        UsageError: Listing the names that exist.
     """
     design = DESIGNS.get(name)
     if design is None:
@@ -76,11 +73,7 @@ def basket_mesh(inner_m: tuple[float, float, float], wall_m: float) -> ToyMesh:
 
 
 def object_mesh(model: ObjectModel) -> ToyMesh:
-    """Make the mesh of an object of a task whose shape is ``mesh``.
-
-    Raises:
-        UsageError: The object has another shape.
-    """
+    """Make the mesh of an object of a task whose shape is ``mesh``."""
     if model.mesh is None:
         message = f"{model.id} is a {model.shape}, not a mesh: its panels() are its shape."
         raise UsageError(message)

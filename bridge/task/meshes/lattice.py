@@ -54,11 +54,7 @@ def fill(
     """Fill a solid that a box just holds, as ``make_lattice``.
 
     Args:
-        solid: Its signed distance.
         low: Lower corner of the box [m].
-
-    Raises:
-        UsageError: No cell lies inside.
     """
     counts = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
     step = (high - low) / counts

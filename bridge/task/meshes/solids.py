@@ -215,9 +215,6 @@ def mesh_of(
 
     Args:
         low_m: Lower corner of the grid; at least two cells outside the solid.
-
-    Raises:
-        OpenSurfaceError: The solid reaches the border of the grid, or is finer than its cells.
     """
     for shift in SHIFTS:
         low = np.array(low_m) - shift * spacing_m

@@ -2,7 +2,6 @@
 
 import fcntl
 import functools
-import itertools
 import json
 import os
 import random
@@ -50,33 +49,24 @@ def whole(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
             return write_official(path, MESSAGES, compression=CompressionType[name.upper()])
 
 
-@pytest.mark.parametrize("in_place", [False, True])
-def test_a_file_cut_anywhere_gives_back_every_whole_record(whole: Path, in_place: bool) -> None:
+def test_a_file_cut_anywhere_gives_back_every_whole_record(whole: Path) -> None:
     size = whole.stat().st_size
     rng = random.Random(1)
     for at in sorted(rng.sample(range(60, size), 25)):
         part = cut(whole, at)
         expected = linear(part)
-        report = recover(part, in_place=in_place)
+        report = recover(part)
         assert report.output == whole.with_name("cut.mcap")
         assert not part.exists()
-        found = read_all(report.output) if not _is_unchunked(whole, in_place) else expected
+        found = read_all(report.output)
         assert set(expected) <= set(found) <= set(MESSAGES), at
         assert report.messages == len(found)
         report.output.unlink()
 
 
-def _is_unchunked(whole: Path, in_place: bool) -> bool:
-    with whole.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    return in_place and not summary.chunk_indexes
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("in_place", [False, True])
 def test_a_file_cut_at_every_single_byte_is_recovered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_place: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for call in ("fsync", "fdatasync"):  # no power is cut here, and the disk is slow
         monkeypatch.setattr(os, call, lambda _: None)
@@ -93,7 +83,7 @@ def test_a_file_cut_at_every_single_byte_is_recovered(
     for at in range(whole.stat().st_size + 1):
         part = cut(whole, at)
         expected = linear(part)
-        report = recover(part, in_place=in_place)
+        report = recover(part)
         if report.output is None:
             assert not expected
             assert part.read_bytes() == whole.read_bytes()[:at]
@@ -188,9 +178,6 @@ def test_another_writers_broken_file_stays_as_it_is(tmp_path: Path) -> None:
     report = recover(broken)
     assert report.output == tmp_path / "b_recovered.mcap"
     assert broken.read_bytes() == before
-    report = recover(broken, in_place=True)
-    assert report.output == broken
-    assert len(read_all(broken)) == report.messages
 
 
 def test_a_file_being_written_is_left_alone(tmp_path: Path) -> None:
@@ -242,20 +229,20 @@ KILL_POINTS = ("pwritev", "fdatasync", "fsync", "rename")
 def test_a_recovery_that_was_killed_is_done_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At every system call that changes a name or the file, for copies and in place."""
+    """At every system call that changes a name or the file."""
     whole = write_ours(tmp_path / "w.mcap", MESSAGES)
     at = whole.stat().st_size * 2 // 3
     expected = set(linear(cut(whole, at)))
-    for in_place, call in itertools.product((False, True), KILL_POINTS):
+    for call in KILL_POINTS:
         for nth in range(1, 12):
             part = cut(whole, at)
-            again = functools.partial(recover, part, in_place=in_place)
+            again = functools.partial(recover, part)
             with monkeypatch.context() as patch:
                 killed = _kill_at(patch, call, nth, again)
             if part.exists():
                 recover(part)
             final = part.with_name("cut.mcap")
-            assert expected <= set(read_all(final)), (in_place, call, nth)
+            assert expected <= set(read_all(final)), (call, nth)
             final.unlink()
             if not killed:
                 break
@@ -295,9 +282,10 @@ def test_no_file_and_no_room_are_said_in_a_sentence(
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage())
     with pytest.raises(RecoveryError, match="Free some space"):
         recover(cut(whole, 4000, "b.mcap"))
-    report = recover(cut(whole, 4000))  # a part is then finished in place
-    assert report.output is not None
-    assert read_all(report.output)
+    part = cut(whole, 4000)
+    with pytest.raises(RecoveryError, match="Free some space"):
+        recover(part)
+    assert part.is_file()
 
 
 class _Usage:

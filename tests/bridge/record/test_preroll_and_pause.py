@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bridge.clock import AnchoredClock, StepWatch
 from bridge.episode import schema
 from bridge.episode.check import check_episode
-from bridge.episode.metadata import EpisodeInfo, Outcome
+from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
@@ -196,48 +195,6 @@ def test_what_others_say_is_kept_in_the_episode(
     recorder.stop()
     record = episode_of(run).metadata_records["recorder"]
     assert record["ros2_warnings"] == recorder.status()["ros2_warnings"]
-
-
-def test_a_split_episode_reads_as_one_with_every_message_once(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(disk=DiskConfig(split_mb=1))
-    recorder.receive(make_sample(topic="/robot_description", type_name=schema.STRING, data=b"urdf"))
-    recorder.start(info())
-    rng = np.random.default_rng(0)
-    sent = []
-    for number in range(48):
-        sent.append(make_sample(data=rng.bytes(99_000), type_name="x"))
-        recorder.receive(sent[-1])
-        if number % 12 == 11:
-            wait_until(lambda number=number: recorder.status()["parts"] == 2 + number // 12)
-    answer = recorder.stop(outcome=Outcome(result="success"))
-    assert (answer["messages"], answer["lost"]) == (48, 0)
-    names = sorted(path.name for path in run.episodes_dir.iterdir())
-    assert names == ["t1.2.mcap", "t1.3.mcap", "t1.4.mcap", "t1.5.mcap", "t1.mcap"]
-    assert answer["parts"] == 5
-    episode = episode_of(run)
-    assert data_of(episode) == [sample.data for sample in sent]
-    assert episode.outcome is not None
-    assert episode.metadata_records["drops"]["received"] == 48
-    for number, path in enumerate(run.parts(run.episodes_dir / "t1.mcap"), start=1):
-        alone = run.path / f"alone{number}.mcap"
-        alone.write_bytes(path.read_bytes())
-        part = Episode.open(alone)  # each stands for itself
-        assert part.info == info()
-        assert part.metadata_records["split"] == {"index": number, "last": number == 5}
-        assert data_of(part, "/robot_description") == [b"urdf"]
-
-
-def test_a_split_by_time_discards_all_its_parts(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(disk=DiskConfig(split_s=0.05))
-    recorder.start(info())
-    recorder.receive(make_sample())
-    wait_until(lambda: recorder.status()["parts"] >= 3)
-    recorder.stop(discard=True)
-    assert list(run.episodes_dir.iterdir()) == []
 
 
 def test_a_start_beside_later_parts_is_refused(make_recorder: MakeRecorder, run: RunFolder) -> None:

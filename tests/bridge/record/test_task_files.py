@@ -13,7 +13,6 @@ from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.record.config import DiskConfig, RecorderConfig
 from bridge.record.control import parse_task_file
 from bridge.record.errors import ControlError
 from bridge.record.recorder import Recorder
@@ -77,22 +76,6 @@ def test_a_recorder_with_a_task_file_gives_it_to_episodes_that_name_no_other(
     assert (found["t3"].task, found["t3"].task_sha256) == ("nobody knows it", "")
     with pytest.raises(MissingTaskError, match=r"t3\.mcap: carries no task\.toml"):
         streams.task_file(Episode.open(run.episodes_dir / "t3.mcap"))
-
-
-def test_every_part_of_a_split_episode_carries_the_file(
-    run: RunFolder, make_sample: MakeSample
-) -> None:
-    config = RecorderConfig(disk=DiskConfig(split_s=0.01))
-    recorder = Recorder(run, now_ns=AnchoredClock().now_ns, config=config)
-    recorder.start(SCAN, MINE)
-    part = run.episodes_dir / "scan.2.mcap.part"
-    while not list(run.episodes_dir.glob(f"{part.name}*")) and recorder.error is None:
-        recorder.receive(make_sample())
-    recorder.stop()
-    recorder.close()
-    (run.episodes_dir / "scan.mcap").unlink()
-    second = Episode.open(run.episodes_dir / "scan.2.mcap")
-    assert streams.task_file(second).data == MINE.data
 
 
 def test_a_recovered_episode_still_has_its_task(run: RunFolder) -> None:

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ from bridge.sources.playback.publish import EpisodeSource, Pace
 from bridge.sources.source import Source, run_source
 from bridge.terminal import Output
 from bridge.wire.config import WireConfig
-from bridge.wire.errors import WireError
 from bridge.wire.session import WireSample, WireSession, open_session
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -238,41 +236,6 @@ def test_a_late_start_sends_first_what_is_latched(path: Path, heard: Heard) -> N
     assert played == [item[-1] for item in expected]
 
 
-def test_a_loop_goes_on_until_it_is_stopped_and_counts_on(path: Path, heard: Heard) -> None:
-    config = PlaybackConfig(rate=100.0, loop=True, topics=("/lab/joint_states",))
-    source, stop = EpisodeSource(path, config), threading.Event()
-    played: list[dict[str, Any]] = []
-    player = threading.Thread(target=lambda: played.append(play(source, heard, stop)))
-    player.start()
-    heard.wait_for(3 * 60)
-    stop.set()
-    player.join(WAIT_S)
-    samples = heard.wait_for(played[0]["messages"])
-    assert [sample.sequence for sample in samples] == list(range(len(samples)))
-    first = [item[3:] for item in stored(path) if item[0] == "/lab/joint_states"]
-    assert [(s.source_ns, s.data) for s in samples[:180]] == 3 * first
-
-
-def test_a_paused_playback_begins_when_it_is_told_to(path: Path, heard: Heard) -> None:
-    # Slow, 2.4 s: its session ends with the last message, and the answer has to leave before.
-    config = PlaybackConfig(rate=0.05, topics=("/lab/joint_states",), paused=True, name="p1")
-    source = EpisodeSource(path, config)
-    player = threading.Thread(target=lambda: play(source, heard))
-    player.start()
-    answer, end_s = None, time.monotonic() + WAIT_S
-    while answer is None and time.monotonic() < end_s:
-        try:
-            answer = heard.session.query("rec/p1/ctl/pause", b"{}", timeout_s=1.0)
-        except WireError:
-            assert heard.samples == []
-    assert json.loads(answer or b"")["state"] == "paused"
-    assert heard.samples == []
-    answer = heard.session.query("rec/p1/ctl/resume", b"{}", timeout_s=5.0)
-    assert json.loads(answer) == {"ok": True, "episode": "first", "state": "playing"}
-    assert len(heard.wait_for(60)) == 60
-    player.join(WAIT_S)
-
-
 class Clock(threading.Event):
     """Time that only waiting takes."""
 
@@ -300,20 +263,6 @@ def test_messages_are_as_far_apart_as_they_came_by_the_rate(
         sent_s.append(clock.now_s)
     expected_s = (times_ns - times_ns[0]) * 1e-9 / rate
     np.testing.assert_allclose(np.array(sent_s) - sent_s[0], expected_s, atol=1e-6)
-
-
-def test_a_pause_shifts_what_follows_and_nothing_else() -> None:
-    clock = Clock()
-    pace = Pace(1.0, monotonic=lambda: clock.now_s)
-    pace.wait(0, clock)
-    began_s = clock.now_s
-    pace.pause()
-    pace.pause()
-    clock.now_s += 7.0
-    pace.resume()
-    pace.resume()
-    pace.wait(1_000_000_000, clock)
-    assert clock.now_s - began_s == pytest.approx(8.0)
 
 
 def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:

@@ -53,10 +53,10 @@ def test_a_record_reads_back_as_it_was_written() -> None:
     ("change", "match"),
     [
         ({"schema_version": 2}, "schema version 2"),
-        ({"joints": None}, "TypeError"),
+        ({"joints": None}, "joints"),
         ({"gain_hz": 0}, "above zero"),
         ({"limit_rad_s": float("nan")}, "above zero"),
-        ({"base_m": [0, 0]}, "ValueError"),
+        ({"base_m": [0, 0]}, "base_m"),
         ({"targets": [{"t_s": 0, "joints_rad": {"wrist": 1}}]}, "wrist is none of a, b"),
         ({"boxes": {"cube": {"size_m": [1, 1, 0], "mass_kg": 1}}}, "not above zero"),
     ],

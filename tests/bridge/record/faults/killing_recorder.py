@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import robot_gst
-from bridge.record.episode_files import EpisodeFiles
+from bridge.episode.writer import EpisodeWriter
 
 
 def main() -> None:
@@ -33,14 +33,14 @@ def main() -> None:
         return result
 
     setattr(owner, call, counted)
-    close: Callable[[EpisodeFiles], Path] = EpisodeFiles.close
+    close: Callable[[EpisodeWriter], Path] = EpisodeWriter.close
 
-    def close_armed(parts: EpisodeFiles) -> Path:
+    def close_armed(writer: EpisodeWriter) -> Path:
         nonlocal armed
         armed = True
-        return close(parts)
+        return close(writer)
 
-    EpisodeFiles.close = close_armed  # type: ignore[method-assign]
+    EpisodeWriter.close = close_armed  # type: ignore[method-assign]
     sys.exit(robot_gst.main())
 
 
