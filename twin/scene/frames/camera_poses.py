@@ -248,12 +248,7 @@ def find_poses(
 
 
 def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> None:
-    """See that colour and depth are posed in one frame.
-
-    Raises:
-        FrameNotFoundError: When the tree does not know the colour frame.
-        UnusableCameraError: When nothing says how the depth frame lies to it.
-    """
+    """See that colour and depth are posed in one frame."""
     color, depth = _frame_ids(episode, camera_id)
     root = tree.root_of(color)
     if depth not in tree.frames() or tree.root_of(depth) != root:
@@ -275,10 +270,6 @@ def calibrated_poses(
 
     Args:
         episode: Gives joints for a camera in the hand, and how colour and depth lie to each other.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     return CameraPoses(
         tree=calibrated_tree(episode, camera_id, mount, stamps_ns),
@@ -298,10 +289,6 @@ def calibrated_tree_at(
 
     Args:
         episode: Gives joints for a camera in the hand, and the stamps of the images.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     stamps = np.unique(np.concatenate([paired_stamps_ns(episode, camera_id), stamps_ns]))
     lost = without_joints(episode, mount, stamps)
