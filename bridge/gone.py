@@ -60,7 +60,12 @@ GONE: dict[str, str] = {
         ("replay --engines-must-agree", "gate --engines-must-agree"),
         "--engine both replays in both and says where they differ.",
     ),
+    "replay --ray": "--workers N replays in N processes of this machine.",
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
+    **dict.fromkeys(
+        ("calibrate --evaluations", "calibrate --budget"),
+        "--physics reads imported pushes alone, on a grid; trials teach through --posterior.",
+    ),
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(

@@ -12,7 +12,6 @@ from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from dashboards.recording import Recording
-from twin.replay.rebuilt_scene import Correction
 from twin.scene.skinning import NUM_NEIGHBOURS, NUM_NODES, node_rotations
 
 MAX_NODE_POSES = 40_000
@@ -77,9 +76,8 @@ def bend(
     nodes: SoftNodes,
     track: PoseTrajectory,
     own_ns: Int[np.ndarray, " num_samples"],
-    found: Correction,
 ) -> tuple[Float[np.ndarray, "num_nodes 3"], Float[np.ndarray, "num_states num_nodes 4 4"]]:
-    """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
+    """Move nodes to where they are, at the page's samples or as many as there is room for.
 
     Args:
         own_ns: The page's samples on the replay's clock, evenly spaced.
@@ -96,7 +94,7 @@ def bend(
     for row, (time_ns, T) in enumerate(
         zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
     ):
-        seen_m = se3.apply(found.as_seen(T), nodes.at(time_ns))
+        seen_m = se3.apply(T, nodes.at(time_ns))
         R = node_rotations(rest_m, seen_m, around[:, 1:])
         Ts[row, :, :3, :3] = R
         Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)

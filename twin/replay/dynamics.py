@@ -152,9 +152,6 @@ def simulate(
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
     that bursts ends it: what comes after would be noise. Of several engines the first moves it;
     ``twin.replay.agreement`` asks the others.
-
-    Raises:
-        UsageError: For soft bodies in an engine that has none.
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz

@@ -78,9 +78,6 @@ def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOri
 
     Args:
         origin: The recorded episode, and when time 0 of the replay is.
-
-    Raises:
-        UsageError: When the file exists.
     """
     messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
     with EpisodeWriter(path) as writer:

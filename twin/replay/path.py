@@ -267,9 +267,6 @@ def path_of_plan(
     Returns:
         The path up to the last pose that could be reached, what failed, and the time of the first
         unreachable pose (None when all were reached).
-
-    Raises:
-        UnusablePlanError: What ``check_usable`` refuses, or another number of joints.
     """
     check_usable(plan, robot)
     knots = _Knots()

@@ -171,11 +171,7 @@ def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tu
 
 
 def read_trials(run: RunFolder, output: Output) -> Trials:
-    """Read every trial of a run that was executed and judged; missing localisations are made.
-
-    Raises:
-        NoTrialsError: When there is none.
-    """
+    """Read every trial of a run that was executed and judged; missing localisations are made."""
     trials, reasons, tasks = [], {}, set[str]()
     paths = run.episodes()
     with output.progress("localise", len(paths)) as advance:
@@ -362,9 +358,6 @@ def calibrate_posterior(
 
     Returns:
         The record, and the id of the calibration that holds now.
-
-    Raises:
-        NoTrialsError: When no trial can be used.
     """
     found, tasks = read_trials(run, output), dict[str, Any]()
     for name, trials in found.of_each_task().items():

@@ -14,7 +14,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
-from bridge.process_pool import Failed, Runner
+from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.task_file import Task
 from bridge.terminal import Output
@@ -88,10 +88,6 @@ class Preparation:
         """Of the recorded episode."""
         return RunFolder.open(self.run_path).episodes_dir / f"{self.episode_id}.mcap"
 
-    def needed_paths(self) -> tuple[Path, ...]:
-        """What a process on another machine must see."""
-        return (self.run_path, self.episode_path())
-
     def cost(self) -> float:
         """How long it takes, compared with others."""
         return float(self.episode_path().stat().st_size)
@@ -111,9 +107,6 @@ def jobs_of(item: Preparation) -> Prepared:
     """Localise the objects of an episode, where that is not there yet, and list its replays.
 
     One job per plan, and two more for each execution, with a plan or without.
-
-    Raises:
-        GstError: When the episode or its task cannot be read.
     """
     run, path, config = RunFolder.open(item.run_path), item.episode_path(), item.config
     episode = Episode.open(path)
@@ -268,6 +261,15 @@ def _trajectory_of(name: str) -> str:
     return name.rsplit(".", 3)[0]
 
 
+def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
+    """Replay all trial episodes of a run, in this process or in several."""
+    run.refuse_empty()
+    workers = config.workers or default_size()
+    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
+    with runner:
+        return replay_trajectories(run, config, output, runner)
+
+
 def replay_trajectories(
     run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
 ) -> dict[str, Any]:
@@ -295,7 +297,7 @@ def replay_trajectories(
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
-        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
+        run.derived_dir.mkdir(parents=True, exist_ok=True)
     told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
     with output.progress("replay", len(todo)) as advance:
         for done, row in enumerate(_replayed(todo, runner, output), start=1):

@@ -82,9 +82,6 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
     Args:
         start_ns: Source time that is time 0.
         end_ns: When the trajectory ended, from time 0.
-
-    Raises:
-        EpisodeError: When it is damaged or no replay.
     """
     episode = Episode.open(path)
     width = streams.joint_track(episode, GRIPPER_STATE)

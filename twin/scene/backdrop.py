@@ -175,11 +175,7 @@ def _cell_directions() -> Float[np.ndarray, "num_cells 3"]:
 
 
 def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:
-    """The shell of a scene; None where ``scene.json`` names none, or its picture is gone.
-
-    Raises:
-        UnreadableSceneError: What ``scene.json`` says of it cannot be understood.
-    """
+    """The shell of a scene; None where ``scene.json`` names none, or its picture is gone."""
     about = record.get("backdrop")
     path = run.scene_dir / BACKDROP
     if not isinstance(about, dict) or not path.is_file():

@@ -105,13 +105,7 @@ class MovableScene:
 
 
 def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
-    """Load the parts that ``scene.json`` lists.
-
-    Raises:
-        PathNotFoundError: A splat file is gone.
-        UnreadablePlyError: One is damaged.
-        UnreadableSceneError: ``scene.json`` or an ``object.json`` cannot be understood.
-    """
+    """Load the parts that ``scene.json`` lists."""
     root = scene.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return MovableScene(

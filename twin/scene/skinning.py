@@ -46,9 +46,6 @@ def bind(
 
     A weight falls to zero where the ninth node becomes as near, so that it changes smoothly from
     point to point.
-
-    Raises:
-        SkinError: Fewer than ten nodes.
     """
     nodes = np.asarray(nodes_m, dtype=np.float64)
     if len(nodes) <= NUM_NODES + 1:
@@ -83,9 +80,6 @@ def pose_cloud(
 
     Returns:
         The Gaussians in the nodes' frame.
-
-    Raises:
-        SkinError: Another number of Gaussians or nodes, or nodes that are no numbers.
     """
     rest, nodes = binding.rest_nodes_m, np.asarray(nodes_m, dtype=np.float64)
     if len(cloud) != binding.weights.shape[0] or nodes.shape != rest.shape:

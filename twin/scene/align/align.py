@@ -357,10 +357,6 @@ def align_robot(
 
     Args:
         start: A pose known to some centimetres; nothing else is then searched.
-
-    Raises:
-        RobotNotAlignedError: Nothing fits, or several places fit alike.
-        RobotDescriptionError: The description has no usable shapes.
     """
     if not views:
         raise RobotNotAlignedError(

@@ -69,12 +69,6 @@ def read_training_set(
 
     Args:
         choices: Which frames of which cameras to read.
-
-    Raises:
-        NoFramesError: When no frame has colour, depth and a pose together.
-        NoDepthError: When no depth image holds anything usable.
-        PoseConventionError: When the poses fit only if read in another convention.
-        WrongGeometryError: When one number of a camera's geometry is clearly off.
     """
     robot = find_robot(choices, output)
     read = _read(choices, config, robot, output)

@@ -167,10 +167,6 @@ def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSur
 
     Args:
         task: Other objects have a shape of their own there.
-
-    Raises:
-        UnreadableSceneError: When ``object.json`` cannot be understood.
-        UnreadableMeshError: When a mesh is damaged.
     """
     found = ScannedSurfaces()
     for key, model in task.objects.items():

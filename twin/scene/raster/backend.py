@@ -248,11 +248,6 @@ def open_rasteriser(config: RasterConfig | None = None) -> Rasteriser | CudaRast
     """Open the backend that ``RasterConfig.backend`` names.
 
     ``auto`` takes CUDA where both a device and gsplat are there, the CPU otherwise.
-
-    Raises:
-        SplatExtensionMissingError: When the CPU code was never built.
-        CudaMissingError: When cuda was asked for and there is no device.
-        MissingDependencyError: When cuda was asked for and gsplat is not installed.
     """
     config = config or RasterConfig()
     wants_cuda = config.backend == "cuda" or (config.backend == "auto" and has_cuda())

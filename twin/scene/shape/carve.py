@@ -38,11 +38,7 @@ class MaskedView:
     """Which camera it is: views of one camera share the errors of its depth."""
 
     def __post_init__(self) -> None:
-        """Refuse images that do not belong together.
-
-        Raises:
-            ShapeError: When sizes differ, or the pose is not finite.
-        """
+        """Refuse images that do not belong together."""
         size = (self.camera.height, self.camera.width)
         if self.depth_m.shape != size or self.mask.shape != size:
             message = (
@@ -281,9 +277,6 @@ def solid_of(
 
     Args:
         support_z_m: Height of the plane it stands on; nothing of it is below. None without one.
-
-    Raises:
-        ShapeError: When next to nothing is left.
     """
     box = evidence.box
     solid = ~evidence.empty

@@ -86,13 +86,7 @@ def _header(num_vertices: int, num_faces: int) -> list[str]:
 
 
 def read_mesh(path: Path) -> tuple[Vertices, Faces]:
-    """Read a mesh that ``mesh_ply`` wrote: vertices [m] and faces.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        UnreadableMeshError: When it is another kind of file, cut short, or names vertices that
-            do not exist.
-    """
+    """Read a mesh that ``mesh_ply`` wrote: vertices [m] and faces."""
     if not path.is_file():
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="mesh", hint=hint)

@@ -275,9 +275,6 @@ def shape_of_mesh(
         vertices_m: In the frame that is wanted, z up.
         points_m: What was measured on the object, in the same frame.
         config: Size of the voxels; the defaults when None.
-
-    Raises:
-        ShapeError: When the triangles enclose nothing.
     """
     config = ShapeConfig() if config is None else config
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)

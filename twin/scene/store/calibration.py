@@ -78,11 +78,7 @@ class Calibration:
 
 
 def read_calibration(run: RunFolder) -> Calibration | None:
-    """Read ``scene/calibration.json``, or return None when there is none.
-
-    Raises:
-        UnreadableCalibrationError: When it cannot be understood.
-    """
+    """Read ``scene/calibration.json``, or return None when there is none."""
     path = run.scene_dir / CALIBRATION_FILE
     if not path.is_file():
         return None
@@ -186,10 +182,6 @@ def calibrated_tree(
 
     A camera in the hand follows the recorded joints. How colour and depth lie to each other comes
     from the recording's own transforms; without them they count as aligned.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     color = streams.camera_info(episode, camera_id).frame_id
     has_depth = streams.find_camera_topic(episode, camera_id, "depth/info") is not None
@@ -244,10 +236,6 @@ def without_joints(
 
     Args:
         mount: A fixed camera needs no joints: the answer is empty.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     return unknown_postures(None if mount.fixed else posture_track(episode), stamps_ns)
 

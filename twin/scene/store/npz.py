@@ -42,9 +42,6 @@ def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.n
 
     Args:
         names: The arrays that are wanted; others are passed over.
-
-    Raises:
-        UnreadableArraysError: When the file is none, lacks an array, or holds too much.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -11,8 +11,7 @@ from bridge.errors import PathNotFoundError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.runner import describe_undrawn
-from twin.replay.workers import replay_run
+from twin.replay.runner import describe_undrawn, replay_run
 
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
