@@ -206,7 +206,7 @@ def _view_line(views: Mapping[str, Any]) -> str:
     images = views["images"]
     if not images:
         return "no frame could be held out: too few frames"
-    still = sum(bool(item["stationary_camera"]) for item in images)
-    which = f", {still} of cameras that stand still" if still else ""
+    stationary = sum(bool(item["stationary_camera"]) for item in images)
+    which = f", {stationary} of cameras that stand still" if stationary else ""
     mean_db = sum(item["psnr_db"] for item in images) / len(images)
     return f"held-out views ({len(images)}{which}): PSNR {mean_db:.2f} dB"
