@@ -50,11 +50,7 @@ def soft_models(scene: ReplayScene) -> dict[str, SoftModel]:
 
 
 def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftModel]) -> None:
-    """Put table, containers and objects where the scene says.
-
-    Args:
-        world: An empty one.
-    """
+    """Put table, containers and objects where the scene says."""
     world.add_table(scene.table_height_m)
     for name, T in scene.containers().items():
         world.add_static(scene.task.objects[name].panels(), T)

@@ -292,9 +292,6 @@ def replay_samples(
 ) -> tuple[Sample, ...]:
     """Run ``config.samples`` varied replays.
 
-    Args:
-        identity: Of the start; the same one draws the same variations.
-
     Raises:
         UsageError: For a kinematic replay, which moves no objects.
     """

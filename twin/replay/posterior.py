@@ -240,11 +240,7 @@ def _without_posterior(run: RunFolder) -> Calibration | None:
 
 
 def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
-    """Replay a trial's plan as a draw would have it.
-
-    Args:
-        draw: What is not known.
-    """
+    """Replay a trial's plan as a draw would have it."""
     scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
     scene = free_start(scene, soft_models(scene))

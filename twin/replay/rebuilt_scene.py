@@ -242,9 +242,6 @@ def scene_of_other_robot(run: RunFolder, robot: str) -> str:
     """Say which other robot recorded the scene of a run; empty: none that is known.
 
     A scene stands where the robot that recorded it was calibrated.
-
-    Args:
-        run: Its ``scene.json`` names the episodes that the scene was made of.
     """
     sources: list[dict[str, Any]] = (read_record(run) or {}).get("sources") or []
     names = {str(source.get("id", "")) for source in sources}

@@ -45,11 +45,7 @@ class Execution:
 
 
 def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution:
-    """Find the execution of a plan.
-
-    Args:
-        events: All of an episode, in their order.
-    """
+    """Find the execution of a plan."""
     mine = [event for event in events if event.get("plan_id") == plan_id]
     count = sum(event["type"] == "execution_started" for event in mine)
     start, end = execution_ns(mine, plan_id)
@@ -274,9 +270,6 @@ def replay_trajectories(
     run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
 ) -> dict[str, Any]:
     """Replay all trial episodes of a run; replays that are there already are kept.
-
-    Args:
-        run: Whose episodes are replayed, and whose ``derived`` folder gets the replays.
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that

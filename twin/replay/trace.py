@@ -112,11 +112,7 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
 def poses_over(
     stamps_ns: Int[np.ndarray, " num_poses"], Ts: Float[np.ndarray, "num_poses 4 4"]
 ) -> PoseTrajectory:
-    """Transforms over time as a trajectory.
-
-    Args:
-        stamps_ns: When, ascending.
-    """
+    """Transforms over time as a trajectory."""
     q, p = se3.split(Ts)
     return PoseTrajectory(stamps_ns, p, q)
 

@@ -210,13 +210,7 @@ def replay_joints(
     *,
     plan: Plan,
 ) -> ReplayResult:
-    """Replay what the joint encoders and the gripper said during an execution.
-
-    Args:
-        track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
-        widths: Recorded distance between the finger pads over the same stamps.
-        plan: The plan that was executed: its stages and when it wanted the gripper closed.
-    """
+    """Replay what the joint encoders and the gripper said during an execution."""
     path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
     return _replay(Commanded(path=path, trajectory="executed"), plan, scene, config)
 

@@ -39,11 +39,7 @@ class MovableScene:
     """What stands behind everything; None: black."""
 
     def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
-        """A view of one state, with the backdrop where nothing was drawn.
-
-        Args:
-            T_base_camera: Where that was, in the scene's frame.
-        """
+        """A view of one state, with the backdrop where nothing was drawn."""
         if self.backdrop is None:
             return view
         return self.backdrop.behind(view, camera, T_base_camera)

@@ -247,12 +247,7 @@ def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarr
 
 
 def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
-    """Open a recorded episode of a run by its id.
-
-    Args:
-        scene: Whose first episode is taken where none is wanted.
-        wanted: The id, or nothing.
-    """
+    """Open a recorded episode of a run by its id."""
     name = wanted or scene.record["sources"][0]["id"]
     episodes: dict[str, Episode] = {}
     for path in run.episodes():
@@ -270,11 +265,7 @@ def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
 
 
 def camera_of(episode: Episode, wanted: str) -> str:
-    """The camera of an episode that is wanted, or the first.
-
-    Args:
-        wanted: The id, or nothing.
-    """
+    """The camera of an episode that is wanted, or the first."""
     ids = streams.camera_ids(episode)
     if not ids or (wanted and wanted not in ids):
         found = ", ".join(ids) or "none"

@@ -75,9 +75,6 @@ def pose_cloud(
     A rigid motion of all nodes moves and turns every Gaussian by it. Rotations are blended as
     quaternions (Kavan et al. 2007 without the dual part), colours turn along.
 
-    Args:
-        cloud: At rest, in the frame the binding was made in.
-
     Returns:
         The Gaussians in the nodes' frame.
     """

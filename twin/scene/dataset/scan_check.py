@@ -387,10 +387,6 @@ class ScanReport:
 def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:
     """Look for what makes a scan useless, or worth less than it seems.
 
-    Args:
-        cameras: What the training frames of each showed.
-        config: Depth limits, and whether wrong poses are refused.
-
     Raises:
         NoDepthError: When no camera has depth images that can be used.
         PoseConventionError: When a camera's poses fit only if read in another convention.

@@ -65,11 +65,7 @@ class _Read:
 def read_training_set(
     choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
 ) -> TrainingSet:
-    """Read every training frame, check the scan, and set aside what moved.
-
-    Args:
-        choices: Which frames of which cameras to read.
-    """
+    """Read every training frame, check the scan, and set aside what moved."""
     robot = find_robot(choices, output)
     read = _read(choices, config, robot, output)
     if not read.views:

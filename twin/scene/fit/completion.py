@@ -68,11 +68,7 @@ def complete_holes(
     config: InitialiseConfig,
     raster: RasterConfig | None = None,
 ) -> GaussianCloud:
-    """Gaussians that close the holes of the training views, marked; none without holes.
-
-    Args:
-        config: ``completion`` and ``max_splats`` say how many there may be.
-    """
+    """Gaussians that close the holes of the training views, marked; none without holes."""
     added = cloud.take(np.zeros(0, dtype=np.int64))
     most = round(config.completion * config.max_splats)
     rasteriser = Rasteriser(raster or RasterConfig())

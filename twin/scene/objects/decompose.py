@@ -297,11 +297,7 @@ class Decomposition:
     """Reconstructed from the views, in the frame of each object, or why not."""
 
     def write(self, run: RunFolder, views: Sequence[TrainingView] = ()) -> dict[str, Any]:
-        """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
-
-        Args:
-            views: What the scene was fitted to; says what is static.
-        """
+        """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them."""
         static = write_static(run.scene_dir, views, self.task, self.places)
         if self.parts is None or self.localised is None or self.task is None:
             return {"objects": {}, "objects_remark": self.remark, "sdf": static}

@@ -110,11 +110,7 @@ class CudaRasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
         torch = self._torch
         leaves = {name: torch.tensor(rows, device=self._device) for name, rows in arrays(cloud)}
         T = se3.invert(T_base_camera).astype(np.float32)
@@ -130,11 +126,7 @@ class CudaRasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw what one camera sees."""
         planes = self.draw_planes(cloud, camera, T_base_camera)
         alpha = planes[4]
         solid = alpha >= SOLID_ALPHA

@@ -269,11 +269,7 @@ class Rasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
         planes: np.ndarray = self._native.draw(
             cloud.means_m,
             cloud.quats_wxyz,
@@ -346,11 +342,7 @@ class Rasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw what one camera sees."""
         planes = self.draw_planes(cloud, camera, T_base_camera)
         image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
         return View(image=image, depth_m=self.surface_depth(), alpha=planes[4])

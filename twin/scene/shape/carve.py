@@ -117,11 +117,7 @@ class Sight:
 
 
 def look(box: VoxelBox, view: MaskedView) -> Sight:
-    """Project all voxel centres into a view and compare depths.
-
-    Args:
-        box: The voxels, in the frame the view is given in.
-    """
+    """Project all voxel centres into a view and compare depths."""
     x, y, z = _in_camera(box, se3.invert(view.T_base_camera))
     camera = view.camera
     inverse = 1.0 / np.maximum(z, np.float32(NEAR_M))

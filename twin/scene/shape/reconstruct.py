@@ -179,11 +179,7 @@ def describe_solid(
     num_views: int,
     truncation_m: float,
 ) -> ObjectShape:
-    """Mesh a solid and say what of it was seen.
-
-    Args:
-        evidence: Where views saw a surface, and what is known to be empty.
-    """
+    """Mesh a solid and say what of it was seen."""
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
     completed = ~_observed(vertices, faces, evidence)
     _, areas = face_normals(vertices, faces)
@@ -247,11 +243,7 @@ def _extent(
 def moved_views(
     views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
 ) -> list[MaskedView]:
-    """The same views in another frame.
-
-    Args:
-        views: In the base frame.
-    """
+    """The same views in another frame."""
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 

@@ -107,12 +107,7 @@ def _mount(record: Mapping[str, Any]) -> MountedCamera:
 def write_calibration(
     run: RunFolder, cameras: Mapping[str, Any], not_identified: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Write ``calibration.json``; cameras identified earlier and not looked at now are kept.
-
-    Args:
-        cameras: Per camera what was found, with ``link``, ``stream`` and ``T_link_camera``.
-        not_identified: Per camera why nothing was found.
-    """
+    """Write ``calibration.json``; cameras identified earlier and not looked at now are kept."""
     kept = _kept(run)
     known = {**kept.get("cameras", {}), **cameras}
     lost = {**kept.get("not_identified", {}), **not_identified}
@@ -144,11 +139,7 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced.
-
-    Args:
-        posterior: The record, with ``draws`` and the trials they were weighed by.
-    """
+    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced."""
     return _store(run, {**_kept(run), "posterior": posterior})
 
 
