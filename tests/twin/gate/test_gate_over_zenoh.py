@@ -228,32 +228,6 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     assert [Verdict.from_json(sample.data).accepted for sample in published] == [None] * 3
 
 
-def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    inside, go_on = threading.Semaphore(0), threading.Event()
-
-    def replay(plan: Plan, *_: Any) -> Verdict:
-        inside.release()
-        go_on.wait()
-        return accept(plan)
-
-    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
-    publish_one_frame(cell)
-    answers: list[Verdict] = []
-    first = threading.Thread(target=lambda: answers.append(ask(cell)))
-    first.start()
-    assert inside.acquire(timeout=5)
-    turned_away = ask(cell)
-    assert answers == [], "the first plan is still being judged"
-    assert turned_away.accepted is None
-    assert "ask later" in str(turned_away.reason)
-    go_on.set()
-    first.join(10)
-    assert [verdict.accepted for verdict in answers] == [True]
-
-
 ASKING = """
 import sys, time
 from bridge.wire.config import WireConfig

@@ -13,7 +13,7 @@ from twin.physics import engine
 from twin.physics.arm import Arm, write_description
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
-from twin.physics.world import PhysicsError, World
+from twin.physics.world import World
 from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
@@ -96,15 +96,6 @@ def test_orders_given_once_do_what_repeated_ones_do(
     assert dropped(urdf, 60)[1] == once
 
 
-def test_a_posture_is_the_joints_and_the_width(urdf: str) -> None:
-    with World(urdf, {}, PhysicsConfig()) as world:
-        world.reset_robot(HOME, 0.05)
-        joints, width = world.robot.posture()
-        np.testing.assert_array_equal(joints, world.robot.joints_rad())
-        np.testing.assert_allclose(joints, HOME, atol=1e-12)
-        assert width == world.robot.width_m() == pytest.approx(0.05)
-
-
 def test_open_fingers_hold_nothing(urdf: str) -> None:
     with World(urdf, {}, PhysicsConfig()) as world:
         world.reset_robot(HOME, 0.08)
@@ -115,12 +106,6 @@ def test_open_fingers_hold_nothing(urdf: str) -> None:
             world.step()
         assert not world.finger_touches("cube")
         assert world.T_base_object("cube")[2, 3] < T_tcp[2, 3] - 0.2
-
-
-def test_a_description_without_the_links_of_the_fingers_is_refused_by_name(urdf: str) -> None:
-    other = urdf.replace('"gripper_left_finger"', '"thumb"')
-    with pytest.raises(PhysicsError, match="lacks gripper_left_finger;"):
-        World(other, {}, PhysicsConfig())
 
 
 def test_a_link_may_be_called_what_no_file_can_be(urdf: str, tmp_path: Path) -> None:

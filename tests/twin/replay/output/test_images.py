@@ -338,17 +338,6 @@ def drawn(
     ]
 
 
-def test_what_nobody_found_is_not_drawn_where_the_scan_had_it(
-    run: RunFolder, script: SimpleNamespace
-) -> None:
-    full = script.scene()
-    write_scene(run, full, "cube", block())
-    episode = write_recording(run, full.urdf)
-    scene = script.scene(missing=("cube",))
-    result = replace(result_of(full, "cube"), Ts_base_object={}, finger_contact={})
-    assert np.isnan(middle_of(pictures(run, episode, result, scene)["side"][0], RED)).all()
-
-
 def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(
     run: RunFolder, script: SimpleNamespace, tmp_path: Path
 ) -> None:

@@ -280,17 +280,6 @@ def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
         assert "sdf.npz: not a file of arrays" in row["error"]
 
 
-def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "scanned")
-    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
-        writer.describe(EpisodeInfo(id="scan", kind="scan"))
-    summary = replay_run(run, ReplayRunConfig(), QUIET)
-    said = describe_run(summary)
-    assert said.startswith("No trial to replay.")
-    assert "scan: not evaluated: a scan" in said
-    json.dumps(summary)
-
-
 def marks(*said: str) -> list[dict[str, Any]]:
     """Events of plan a, one second apart: > it starts, < it ends."""
     kinds = {">": "execution_started", "<": "execution_ended", ".": "note"}

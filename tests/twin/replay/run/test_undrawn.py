@@ -32,8 +32,3 @@ def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() ->
         "cube: not in the scene, not in pictures (cube not found: hidden)",
         "robot: not in the scene, not in pictures (no joints)",
     ]
-
-
-def test_a_whole_scene_lacks_nothing() -> None:
-    whole = {"objects": {"box": {}, "cube": {}}, "robot": {"links": {"tool0": {}}}}
-    assert describe_undrawn(whole, [load_task("cube_into_box")]) == []

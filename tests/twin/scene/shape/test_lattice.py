@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from solid_shapes import ball_shape, grid, shape_of
 
 from twin.scene.shape.carve import ShapeError
@@ -33,13 +31,6 @@ def test_tetrahedra_are_positive_and_fill_the_shape(ball: ObjectShape, inside: L
     assert np.all(inside.mass_fraction > 0)
     centre = inside.mass_fraction @ inside.nodes_m
     np.testing.assert_allclose(centre, ball.vertices_m.mean(axis=0), atol=0.001)
-
-
-def test_tetrahedra_tie_all_nodes_together(inside: Lattice) -> None:
-    num = len(inside.nodes_m)
-    pairs = np.concatenate([inside.tets[:, [0, k]] for k in (1, 2, 3)])
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(num, num))
-    assert connected_components(graph, directed=False)[0] == 1
 
 
 def test_a_lattice_is_read_back(inside: Lattice, tmp_path: Path) -> None:
