@@ -1,7 +1,6 @@
 """Trials of the stand-in cell as episodes of a run, in process: no wire, no recorder process."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,14 +103,3 @@ def record_ungated(
     session = FileSession(run.episodes_dir)
     run_session(session, config, Output(quiet=True), start_ns=START_NS)
     return paths
-
-
-def with_copies(run: RunFolder, paths: Sequence[Path], count: int) -> list[Path]:
-    """Copy recorded episodes under further names until there are so many."""
-    names = [run.episodes_dir / f"copy_{k:04d}.mcap" for k in range(count)]
-    for k, name in enumerate(names):
-        if not name.is_file():
-            part = name.with_suffix(".tmp")
-            part.write_bytes(paths[k % len(paths)].read_bytes())
-            part.rename(name)
-    return names

@@ -31,7 +31,7 @@ EXTRAS = {
     ),
     "replay": Extra(
         "rebuild, render, replay, gate, calibrate",
-        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "cmaes", "python-fcl"),
+        ("open3d", "pybullet", "pin", "scipy", "example-robot-data", "python-fcl"),
     ),
     "report": Extra(
         "evaluate: tables, figures, report",
@@ -55,7 +55,6 @@ EXTRAS = {
     ),
     "lpips": Extra("LPIPS", ("torch", "safetensors", "torchmetrics"), is_optional=True),
     "gpu": Extra("drawing on CUDA", ("gsplat",), is_optional=True),
-    "cluster": Extra("replays on Ray", ("ray",), is_optional=True),
 }
 """As ``pyproject.toml`` has them."""
 NATIVE = (

@@ -72,7 +72,11 @@ GONE: dict[str, str] = {
         ("replay --engines-must-agree", "gate --engines-must-agree"),
         "--engine both replays in both and says where they differ.",
     ),
+    "replay --ray": "--workers N replays in N processes of this machine.",
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
+    "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
+    "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
+    "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(

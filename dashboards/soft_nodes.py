@@ -12,7 +12,6 @@ from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.geometry.trajectory import PoseTrajectory
 from dashboards.recording import Recording
-from twin.replay.rebuilt_scene import Correction
 from twin.scene.skinning import NUM_NEIGHBOURS, NUM_NODES, node_rotations
 
 MAX_NODE_POSES = 40_000
@@ -77,20 +76,18 @@ def bent(
     name: str,
     track: PoseTrajectory,
     own_ns: Int[np.ndarray, " num_samples"],
-    found: Correction,
 ) -> Bent | None:
     """Move the nodes of an object as ``bend`` does; None where there are none that can be drawn."""
     nodes = read_soft_nodes(replay, name)
-    return None if nodes is None else bend(nodes, track, own_ns, found)
+    return None if nodes is None else bend(nodes, track, own_ns)
 
 
 def bend(
     nodes: SoftNodes,
     track: PoseTrajectory,
     own_ns: Int[np.ndarray, " num_samples"],
-    found: Correction,
 ) -> Bent:
-    """Move nodes to where cameras see them, at the page's samples or as many as there is room for.
+    """Move nodes to where they are, at the page's samples or as many as there is room for.
 
     Args:
         own_ns: The page's samples on the replay's clock, evenly spaced.
@@ -104,7 +101,7 @@ def bend(
     for row, (time_ns, T) in enumerate(
         zip(times_ns, track.at(times_ns.astype(np.int64)).transforms(), strict=True)
     ):
-        seen_m = se3.apply(found.as_seen(T), nodes.at(time_ns))
+        seen_m = se3.apply(T, nodes.at(time_ns))
         R = node_rotations(rest_m, seen_m, around[:, 1:])
         Ts[row, :, :3, :3] = R
         Ts[row, :, :3, 3] = seen_m - np.einsum("nij,nj->ni", R, rest_m)

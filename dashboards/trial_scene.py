@@ -25,14 +25,12 @@ from bridge.task.task_file import Task
 from dashboards.library import derived_paths
 from dashboards.loading import LOADING
 from dashboards.recording import PageClock, Problems, Recording
-from twin.replay.rebuilt_scene import Correction, correction_of
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
 from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.render import poses_in_scene
-from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
 
 RATE_HZ = 20.0
@@ -238,13 +236,7 @@ def _replayed_side(
     if ends is None:
         return None
     own_ns = gathering.stamps_ns + (first_ns - gathering.clock.stamp_ns(float(ends[0])))
-    correction = gathering.problems.attempt(
-        lambda: correction_of(read_calibration(gathering.run)), correction_of(None)
-    )
-    objects = {
-        name: np.stack([correction.as_seen(T) for T in track.at(own_ns).transforms()])
-        for name, track in replay.objects.items()
-    }
+    objects = {name: track.at(own_ns).transforms() for name, track in replay.objects.items()}
     skeleton = None
     joints = replay.joints
     if joints is not None and robot is not None and set(robot.joints) <= set(joints.names):
@@ -256,7 +248,7 @@ def _replayed_side(
         span_s=(float(ends[0]), float(ends[1])),
         Ts_base_object=objects,
         skeleton_m=skeleton,
-        bends=_bends(gathering, replay, trajectory, own_ns, correction),
+        bends=_bends(gathering, replay, trajectory, own_ns),
     )
 
 
@@ -265,7 +257,6 @@ def _bends(
     replay: Recording,
     trajectory: str,
     own_ns: Int[np.ndarray, " num_samples"],
-    correction: Correction,
 ) -> dict[str, Bend]:
     """How the replay bends soft objects, at instants of its own clock."""
     names = () if gathering.task is None else gathering.task.soft_objects
@@ -276,7 +267,7 @@ def _bends(
         track, found = replay.objects.get(name), None
         if track is not None and has_leaf("soft"):
             with LOADING:
-                bent = partial(load_leaf("soft", "bent"), replay, name, track, own_ns, correction)
+                bent = partial(load_leaf("soft", "bent"), replay, name, track, own_ns)
             found = gathering.problems.attempt(bent, None)
         if found is None:
             gathering.problems.texts.append(

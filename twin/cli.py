@@ -34,8 +34,8 @@ def replay(
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
+    from twin.replay.runner import replay_run
     from twin.replay.summary import describe_run
-    from twin.replay.workers import replay_run
 
     summary = replay_run(RunFolder.open(run), config, output)
     output.result(summary, describe_run(summary))
@@ -156,7 +156,7 @@ def calibrate(
 
     Writes scene/calibration.json.
     Example: robot-gst calibrate runs/monday --cameras
-    Physics: robot-gst calibrate runs/monday --physics
+    From imported pushes: robot-gst calibrate runs/kinova --physics
     From trials: robot-gst calibrate runs/monday --posterior
 
     Args:
@@ -187,12 +187,12 @@ def calibrate(
         )
         return 0
     if config.physics:
-        from twin.calibrate.physics.run import calibrate_physics, describe_physics
+        from twin.calibrate.physics.push_fit import calibrate_pushes, describe_pushes
 
-        physics, calibration_id = calibrate_physics(run_folder, config, output)
+        physics, calibration_id = calibrate_pushes(run_folder, config, output)
         output.result(
             {**physics, "calibration_id": calibration_id},
-            describe_physics(physics, calibration_id),
+            describe_pushes(physics, calibration_id),
         )
         return 0
     from twin.calibrate.cameras import calibrate_cameras, describe_cameras

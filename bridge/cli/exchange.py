@@ -254,7 +254,7 @@ def import_images(
 ) -> int:
     """Turn posed images without depth into a scan episode: COLMAP's text model, transforms.json.
 
-    rebuild finds depth by comparing the images. Lengths are metric only with --metres-per-unit.
+    To be looked at: rebuild needs depth. Lengths are metric only with --metres-per-unit.
     Example: robot-gst import images data/garden runs/garden
 
     Args:

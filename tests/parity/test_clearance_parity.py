@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from bridge.geometry.mesh import box_corners
 from twin.plan.release.distances import Boxes, candidate_clearance, lower_by_grid
-from twin.replay import _clearance
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
 from twin.replay.clearance.distance_grid import GridLookup
@@ -51,31 +50,6 @@ def test_no_point_is_nearer_than_the_tree_says(grid: SdfGrid) -> None:
             assert distance + FINE_M >= min(every, 0.98 * every) - 1e-5
             inside += distance < 0
     assert 10 < inside < 110
-
-
-def test_the_same_bits_on_every_call(grid: SdfGrid) -> None:
-    spheres = BoundingSpheres(
-        [bounding_spheres_of(np.random.default_rng(3).uniform(-0.05, 0.05, (25, 3)))]
-    )
-    lookup = GridLookup(grid)
-    R, t = poses(1, 7)
-    first = spheres.distances_m(lookup, R, t)
-    assert all(spheres.distances_m(lookup, R, t).tobytes() == first.tobytes() for _ in range(20))
-
-
-def test_what_does_not_fit_together_is_refused(grid: SdfGrid) -> None:
-    R, t = poses(1, 8)
-    points, radius = np.zeros((2, 3)), np.zeros(2)
-    roots, answers = np.array([[0, 1]], dtype=np.int32), np.zeros(1)
-    fixed = (grid.values_m, grid.origin_m, grid.voxel_m)
-    beyond = np.array([[1, 9], [0, 0]], dtype=np.int32)
-    with pytest.raises(IndexError, match="not there"):
-        _clearance.nearest(*fixed, R, t, points, radius + 9, beyond, roots, answers)
-    fine = np.zeros((2, 2), dtype=np.int32)
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.nearest(*fixed, R, t, points, np.zeros(3), fine, roots, answers)
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.nearest(*fixed, R, t, points, radius, fine, roots, np.zeros(2))
 
 
 def bound_in_numpy(near: NearPairs, solids: list, one: int, other: int) -> float:
@@ -155,25 +129,6 @@ def test_pairs_that_are_left_out_are_farther_apart_than_was_asked() -> None:
     assert beyond == 0
 
 
-def test_bounds_refuse_what_does_not_fit_together() -> None:
-    one, three, none = np.ones(1), np.zeros((1, 3)), np.zeros((1, 2), dtype=np.int32)
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.Bounds(three, np.zeros((2, 3)), one, three, none, none)
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.Bounds(three, three, one, three, np.zeros((2, 2), dtype=np.int32), none)
-    with pytest.raises(IndexError, match="not there"):
-        _clearance.Bounds(three, three, one, three, none, np.array([[0, 1]], dtype=np.int32))
-    for wrong in ([[0, 2]], [[-1, 0]], [[1, 0]]):
-        with pytest.raises(IndexError, match="corner"):
-            _clearance.Bounds(three, three, one, three, np.array(wrong, dtype=np.int32), none)
-    bounds = _clearance.Bounds(three, three, one, three, none, none)
-    order = np.zeros(1, dtype=np.int32)
-    with pytest.raises(ValueError, match="differ in number"):
-        bounds.nearest_first(np.eye(3)[None], np.zeros((2, 3)), np.zeros(1), order, 0.0)
-    with pytest.raises(ValueError, match="differ in number"):
-        bounds.nearest_first(np.eye(3)[None], three, np.zeros(2), order, 0.0)
-
-
 def bodies(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Points of a body, and poses of it as matrices."""
     R, t = poses(count, seed)
@@ -223,21 +178,3 @@ def test_margins_of_points_are_their_distances_less_what_is_kept(grid: SdfGrid) 
         np.testing.assert_allclose(margins, expected, atol=1e-6)
     nearest = candidate_clearance(lookup, points, Ts)
     np.testing.assert_allclose(nearest, to_grid.min(axis=1) + 0.003, atol=1e-6)
-
-
-def test_lists_of_other_lengths_are_refused(grid: SdfGrid) -> None:
-    points, Ts = bodies(3, 14)
-    R, t = np.ascontiguousarray(Ts[:, :3, :3]), np.ascontiguousarray(Ts[:, :3, 3])
-    fixed = (grid.values_m, grid.origin_m, grid.voxel_m)
-    boxes = (np.eye(3)[None], np.zeros((1, 3)), np.ones((1, 3)))
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.surface_to_grid(*fixed, R, t[:2], points, np.zeros(3))
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.surface_to_boxes(*boxes, R, t, points, np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.surface_to_boxes(boxes[0], np.zeros((2, 3)), boxes[2], R, t, points,
-                                    np.zeros((3, 1)))  # fmt: skip
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.points_to_grid(*fixed, 0.0, R, t, points, np.zeros((3, 59)))
-    with pytest.raises(ValueError, match="differ in number"):
-        _clearance.points_to_boxes(*boxes, np.zeros(2), 1.0, R, t, points, np.zeros((3, 60)))

@@ -84,22 +84,6 @@ def test_both_draw_the_same_planes(cuda: CudaRasteriser, num_harmonics: int) -> 
     assert np.median(np.abs(view.depth_m[solid] - ours[3][solid] / ours[4][solid])) < 1e-4
 
 
-def test_a_gaussian_at_a_known_pixel_is_drawn_there(cuda: CudaRasteriser) -> None:
-    x_px, y_px, depth_m = 30.5, 12.5, 2.0
-    mean = [(x_px - CAMERA.cx) / CAMERA.fx * depth_m, (y_px - CAMERA.cy) / CAMERA.fy * depth_m]
-    cloud = GaussianCloud(
-        means_m=as_float32(np.array([[*mean, depth_m]])),
-        quats_wxyz=as_float32(np.array([[1.0, 0, 0, 0]])),
-        scales_log=as_float32(np.full((1, 3), np.log(0.05))),
-        opacities_logit=as_float32(np.array([2.0])),
-        colors=as_float32(np.ones((1, 3))),
-    )
-    planes = cuda.draw_planes(cloud, CAMERA, np.eye(4))
-    assert np.unravel_index(planes[4].argmax(), planes[4].shape) == (12, 30)
-    assert planes[3, 12, 30] / planes[4, 12, 30] == pytest.approx(depth_m, rel=1e-4)
-    np.testing.assert_allclose(planes[4, 11, 30], planes[4, 13, 30], rtol=1e-3)  # centred
-
-
 @pytest.mark.parametrize("num_channels", [0, 1, 5, 70])
 def test_features_are_drawn_alike(cuda: CudaRasteriser, num_channels: int) -> None:
     cloud, rng = cloud_of(5), np.random.default_rng(6)

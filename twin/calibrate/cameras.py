@@ -98,12 +98,6 @@ def find_fixed_camera(episodes: Sequence[Episode], camera_id: str, *, seed: int)
 
     The search begins where the recording has the camera; when the robot is not there, or the
     recording does not say, the whole table is searched.
-
-    Raises:
-        RobotNotAlignedError: The images do not determine it, or none shows a robot that stands
-            still.
-        EpisodeError: No joint states.
-        RobotDescriptionError: No usable robot description.
     """
     tracks = _tracks(episodes)
     seen = [

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
-from twin.scene.settings import convert_duration
 
 Mount = Literal["auto", "hand", "fixed"]
 
@@ -20,8 +19,8 @@ class CalibrateConfig:
     cameras: bool = False
     """Where the cameras are, written to RUN/scene/calibration.json."""
     physics: bool = False
-    """Friction, masses, forces and pose bias from executed probes and trials, written to
-    RUN/scene/calibration.json where held-out episodes confirm them."""
+    """Friction from imported pushes, written to RUN/scene/calibration.json where held-out ones
+    confirm it."""
     posterior: bool = False
     """Which friction, masses, force and common shift agree with the trials executed in this run,
     written to RUN/scene/calibration.json; samples of replays and of the gate then draw from it."""
@@ -37,13 +36,7 @@ class CalibrateConfig:
     link: str = "tool0"
     """Link that carries the camera, or the target of a fixed camera."""
     seed: int = 0
-    """Of the resampling behind the intervals; with --physics, of the search and of which episodes
-    are held out."""
-    evaluations: int = 50
-    """With --physics: points the search tries; the intervals take about 60 more."""
-    budget_s: Annotated[float, Parameter(name="--budget", converter=convert_duration)] = 3600.0
-    """With --physics: a last resort, named where it strikes: wall time after which the search ends
-    before its last point: 1h, 10min or plain seconds."""
+    """Of the resampling behind the intervals."""
     workers: int | None = None
     """With --physics and --posterior: processes that simulate side by side; one for each core, at
     most 8, when no number is given."""
@@ -54,8 +47,6 @@ class CalibrateConfig:
             self,
             {
                 "seed": (0, 2**31),
-                "evaluations": (1, 100_000),
-                "budget_s": (0, float("inf")),
                 "workers": (1, 1024),
                 "draws": (2, 100_000),
             },

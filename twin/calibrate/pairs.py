@@ -41,12 +41,7 @@ class PosePairs:
 
 
 def read_pairs(path: Path) -> PosePairs:
-    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows [m].
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        UsageError: When it holds something that is no pose.
-    """
+    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows [m]."""
     if not path.is_file():
         raise PathNotFoundError(path=path, what="file of pose pairs", hint="Check the path.")
     try:
@@ -102,10 +97,6 @@ def recorded_pairs(episodes: Sequence[Episode], camera_id: str, link: str) -> Po
     Args:
         episodes: Those without poses of a target from this camera are passed over.
         link: Robot link whose pose in the base is the other half of a pair.
-
-    Raises:
-        EpisodeError: An episode with targets has no joint states.
-        RobotDescriptionError: No usable robot description, or it lacks the link.
     """
     hands: list[np.ndarray] = []
     targets: list[np.ndarray] = []

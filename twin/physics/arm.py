@@ -134,11 +134,7 @@ class Arm:
     """One robot with its base at the origin of a PyBullet client."""
 
     def __init__(self, client: int, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
-        """Load it.
-
-        Raises:
-            PhysicsError: When PyBullet does not load the description or joints are missing.
-        """
+        """Load it."""
         self._client = client
         self._config = config
         self.record: Robot = robot_of(urdf)

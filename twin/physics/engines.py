@@ -1,7 +1,6 @@
 """What a replay asks of a physics engine, and which engines answer."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib import metadata
 from types import TracebackType
 from typing import Protocol, runtime_checkable
@@ -9,10 +8,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from bridge.errors import MissingDependencyError
 from twin.physics.arm import Hulls, Joints
 from twin.physics.bending import SoftBodies
-from twin.physics.config import ENGINES, Engine, PhysicsConfig, require_engine
+from twin.physics.config import Engine, PhysicsConfig, require_engine
 from twin.physics.engine import ENGINE_VERSION
 from twin.physics.unseen import EVEN, Unseen
 from twin.physics.world import Box, World
@@ -103,12 +101,7 @@ class PhysicsWorld(Protocol):
 def open_world(
     engine: Engine, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
 ) -> PhysicsWorld:
-    """Make an empty world with the robot in it.
-
-    Raises:
-        MissingDependencyError: When the engine is not installed.
-        PhysicsError: When it does not load the description, or joints are missing.
-    """
+    """Make an empty world with the robot in it."""
     if engine == "pybullet":
         return World(urdf, mesh_hulls_m, config)
     require_engine(engine)
@@ -118,21 +111,8 @@ def open_world(
 
 
 def engine_version(engine: Engine) -> str:
-    """Name an engine with its version, as verdicts carry it.
-
-    Raises:
-        MissingDependencyError: When it is not installed.
-    """
+    """Name an engine with its version, as verdicts carry it."""
     if engine == "pybullet":
         return ENGINE_VERSION
     require_engine(engine)
     return f"{engine}-{metadata.version(engine)}"
-
-
-def installed_versions() -> str:
-    """All engines that are installed, with their versions."""
-    found = []
-    for engine in ENGINES:
-        with suppress(MissingDependencyError):
-            found.append(engine_version(engine))
-    return ", ".join(found)

@@ -86,11 +86,7 @@ class World:
     """One simulated cell. A context manager: its client goes away at the end."""
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
-        """Load the robot with its base at the origin.
-
-        Raises:
-            PhysicsError: When PyBullet does not load the description or joints are missing.
-        """
+        """Load the robot with its base at the origin."""
         self.config = config
         self._client = open_client(config)
         self.free_ids: dict[str, int] = {}

@@ -40,11 +40,7 @@ def recorded_findings(recording: Recording, config: ReplayConfig) -> tuple[dict[
 def compare(
     job: ReplayJob, engine: Engine, result: ReplayResult, recording: Recording, end_ns: int
 ) -> Divergence:
-    """Lay the executed replay, the planned one if it is there, and the recording over each other.
-
-    Args:
-        job: The executed replay's; names the planned replay's file.
-    """
+    """Lay the executed replay over the planned one, if it is there, and over the recording."""
     robot = load_robot(recording.scene.urdf)
     executed = trace_of_result(result, "executed", end_ns)
     recorded = trace_of_recording(recording, robot, job.config.sample_rate_hz)

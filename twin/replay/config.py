@@ -13,8 +13,6 @@ from twin.physics.config import ENGINES, RIGID_ONLY, Engine, PhysicsConfig, requ
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
 GRIP_FORCE = "grip_force_N"
-RIGID_MASSES = "masses of rigid objects"
-"""Beside fields of ``PhysicsConfig`` among what a calibration found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,11 +52,7 @@ class PosteriorDraw:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "PosteriorDraw":
-        """Read what ``calibration.json`` keeps of one.
-
-        Raises:
-            KeyError, TypeError, ValueError: When something lacks or is not a number.
-        """
+        """Read what ``calibration.json`` keeps of one."""
         x, y = record["bias_m"]
         boxes = []
         for box in record.get("boxes", ()):
@@ -85,8 +79,8 @@ class VariationConfig:
     """What calibration knows better than the priors that samples are drawn from."""
 
     calibrated: tuple[tuple[str, float], ...] = ()
-    """Fields of ``PhysicsConfig``, and the masses of rigid objects, with the spread of their
-    logarithm that calibration found; they replace the priors."""
+    """Fields of ``PhysicsConfig`` with the spread of their logarithm that calibration found; they
+    replace the priors."""
     posterior: tuple[PosteriorDraw, ...] = ()
     """What the session's own trials left of wide priors; samples draw frictions, force, masses and
     a common shift of all poses from it instead of from the priors."""
@@ -114,13 +108,11 @@ class VariationConfig:
         known = dict(self.calibrated)
         if known.keys() & set(FRICTIONS[1:]):
             spreads[FRICTIONS[0]] = 0.0
-        known.pop(RIGID_MASSES, None)
         return {**spreads, **{name: known[name] for name in sorted(known)}}
 
-    def mass_spread(self, *, soft: bool) -> float:
-        """Spread of the logarithm of an object's mass; calibration weighs rigid ones only."""
-        prior = 0.0 if self.posterior else MASS_LOG
-        return prior if soft else dict(self.calibrated).get(RIGID_MASSES, prior)
+    def mass_spread(self) -> float:
+        """Spread of the logarithm of an object's mass; draws of a posterior have it already."""
+        return 0.0 if self.posterior else MASS_LOG
 
 
 Mode = Literal["kinematic", "dynamic"]
@@ -215,11 +207,7 @@ class ReplayRunConfig:
     episode: tuple[str, ...] = ()
     """Ids of the trial episodes to replay; all of them when none is given."""
     workers: int | None = None
-    """Processes that replay side by side, or processors of --ray local: one for each core, at most
-    8, when no number is given. A cluster that is there uses its own."""
-    ray: str = ""
-    """Replay on a Ray cluster instead: its HOST:PORT, or local to start one on this machine;
-    docs/scale.md says how it is kept closed."""
+    """Processes that replay side by side: one for each core, at most 8, when no number is given."""
     samples: int = 0
     """Varied replays of each plan; they give the success probability of its verdict. A kinematic
     replay moves no objects and has none."""

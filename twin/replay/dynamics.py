@@ -46,11 +46,7 @@ def soft_models(scene: ReplayScene) -> dict[str, SoftShape]:
 
 
 def spawn(world: PhysicsWorld, scene: ReplayScene, soft: Mapping[str, SoftShape]) -> None:
-    """Put table, containers and objects where the scene says.
-
-    Args:
-        world: An empty one.
-    """
+    """Put table, containers and objects where the scene says."""
     world.add_table(scene.table_height_m)
     for name, T in scene.containers().items():
         world.add_static(scene.task.objects[name].panels(), T)
@@ -148,9 +144,6 @@ def simulate(
     Every run of the same inputs gives the same bits: one fresh world, fixed steps. A soft body
     that bursts ends it: what comes after would be noise. Of several engines the first moves it;
     ``twin.replay.agreement`` asks the others.
-
-    Raises:
-        UsageError: For soft bodies in an engine that has none.
     """
     check_dynamics(hulls.robot)
     rate = config.physics.rate_hz

@@ -38,9 +38,6 @@ def check_length(length_ns: int, plan_id: str) -> None:
 def check_covers(track: JointTrack, what: str, end_ns: int, plan_id: str) -> None:
     """Refuse a track that stops well before the execution ended.
 
-    Args:
-        what: What it holds, as it is said: joints, gripper widths.
-
     Raises:
         UnusablePlanError: Saying how much is missing.
     """

@@ -1,10 +1,9 @@
 """What the recorded cameras would have seen of a replay: the rebuilt scene's Gaussians, moved.
 
 The background stands still, links follow the replayed joints, rigid objects their replayed poses
-and soft ones their nodes. Everything is drawn where cameras see it: the pose bias of a calibration,
-which put objects where the robot finds them, is taken back. An execution is seen from where the
-cameras were meanwhile. A plan is seen by the fixed cameras, and by those in the hand from where its
-own hand would have carried them: the recorded hand lags behind, and would get into their view.
+and soft ones their nodes. An execution is seen from where the cameras were meanwhile. A plan is
+seen by the fixed cameras, and by those in the hand from where its own hand would have carried them:
+the recorded hand lags behind, and would get into their view.
 Cameras that were calibrated are where the calibration has them, the others where ``/tf`` does.
 """
 
@@ -23,7 +22,6 @@ from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
 from bridge.robots.robot import robot_of
 from twin.replay.dynamics import soft_models
-from twin.replay.rebuilt_scene import Correction
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.robot.posture import Posture
@@ -50,7 +48,6 @@ class _Stage:
     """Its objects are those that can move; all others belong to its background."""
     bindings: Mapping[str, Binding]
     """Of soft ones: which nodes carry which Gaussians."""
-    correction: Correction
 
     def at(self, result: ReplayResult, scene: ReplayScene, index: int) -> GaussianCloud:
         """The scene at one of the replay's states."""
@@ -60,10 +57,9 @@ class _Stage:
             T = scene.Ts_base_object[name] if Ts is None else Ts[index]
             nodes = result.nodes_m.get(name)
             if nodes is not None and name in self.bindings:
-                seen = self.correction.nodes_as_seen(nodes[index], T)
-                bent[name] = pose_cloud(item.cloud, self.bindings[name], seen)
+                bent[name] = pose_cloud(item.cloud, self.bindings[name], nodes[index])
             else:
-                places[name] = self.correction.as_seen(T)
+                places[name] = T
         posture = Posture(joints_rad=result.joints_rad[index], width_m=float(result.width_m[index]))
         return self.parts.at(places, posture, scene.urdf, bent)
 
@@ -77,19 +73,14 @@ def render_replay(
     start_ns: int,
     executed: bool,
     planned: bool,
-    correction: Correction,
 ) -> Iterator[tuple[str, CompressedColor]]:
     """Yield camera ids with JPEG images, stamped with source times.
 
     Args:
         start_ns: Source time that is the replay's time 0.
         executed: Whether the plan was executed then, so that there are instants to compare with.
-
-    Raises:
-        PathNotFoundError: When the run was not rebuilt.
-        UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
     """
-    stage = _set_up(run, scene, result, correction)
+    stage = _set_up(run, scene, result)
     rasteriser = open_rasteriser()
     tree, calibration = base_tree(episode), read_calibration(run)
     places = {} if calibration is None else calibration.cameras
@@ -145,13 +136,11 @@ def _calibrated(
     )
 
 
-def _set_up(
-    run: RunFolder, scene: ReplayScene, result: ReplayResult, correction: Correction
-) -> _Stage:
+def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:
     rebuilt = read_scene(run)
     parts = read_movable_scene(run, rebuilt)
     objects = parts.objects
-    places = {name: correction.as_seen(T) for name, T in scene.containers().items()}
+    places = dict(scene.containers())
     # What the task does not know stands where it was scanned; what it knows and nobody found is
     # absent here too.
     places |= {
@@ -169,7 +158,6 @@ def _set_up(
             for name, body in soft.items()
             if name in result.nodes_m and len(movable[name].cloud)
         },
-        correction=correction,
     )
 
 

@@ -60,10 +60,6 @@ class MotionReplay:
         """All take about as long."""
         return 1.0
 
-    def needed_paths(self) -> tuple[Path, ...]:
-        """What a process on another machine must see."""
-        return (self.run_path,)
-
     def path(self, sha256: str) -> Path:
         """Of the derived episode."""
         key = hash_settings({**self.settings(), "source": sha256, "id": self.calibration_id})
@@ -116,11 +112,7 @@ def _fit_of(calibration: Calibration | None) -> Mapping[str, Any]:
 
 
 def run_motion_replay(item: MotionReplay) -> dict[str, Any]:
-    """Replay, write the episode, and return its row.
-
-    Raises:
-        GstError: When the recording or its robot cannot be used.
-    """
+    """Replay, write the episode, and return its row."""
     push = load_push(item.run_path, item.episode_id)
     if push is None:  # the list was made of others
         message = f"{item.episode_id} is not an imported recording with a script."

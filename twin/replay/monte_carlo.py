@@ -198,7 +198,7 @@ def _varied_model(
     soft = model.soft
     if soft is not None:
         soft = replace(soft, young_pa=soft.young_pa * float(np.exp(YOUNG_LOG * z[1])))
-    mass_kg = model.mass_kg * float(np.exp(settings.mass_spread(soft=soft is not None) * z[0]))
+    mass_kg = model.mass_kg * float(np.exp(settings.mass_spread() * z[0]))
     return replace(model, mass_kg=mass_kg, soft=soft)
 
 
@@ -291,9 +291,6 @@ def replay_samples(
     identity: str,
 ) -> tuple[Sample, ...]:
     """Run ``config.samples`` varied replays.
-
-    Args:
-        identity: Of the start; the same one draws the same variations.
 
     Raises:
         UsageError: For a kinematic replay, which moves no objects.

@@ -74,14 +74,7 @@ class ReplayOrigin:
 
 
 def write_replay(path: Path, result: ReplayResult, plan: Plan, origin: ReplayOrigin) -> Path:
-    """Write one replay; the writer replaces a part file that an interrupted run left.
-
-    Args:
-        origin: The recorded episode, and when time 0 of the replay is.
-
-    Raises:
-        UsageError: When the file exists.
-    """
+    """Write one replay; the writer replaces a part file that an interrupted run left."""
     messages = [*_messages(result, plan, origin), *_events(result, plan, origin)]
     with EpisodeWriter(path) as writer:
         writer.describe(origin.info, derived=origin.derived)

@@ -39,11 +39,7 @@ _SPEED_SLACK = 1.02
 def outside_limits(
     robot: RobotModel, joints_rad: Float[np.ndarray, "num_steps num_joints"]
 ) -> Bool[np.ndarray, "num_steps num_joints"]:
-    """Say which joints are beyond their limits by more than rounding.
-
-    Args:
-        joints_rad: Postures, joints from base to hand.
-    """
+    """Say which joints are beyond their limits by more than rounding."""
     return (joints_rad < robot.lower_rad - _LIMIT_SLACK_RAD) | (
         joints_rad > robot.upper_rad + _LIMIT_SLACK_RAD
     )
@@ -67,12 +63,7 @@ def jumps(
     joints_rad: Float[np.ndarray, "num_times num_joints"],
     robot: RobotModel,
 ) -> list[Failure]:
-    """Find the first jump and the first excess of speed between neighbouring postures.
-
-    Args:
-        times_ns: Of the postures, ascending.
-        joints_rad: Postures, joints from base to hand.
-    """
+    """Find the first jump and the first excess of speed between neighbouring postures."""
     if len(times_ns) < 2:
         return []
     steps = np.abs(np.diff(joints_rad, axis=0))
@@ -267,9 +258,6 @@ def path_of_plan(
     Returns:
         The path up to the last pose that could be reached, what failed, and the time of the first
         unreachable pose (None when all were reached).
-
-    Raises:
-        UnusablePlanError: What ``check_usable`` refuses, or another number of joints.
     """
     check_usable(plan, robot)
     knots = _Knots()

@@ -171,11 +171,7 @@ def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tu
 
 
 def read_trials(run: RunFolder, output: Output) -> Trials:
-    """Read every trial of a run that was executed and judged; missing localisations are made.
-
-    Raises:
-        NoTrialsError: When there is none.
-    """
+    """Read every trial of a run that was executed and judged; missing localisations are made."""
     trials, reasons, tasks = [], {}, set[str]()
     paths = run.episodes()
     with output.progress("localise", len(paths)) as advance:
@@ -244,11 +240,7 @@ def _without_posterior(run: RunFolder) -> Calibration | None:
 
 
 def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
-    """Replay a trial's plan as a draw would have it.
-
-    Args:
-        draw: What is not known.
-    """
+    """Replay a trial's plan as a draw would have it."""
     scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
     scene = free_start(scene, soft_models(scene))
@@ -362,9 +354,6 @@ def calibrate_posterior(
 
     Returns:
         The record, and the id of the calibration that holds now.
-
-    Raises:
-        NoTrialsError: When no trial can be used.
     """
     found, tasks = read_trials(run, output), dict[str, Any]()
     for name, trials in found.of_each_task().items():

@@ -50,9 +50,5 @@ class ReplayResult:
 def stretches_ns(
     stamps_ns: Int[np.ndarray, " num_steps"], flags: Bool[np.ndarray, " num_steps"]
 ) -> list[tuple[int, int]]:
-    """First and last stamp of each run of True.
-
-    Args:
-        stamps_ns: Of the steps, ascending.
-    """
+    """First and last stamp of each run of True."""
     return [(int(stamps_ns[first]), int(stamps_ns[end - 1])) for first, end in runs_of_true(flags)]

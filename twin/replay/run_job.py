@@ -34,7 +34,7 @@ from twin.replay.job_row import judged, row_of_failure
 from twin.replay.monte_carlo import replay_samples, with_probability
 from twin.replay.observed import in_order, observed_plan
 from twin.replay.output import ReplayOrigin, write_replay
-from twin.replay.rebuilt_scene import Correction, RebuiltScene, read_rebuilt_scene
+from twin.replay.rebuilt_scene import RebuiltScene, read_rebuilt_scene
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.replay.trace import (
@@ -70,9 +70,6 @@ class _Source:
     """With the stages at the times at which they were executed."""
     events: list[dict[str, Any]]
     scene: ReplayScene
-    correction: Correction
-    """Applied to the scene already, still to be to what was localised afterwards, and to be taken
-    back for pictures."""
 
     @property
     def executed(self) -> bool:
@@ -177,7 +174,6 @@ def _open(job: ReplayJob) -> _Source:
         plan_as_executed=plan_as_executed,
         events=events,
         scene=scene,
-        correction=rebuilt.correction,
     )
 
 
@@ -233,7 +229,7 @@ def _recording(source: _Source) -> Recording:
             arm, widths, source.plan_as_executed, kinematic, robot_of(source.scene.urdf)
         ),
         scene=source.scene,
-        end=source.correction.state(job.end),
+        end=job.end,
         end_seen_ns=job.length_ns() if seen_ns is None else seen_ns - job.start_ns,
     )
 
@@ -266,7 +262,6 @@ def _images(source: _Source, result: ReplayResult) -> tuple[tuple[str, Compresse
             start_ns=source.job.start_ns,
             executed=source.job.end_ns is not None,
             planned=source.job.trajectory == "planned",
-            correction=source.correction,
         )
     )
 

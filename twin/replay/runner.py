@@ -14,7 +14,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
-from bridge.process_pool import Failed, Runner
+from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.task_file import Task
 from bridge.terminal import Output
@@ -45,11 +45,7 @@ class Execution:
 
 
 def execution_of(events: Iterable[Mapping[str, Any]], plan_id: str) -> Execution:
-    """Find the execution of a plan.
-
-    Args:
-        events: All of an episode, in their order.
-    """
+    """Find the execution of a plan."""
     mine = [event for event in events if event.get("plan_id") == plan_id]
     count = sum(event["type"] == "execution_started" for event in mine)
     start, end = execution_ns(mine, plan_id)
@@ -88,10 +84,6 @@ class Preparation:
         """Of the recorded episode."""
         return RunFolder.open(self.run_path).episodes_dir / f"{self.episode_id}.mcap"
 
-    def needed_paths(self) -> tuple[Path, ...]:
-        """What a process on another machine must see."""
-        return (self.run_path, self.episode_path())
-
     def cost(self) -> float:
         """How long it takes, compared with others."""
         return float(self.episode_path().stat().st_size)
@@ -111,9 +103,6 @@ def jobs_of(item: Preparation) -> Prepared:
     """Localise the objects of an episode, where that is not there yet, and list its replays.
 
     One job per plan, and two more for each execution, with a plan or without.
-
-    Raises:
-        GstError: When the episode or its task cannot be read.
     """
     run, path, config = RunFolder.open(item.run_path), item.episode_path(), item.config
     episode = Episode.open(path)
@@ -268,13 +257,19 @@ def _trajectory_of(name: str) -> str:
     return name.rsplit(".", 3)[0]
 
 
+def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
+    """Replay all trial episodes of a run, in this process or in several."""
+    run.refuse_empty()
+    workers = config.workers or default_size()
+    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
+    with runner:
+        return replay_trajectories(run, config, output, runner)
+
+
 def replay_trajectories(
     run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
 ) -> dict[str, Any]:
     """Replay all trial episodes of a run; replays that are there already are kept.
-
-    Args:
-        run: Whose episodes are replayed, and whose ``derived`` folder gets the replays.
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
@@ -295,7 +290,7 @@ def replay_trajectories(
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
-        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
+        run.derived_dir.mkdir(parents=True, exist_ok=True)
     told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
     with output.progress("replay", len(todo)) as advance:
         for done, row in enumerate(_replayed(todo, runner, output), start=1):

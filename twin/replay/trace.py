@@ -82,9 +82,6 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
     Args:
         start_ns: Source time that is time 0.
         end_ns: When the trajectory ended, from time 0.
-
-    Raises:
-        EpisodeError: When it is damaged or no replay.
     """
     episode = Episode.open(path)
     width = streams.joint_track(episode, GRIPPER_STATE)
@@ -115,11 +112,7 @@ def trace_of_file(path: Path, side: str, start_ns: int, end_ns: int) -> Trace:
 def poses_over(
     stamps_ns: Int[np.ndarray, " num_poses"], Ts: Float[np.ndarray, "num_poses 4 4"]
 ) -> PoseTrajectory:
-    """Transforms over time as a trajectory.
-
-    Args:
-        stamps_ns: When, ascending.
-    """
+    """Transforms over time as a trajectory."""
     q, p = se3.split(Ts)
     return PoseTrajectory(stamps_ns, p, q)
 

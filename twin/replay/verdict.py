@@ -183,9 +183,6 @@ def replay_plan(
         plan: What is commanded; its start is checked where the scene knows where the arm is.
         refuse_early: Simulate nothing once a check that needs no physics says no. The commanded
             path itself must then keep clear, too.
-
-    Raises:
-        UnusablePlanError: When the plan has no usable waypoints.
     """
     robot = load_robot(scene.urdf)
     free = posture_clearance(scene, hulls_of(robot), config, up_to_m=0.0)
@@ -213,16 +210,7 @@ def replay_joints(
     *,
     plan: Plan,
 ) -> ReplayResult:
-    """Replay what the joint encoders and the gripper said during an execution.
-
-    Args:
-        track: Recorded arm joints, cut to the execution; its first stamp becomes time 0.
-        widths: Recorded distance between the finger pads over the same stamps.
-        plan: The plan that was executed: its stages and when it wanted the gripper closed.
-
-    Raises:
-        UnusablePlanError: When a track is empty or names other joints.
-    """
+    """Replay what the joint encoders and the gripper said during an execution."""
     path = path_of_execution(track, widths, plan, config, robot_of(scene.urdf))
     return _replay(Commanded(path=path, trajectory="executed"), plan, scene, config)
 

@@ -41,11 +41,7 @@ def convex_hull(points_m: Float[np.ndarray, "num_points 3"]) -> coal.ConvexBase:
 
 
 def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
-    """Read the collision shapes of a description.
-
-    Raises:
-        RobotDescriptionError: When a mesh cannot be read.
-    """
+    """Read the collision shapes of a description."""
     try:
         return pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
@@ -56,12 +52,7 @@ def collision_geometry(robot: RobotModel) -> pin.GeometryModel:
 
 
 def link_hulls(robot: RobotModel) -> list[LinkHull]:
-    """Return one hull for each collision element of the description.
-
-    Raises:
-        RobotDescriptionError: When a mesh cannot be read, or a shape is of an unknown kind or has
-            no volume.
-    """
+    """Return one hull for each collision element of the description."""
     geometry = collision_geometry(robot)
     hulls = []
     for item in geometry.geometryObjects:

@@ -26,9 +26,6 @@ class Hand:
 
         Args:
             joints: The arm's, base to hand.
-
-        Raises:
-            RobotDescriptionError: When it cannot be read, or joints, link or meshes are missing.
         """
         if not urdf.is_file():
             raise RobotDescriptionError(

@@ -429,9 +429,6 @@ class RobotModel:
         Args:
             joints_rad: Of the arm, from base to hand.
             width_m: Distance between the finger pads.
-
-        Raises:
-            RobotDescriptionError: Listing the frames that exist.
         """
         if not self.model.existFrame(link):
             names = ", ".join(frame.name for frame in self.model.frames)

@@ -54,11 +54,7 @@ class Backdrop:
     radius_m: float
 
     def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
-        """The same view, with the shell where nothing was drawn; depth and alpha do not change.
-
-        Args:
-            T_base_camera: Where that was, in the scene's frame.
-        """
+        """The same view, with the shell where nothing was drawn; depth and alpha do not change."""
         weight = (1 - view.alpha) * np.clip((OPAQUE - view.alpha) / FADES, 0.0, 1.0)
         rows, columns = np.nonzero(weight > 0)
         if not len(rows):
@@ -175,11 +171,7 @@ def _cell_directions() -> Float[np.ndarray, "num_cells 3"]:
 
 
 def read_backdrop(run: RunFolder, record: Mapping[str, Any]) -> Backdrop | None:
-    """The shell of a scene; None where ``scene.json`` names none, or its picture is gone.
-
-    Raises:
-        UnreadableSceneError: What ``scene.json`` says of it cannot be understood.
-    """
+    """The shell of a scene; None where ``scene.json`` names none, or its picture is gone."""
     about = record.get("backdrop")
     path = run.scene_dir / BACKDROP
     if not isinstance(about, dict) or not path.is_file():

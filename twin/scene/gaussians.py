@@ -47,11 +47,7 @@ class GaussianCloud:
     drawn like all others."""
 
     def __post_init__(self) -> None:
-        """A cloud made without harmonics has rows of none, and one without marks was measured.
-
-        Raises:
-            TwinError: When the harmonics are not all of those up to some degree.
-        """
+        """A cloud made without harmonics has rows of none, and one without marks was measured."""
         if self.harmonics.shape[1] not in NUM_HARMONICS:
             message = (
                 f"a cloud with {self.harmonics.shape[1]} harmonics per colour: give all up to a "
@@ -219,12 +215,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 
 
 def read_ply(path: Path) -> GaussianCloud:
-    """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        UnreadablePlyError: When it is another kind of file, or cut short.
-    """
+    """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored."""
     if not path.is_file():
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="splat file", hint=hint)

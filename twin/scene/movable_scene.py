@@ -39,11 +39,7 @@ class MovableScene:
     """What stands behind everything; None: black."""
 
     def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
-        """A view of one state, with the backdrop where nothing was drawn.
-
-        Args:
-            T_base_camera: Where that was, in the scene's frame.
-        """
+        """A view of one state, with the backdrop where nothing was drawn."""
         if self.backdrop is None:
             return view
         return self.backdrop.behind(view, camera, T_base_camera)
@@ -105,13 +101,7 @@ class MovableScene:
 
 
 def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
-    """Load the parts that ``scene.json`` lists.
-
-    Raises:
-        PathNotFoundError: A splat file is gone.
-        UnreadablePlyError: One is damaged.
-        UnreadableSceneError: ``scene.json`` or an ``object.json`` cannot be understood.
-    """
+    """Load the parts that ``scene.json`` lists."""
     root = scene.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return MovableScene(

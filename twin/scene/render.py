@@ -51,13 +51,7 @@ class Composed:
 def compose(
     run: RunFolder, scene: Scene, episode: Episode, stamp_ns: int, config: RenderConfig
 ) -> Composed:
-    """Put background, objects and robot together as the settings say.
-
-    Raises:
-        UsageError: An object that the scene does not have, a pose that is none, or joints for a
-            robot that the scene does not have.
-        RobotDescriptionError: The episode does not describe the robot.
-    """
+    """Put background, objects and robot together as the settings say."""
     parts = read_movable_scene(run, scene)
     places = object_places(config.object, list(parts.objects))
     if not parts.links:
@@ -115,9 +109,6 @@ def object_places(
 
     Args:
         texts: One per object; the last word on an object counts.
-
-    Raises:
-        UsageError: Another object, or numbers that are no pose.
     """
     places = {}
     for text in texts:
@@ -200,14 +191,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
-    """Write one image of the scene, and return what was drawn.
-
-    Raises:
-        UsageError: When the episode, the camera or an object is unknown (lists those that exist),
-            joints are given for a robot that the scene does not have, or nothing says where the
-            camera was in the scene at that time.
-        MissingDependencyError: When the backend cuda was asked for and cannot run here.
-    """
+    """Write one image of the scene, and return what was drawn."""
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
     episode = episode_of(run, scene, config.episode)
@@ -263,15 +247,7 @@ def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarr
 
 
 def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
-    """Open a recorded episode of a run by its id.
-
-    Args:
-        scene: Whose first episode is taken where none is wanted.
-        wanted: The id, or nothing.
-
-    Raises:
-        UsageError: There is none; lists those that exist.
-    """
+    """Open a recorded episode of a run by its id."""
     name = wanted or scene.record["sources"][0]["id"]
     episodes: dict[str, Episode] = {}
     for path in run.episodes():
@@ -289,14 +265,7 @@ def episode_of(run: RunFolder, scene: Scene, wanted: str) -> Episode:
 
 
 def camera_of(episode: Episode, wanted: str) -> str:
-    """The camera of an episode that is wanted, or the first.
-
-    Args:
-        wanted: The id, or nothing.
-
-    Raises:
-        UsageError: There is none; lists those that exist.
-    """
+    """The camera of an episode that is wanted, or the first."""
     ids = streams.camera_ids(episode)
     if not ids or (wanted and wanted not in ids):
         found = ", ".join(ids) or "none"
@@ -335,11 +304,7 @@ def _view_of(
 
 
 def chosen_view(config: RenderConfig) -> Float[np.ndarray, "4 4"] | None:
-    """Where ``--eye`` and ``--target`` put a camera; None without them.
-
-    Raises:
-        UsageError: One without the other, or one straight above the other.
-    """
+    """Where ``--eye`` and ``--target`` put a camera; None without them."""
     if config.eye is None and config.target is None:
         return None
     if config.eye is None or config.target is None:
@@ -357,9 +322,6 @@ def sized_camera(camera: Camera, size: str) -> Camera:
 
     Args:
         size: ``WIDTHxHEIGHT``; empty: as recorded.
-
-    Raises:
-        UsageError: When the text is no size.
     """
     if not size:
         return camera
@@ -390,9 +352,6 @@ def poses_in_scene(
 
     Args:
         scene: Its record says in which frame it is, and where it has poses from.
-
-    Raises:
-        UsageError: When nothing says where the camera was in that frame.
     """
     tree = _tree_of(run, scene, episode, camera_id, stamps_ns)
     frame_id = streams.camera_info(episode, camera_id).frame_id

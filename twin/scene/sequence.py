@@ -85,9 +85,6 @@ def open_episode(run: RunFolder, scene: Scene, wanted: str) -> EpisodeInScene:
     """Find an episode by its id, with all that moves in it.
 
     A recorded trial is localised before and after its executions if it was not yet.
-
-    Raises:
-        UsageError: There is no such episode; lists those that exist.
     """
     recorded = episode_of(run, scene, wanted)
     postures, robot = None, f"joints as {recorded.path.stem} has them"
@@ -122,9 +119,6 @@ def frames_of(
     Args:
         scene: In whose frame the camera must be known.
         camera_id: From where; ``eye`` and ``target`` of the settings go before.
-
-    Raises:
-        UsageError: When nothing says where the camera was.
     """
     stamps = _stamps(episode, camera_id)
     T_chosen = chosen_view(config)
@@ -181,13 +175,7 @@ def _rate_hz(stamps_ns: np.ndarray) -> float:
 
 
 def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
-    """Draw a whole episode to a video or to one PNG a frame, and return what was drawn.
-
-    Raises:
-        UsageError: When the episode or the camera is unknown, when nothing says where the camera
-            was, or when what is asked for does not go together.
-        MissingDependencyError: A video without PyAV, or the backend cuda without a GPU.
-    """
+    """Draw a whole episode to a video or to one PNG a frame, and return what was drawn."""
     _check(config)
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)

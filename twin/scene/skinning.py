@@ -46,9 +46,6 @@ def bind(
 
     A weight falls to zero where the ninth node becomes as near, so that it changes smoothly from
     point to point.
-
-    Raises:
-        SkinError: Fewer than ten nodes.
     """
     nodes = np.asarray(nodes_m, dtype=np.float64)
     if len(nodes) <= NUM_NODES + 1:
@@ -78,14 +75,8 @@ def pose_cloud(
     A rigid motion of all nodes moves and turns every Gaussian by it. Rotations are blended as
     quaternions (Kavan et al. 2007 without the dual part), colours turn along.
 
-    Args:
-        cloud: At rest, in the frame the binding was made in.
-
     Returns:
         The Gaussians in the nodes' frame.
-
-    Raises:
-        SkinError: Another number of Gaussians or nodes, or nodes that are no numbers.
     """
     rest, nodes = binding.rest_nodes_m, np.asarray(nodes_m, dtype=np.float64)
     if len(cloud) != binding.weights.shape[0] or nodes.shape != rest.shape:

@@ -39,14 +39,12 @@ def metres_per_unit(index: PosedIndex, config: PosedConfig) -> float:
 def describe_posed(index: PosedIndex, config: PosedConfig) -> dict[str, Any]:
     """What an episode's metadata says about the folder it came from."""
     scale = metres_per_unit(index, config)
-    depths = index.sparse_range
     return {
         "folder": index.name,
         "layout": index.layout,
         "index_sha256": hash_file(index.path),
         "is_metric": config.metres_per_unit is not None,
         "metres_per_unit": scale,
-        "depth_range_m": None if depths is None else [scale * depths[0], scale * depths[1]],
         "times": f"nominal, {config.rate_hz:g} Hz from 0; the folder has none",
         "assumed": index.assumed,
     }

@@ -21,13 +21,12 @@ def publish_standin(
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None,
     output: Output = OUTPUT,
 ) -> int:
-    """Run the stand-in cell: a simulated laboratory that records a scan, trials, then probes.
+    """Run the stand-in cell: a simulated laboratory that records a scan, then trials.
 
     It needs a recorder (robot-gst record RUN) and, with replanning, a gate (robot-gst gate RUN).
     SIGINT or SIGTERM finish the open episode.
     Example: robot-gst publish standin --trials 3 --seed 1
     Scan only: robot-gst publish standin --trials 0
-    Probes of physics only: robot-gst publish standin --trials 0 --no-scan --probes 4
     Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
 
     Args:

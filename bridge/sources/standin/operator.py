@@ -1,6 +1,5 @@
 """The session: an operator who records a scan, then trials, with the planner and the gate."""
 
-import contextlib
 import json
 import re
 from collections.abc import Mapping
@@ -27,9 +26,6 @@ from bridge.geometry import se3
 from bridge.robots.default import MAX_WIDTH_M, ROBOT_NAME
 from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.decisions import Decider
-from bridge.sources.standin.gate_sight import NotSeenError
-from bridge.sources.standin.planner import perceive
-from bridge.sources.standin.probes import PROBES, NoSpaceForProbeError, plan_probe
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.settings import (
     CONDITIONS,
@@ -208,9 +204,6 @@ RESETS_OF_RETRIES = 10
 """Added to the number of the first one's, so that the objects are put back independently."""
 RETRY_SEEDS = 10**13
 """Added to a start's seed, so that what is drawn for a retry is drawn for no trial."""
-PROBE_STREAM = 505
-PROBE_TRIES = 100
-"""The object is put elsewhere until there is space for the probe."""
 LOOK_S = 0.9
 """The arm waits at home before a plan at least this long, so that the start is seen at rest."""
 BETWEEN_S = 8.0
@@ -262,7 +255,6 @@ class Operator:
         self._decider = Decider(cell, session, config, sha256)
         self._open = False
         self.scanned = False
-        self.num_probes = 0
         self.results: list[tuple[EpisodeInfo, Outcome]] = []
         self.retries: list[tuple[EpisodeInfo, Outcome]] = []
 
@@ -420,72 +412,6 @@ class Operator:
         cell.cameras_running = False
         self._end(outcome)
         return outcome
-
-    def probes(self) -> None:
-        """Record every probe of every round, each from a start of its own."""
-        kinds = [kind for _ in range(self._config.probes) for kind in PROBES]
-        first = self._config.first_probe
-        if kinds and first is None:
-            first = self._next_number("probe")
-        with self._output.progress("probes", len(kinds)) as advance:
-            for number, kind in enumerate(kinds, start=first or 1):
-                self._probe(number, kind)
-                self.num_probes += 1
-                advance(self.num_probes, kind)
-
-    def _probe(self, number: int, kind: str) -> None:
-        cell, config = self._cell, self._config
-        poses, plan = self._probe_start(number, kind)
-        cell.reset(poses)
-        info = self._info(
-            f"probe_{number:04d}", kind="probe", start_id=plan.start_id, tags=(f"probe:{kind}",)
-        )
-        self._begin(info)
-        cell.cameras_running = True
-        cell.wait(wait_s(LOOK_S, cell.config.rate_hz))
-        said = f"recorded from seed {config.seed}"
-        try:
-            if self._decider.sees_by_gate:  # the start was chosen by where things were declared
-                plan = self._plan_probe(number, kind, self._decider.look().needed())
-            cell.streams.plan(plan, cell.now_ns)
-            execute_plan(cell, plan)
-        except (NotSeenError, NoSpaceForProbeError) as error:
-            said = f"not carried out: {error}"
-            cell.streams.event("note", cell.now_ns, text=said)
-        cell.cameras_running = False
-        self._end(None)
-        self._output.detail(f"{info.id} {kind}: {said}")
-
-    def _probe_start(
-        self, number: int, kind: str
-    ) -> tuple[dict[str, Float[np.ndarray, "4 4"]], Plan]:
-        """Put the objects where there is space for the probe, and plan it as it is perceived."""
-        cell, config = self._cell, self._config
-        noise = cell.file.noise_for(cell.task.name)
-        for attempt in range(PROBE_TRIES):
-            rng = np.random.default_rng([PROBE_STREAM, config.seed, number, attempt])
-            poses = cell.task.draw_start(rng)
-            seed = config.seed * SEEDS_PER_SESSION + number
-            with contextlib.suppress(NoSpaceForProbeError):
-                seen = perceive(poses, noise, start_seed=seed)
-                return poses, self._plan_probe(number, kind, seen)
-        raise NoSpaceForProbeError(kind)
-
-    def _plan_probe(
-        self, number: int, kind: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
-    ) -> Plan:
-        cell = self._cell
-        return plan_probe(
-            kind,
-            cell.task,
-            seen,
-            kinematics=cell.kinematics,
-            joints_start_rad=cell.home_rad,
-            max_joint_speed_rad_s=cell.file.max_joint_speed_rad_s,
-            plan_id=f"probe_{number:04d}.{kind}",
-            start_id=f"{cell.task.name}/probe/{self._config.seed}/{number}",
-            turn=1 if (number - 1) // len(PROBES) % 2 else -1,
-        )
 
     def _info(self, episode_id: str, *, kind: str, **fields: Any) -> EpisodeInfo:
         task = self._cell.task

@@ -31,7 +31,7 @@ def run_session(
     should_stop: Callable[[], bool] = lambda: False,
     start_ns: int | None = None,
 ) -> dict[str, Any]:
-    """Record a scan, trials and probes as the configuration says.
+    """Record a scan and trials as the configuration says.
 
     Args:
         should_stop: Asked every 8 ms of the cell's time; the open episode is then finished.
@@ -62,7 +62,6 @@ def run_session(
         if config.scan:
             operator.scan()
         operator.trials()
-        operator.probes()
     except StoppedError:
         stopped = True
         operator.abandon(discard=False)
@@ -142,7 +141,6 @@ def _summary(
         "task": task_name,
         "seed": config.seed,
         "scan": operator.scanned,
-        "probes": operator.num_probes,
         "outcomes": {condition: dict(counter) for condition, counter in counts.items()},
         "objects": objects,
         "retries": _retry_counts(operator),
@@ -176,8 +174,6 @@ def describe(summary: dict[str, Any]) -> str:
         listed = ", ".join(f"{count} {result}" for result, count in sorted(counts.items()))
         lines.append(f"  {condition}: {sum(counts.values())} retried after a failure, {listed}")
     lines += [f"  {name} unknown: {why}" for name, why in summary.get("unknown", {}).items()]
-    if summary.get("probes"):
-        lines.append(f"  {summary['probes']} probes")
     if summary["stopped"]:
         lines.append("  stopped before the end")
     return "\n".join(lines)

@@ -43,11 +43,6 @@ class SessionConfig:
     missing: Annotated[bool, RARE] = False
     """Record only the trials of which the recorder has none yet with the same task, start,
     condition and policy: completes a session that was interrupted."""
-    probes: int = 0
-    """Rounds of probe episodes after the trials, for calibrate RUN --physics: each round pushes,
-    slides, squeezes and drops the first object."""
-    first_probe: Annotated[int | None, RARE] = None
-    """Number of the first probe's episode; without it the run's numbering goes on."""
     planner: str = BUILT_IN
     """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan
     (robot-gst plan RUN --live)."""
@@ -101,8 +96,6 @@ class SessionConfig:
             "trials": (0, 8_000),
             "first_start": (0, SEEDS_PER_SESSION - 1),
             "first_trial": (0, 9_999),
-            "probes": (0, 1_000),
-            "first_probe": (1, 9_999),
             "rounds": (1, 1_000),
             "planner_timeout_s": (0.1, most),
             "study_seed": (0, 2**31),

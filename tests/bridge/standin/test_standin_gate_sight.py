@@ -136,26 +136,3 @@ def test_what_the_gate_may_answer_is_read_with_three_values(push: Task) -> None:
     for data in broken:
         assert GateSight.from_json(data, push).found is None, data
     assert GateSight.from_json(answer(False, "x"), push).found is False
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_a_probe_is_planned_from_the_gates_record_too(
-    lab: CellFile, push: Task, make_session: Callable[..., Any]
-) -> None:
-    session = session_with(make_session, answer(False, "cube: behind the arm"))
-    cell = StandinCell(
-        lab,
-        push,
-        draw_hidden(lab, SEED, push),
-        Streams(session, "lab"),
-        config=CellConfig(rate_hz=0.0),
-        seed=SEED,
-        start_ns=0,
-    )
-    settings = SessionConfig(cell="lab", seed=9000, trials=0, scan=False)
-    operator = Operator(cell, session, settings)
-    operator._probe(1, "push")
-    assert session.of("/lab/plan") == []
-    assert [event["text"] for event in session.events()] == [
-        "not carried out: object not found: cube: behind the arm"
-    ]

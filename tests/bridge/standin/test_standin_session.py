@@ -271,7 +271,6 @@ def test_a_second_session_goes_on_with_the_numbering_of_the_run(
     assert session.control[0][1]["id"] == "trial_0008"
     at_work = Operator(make_cell(session), session, settings())
     assert at_work._next_number("scan") == 3
-    assert at_work._next_number("probe") == 1
 
 
 def test_missing_records_only_what_the_recorder_does_not_have(

@@ -162,18 +162,6 @@ def test_a_target_seen_from_the_hand_gives_the_camera(
     assert item["residual_m"]["low"] <= item["residual_m"]["value"] <= item["residual_m"]["high"]
 
 
-def test_a_file_that_is_no_episode_costs_itself_only(
-    run: RunFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    record_targets(run)
-    (run.episodes_dir / "cut_off.mcap").write_bytes(b"no episode")
-    assert calibrate(run, "--cameras") == 0
-    assert "cut_off: " in capsys.readouterr().err
-    found = read_calibration(run)
-    assert found is not None
-    assert set(found.cameras) == {"wrist"}
-
-
 def test_a_detection_that_is_no_number_is_left_out(run: RunFolder) -> None:
     """One would spoil the mean of its stop, and with it everything."""
     path = record_targets(run, count=5, more=[np.array([np.nan, 0.0, 1.0])])
@@ -318,7 +306,7 @@ def test_turning_about_one_axis_is_said_in_one_sentence(
         (("--physics", "--workers", "0"), "--workers 0"),
         (("--cameras", "--pairs", "x.json"), "--pairs needs --camera"),
         (("--cameras", "--camera", "front"), "camera front has neither"),
-        (("--physics", "--evaluations", "0"), "--evaluations 0"),
+        (("--physics", "--evaluations", "9"), "trials teach through --posterior"),
     ],
 )
 def test_wrong_use_is_exit_code_two(

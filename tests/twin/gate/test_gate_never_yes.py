@@ -17,7 +17,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from bridge.task.verdict import Factor, Verdict
+from bridge.task.verdict import Verdict
 from bridge.terminal import Output
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
@@ -159,20 +159,6 @@ def test_what_changes_while_a_plan_is_judged_takes_the_yes_away(
     verdict = judged(perception, found)
     assert verdict.accepted is None
     assert reason in str(verdict.reason)
-
-
-def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
-    no = Factor(value=False, cause="inside", detail="beside the box")
-    verdict = judged(
-        ChangingPerception(running=[None, "plan_0"]),
-        verdict=Verdict(**{**vars(accepted()), "terminal": no}),
-    )
-    assert verdict.accepted is False
-
-
-def test_without_a_newer_picture_nobody_looks_again() -> None:
-    """A cell that stands still while it waits for the verdict costs no second localisation."""
-    assert judged(found=[seen(pose()), seen(pose(9.0))]).accepted is True
 
 
 def test_what_localisation_is_not_sure_of_is_no_motion() -> None:

@@ -16,7 +16,6 @@ from gate_fakes import JUDGED, accept
 from loopback import free_endpoint
 from own_process import ROOT
 
-from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -229,54 +228,6 @@ def test_a_replay_that_hangs_or_raises_is_null_on_the_wire_and_in_the_log(
     assert [Verdict.from_json(sample.data).accepted for sample in published] == [None] * 3
 
 
-def test_plans_that_may_not_wait_are_told_at_once_on_the_wire(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    inside, go_on = threading.Semaphore(0), threading.Event()
-
-    def replay(plan: Plan, *_: Any) -> Verdict:
-        inside.release()
-        go_on.wait()
-        return accept(plan)
-
-    a_gate(router, LiveView("lab"), replay, lambda *_: everything_at(), waiting=0)
-    publish_one_frame(cell)
-    answers: list[Verdict] = []
-    first = threading.Thread(target=lambda: answers.append(ask(cell)))
-    first.start()
-    assert inside.acquire(timeout=5)
-    turned_away = ask(cell)
-    assert answers == [], "the first plan is still being judged"
-    assert turned_away.accepted is None
-    assert "ask later" in str(turned_away.reason)
-    go_on.set()
-    first.join(10)
-    assert [verdict.accepted for verdict in answers] == [True]
-
-
-def test_two_planners_at_once_each_hear_of_their_own_plan(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    a_gate(router, LiveView("lab"), accept, lambda *_: everything_at())
-    publish_one_frame(cell)
-    heard: dict[str, list[str]] = {"left": [], "right": []}
-
-    def planner(name: str) -> None:
-        for number in range(10):
-            verdict = ask(cell, plan_for("arm", f"{name}_{number}"))
-            assert verdict.accepted is True
-            heard[name].append(verdict.plan_id)
-
-    threads = [threading.Thread(target=planner, args=(name,)) for name in heard]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(30)
-    assert heard == {name: [f"{name}_{n}" for n in range(10)] for name in heard}
-
-
 ASKING = """
 import sys, time
 from bridge.wire.config import WireConfig
@@ -323,68 +274,6 @@ def test_a_planner_that_dies_before_the_answer_leaves_the_gate_to_the_next(
     assert [Verdict.from_json(item.data).plan_id for item in published] == ["orphan", "next"]
 
 
-def test_an_object_moved_while_its_plan_is_judged_is_no_yes(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    perception = LiveView("lab")
-    places = iter([0.0, 0.05, 0.05])
-
-    def last_seen() -> int:
-        live = perception.frames(max_age_ns=100 * S, max_per_camera=1)
-        return max((frame.stamp_ns for frame in live.frames), default=0)
-
-    def replay(plan: Plan, *_: Any) -> Verdict:
-        publish_one_frame(cell, 2 * S)  # somebody moved the cube, and the camera saw it
-        ends = time.monotonic() + 5
-        while last_seen() < 2 * S and time.monotonic() < ends:
-            time.sleep(0.01)
-        return accept(plan)
-
-    a_gate(router, perception, replay, lambda *_: everything_at(next(places)))
-    publish_one_frame(cell)
-    verdict = ask(cell)
-    assert verdict.accepted is None
-    assert "moved while the plan was being judged: cube by 50 mm" in str(verdict.reason)
-    # Asked again it is judged from where it lies now; nothing newer is seen after that.
-    assert ask(cell).accepted is True
-
-
-def test_pictures_that_are_old_on_the_cells_clock_are_no_basis(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    perception = LiveView("lab")
-    a_gate(router, perception, accept, lambda *_: everything_at(), frame_wait_s=0.1)
-    publish_one_frame(cell)
-    assert ask(cell).accepted is True
-    later = [
-        FrameTransform(stamp_ns=60 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
-    ]
-    cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=60 * S)
-    states = cell.publisher("/lab/joint_states", schema.JOINT_STATE)
-    states.put(still_at(60 * S), source_ns=60 * S)
-    ends = time.monotonic() + 5
-    while _joints_ns(perception) < 60 * S and time.monotonic() < ends:
-        time.sleep(0.01)
-    expired = ask(cell)
-    assert expired.accepted is None
-    assert "side: silent for 59.0 s" in str(expired.reason)
-
-
-@pytest.mark.parametrize("number", [b"NaN", b"1e999", b"-Infinity"])
-def test_a_plan_with_numbers_that_are_none_is_refused(
-    sessions: tuple[WireSession, WireSession], number: bytes
-) -> None:
-    router, cell = sessions
-    a_gate(router, LiveView("lab"), accept, lambda *_: everything_at())
-    publish_one_frame(cell)
-    payload = plan_for("arm").replace(b"0.4", number)
-    assert payload != plan_for("arm")
-    with pytest.raises(RemoteError, match="plan is invalid"):
-        cell.query("lab/gate/verdict", payload, timeout_s=10.0)
-
-
 def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
     sessions: tuple[WireSession, WireSession],
 ) -> None:
@@ -398,29 +287,6 @@ def test_a_second_gate_in_a_cell_is_refused_until_the_first_is_gone(
     cell.close()
     _until(lambda: not router.query_alive("lab/gate/alive"))
     claim_gate(router, "lab")
-
-
-def _joints_ns(perception: LiveView) -> int:
-    heard = perception.joints()
-    return 0 if heard is None else heard.stamp_ns
-
-
-def test_joint_states_that_are_old_or_of_another_robot_are_no_basis(
-    sessions: tuple[WireSession, WireSession],
-) -> None:
-    router, cell = sessions
-    perception = LiveView("lab")
-    a_gate(router, perception, accept, lambda *_: everything_at())
-    publish_one_frame(cell)
-    assert ask(cell).accepted is True
-    later = [
-        FrameTransform(stamp_ns=3 * S, parent="base_link", child="wrist", T_parent_child=np.eye(4))
-    ]
-    cell.publisher("/tf", schema.TF_MESSAGE).put(transforms_to_cdr(later), source_ns=3 * S)
-    _until(lambda: perception.newest_ns() == 3 * S)
-    silent = ask(cell)
-    assert silent.accepted is None
-    assert "joint states on /lab/joint_states are 2.0 s old" in str(silent.reason)
 
 
 def _until(holds: Callable[[], bool]) -> None:

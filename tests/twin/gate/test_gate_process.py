@@ -60,18 +60,3 @@ def test_a_process_killed_while_it_is_started_is_replaced(
     assert asked(twin, "2 + 2") == 4
     with pytest.raises(WorkerDiedError):
         starts[0].begin(len, b"")
-
-
-def test_a_system_that_gives_no_process_for_a_while_is_asked_again(
-    twin: TwinProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse() -> Worker:
-        raise BlockingIOError(11, "Resource temporarily unavailable")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(twin_process, "Worker", refuse)
-        with pytest.raises(UndecidedError, match="by SIGKILL"):
-            asked(twin, "__import__('os').kill(__import__('os').getpid(), 9)")
-        with pytest.raises(UndecidedError, match=r"no process for the twin .*: .*unavail"):
-            asked(twin, "2 + 2")
-    assert asked(twin, "2 + 2") == 4

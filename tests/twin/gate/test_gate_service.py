@@ -1,7 +1,5 @@
 """The gate as a service of a cell: what it answers, publishes and subscribes, and how it ends."""
 
-import os
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -10,13 +8,11 @@ from typing import Any
 import pytest
 from gate_fakes import PLAN, FakePerception, gate_with
 
-from bridge.episode.run_folder import RunFolder
-from bridge.errors import InvalidRecordError, UsageError
+from bridge.errors import InvalidRecordError
 from bridge.task.verdict import Verdict
-from bridge.terminal import Output, stop_signals
-from bridge.wire.errors import WireConfigError
+from bridge.terminal import Output
 from twin.gate.config import GateConfig
-from twin.gate.service import run_gate, serve_gate, watch_cell
+from twin.gate.service import serve_gate, watch_cell
 
 
 @dataclass
@@ -82,24 +78,3 @@ def test_only_cameras_events_joints_and_transforms_are_subscribed() -> None:
     sample = SimpleNamespace(topic="/tf", data=b"x", received_ns=3, type_name="t")
     session.subscriptions["tf"](sample)
     assert taken == [("/tf", b"x", 3, "t")]
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stop_signals_set_the_event_and_give_the_handlers_back(number: int) -> None:
-    before = signal.getsignal(number)
-    with stop_signals() as stopped:
-        os.kill(os.getpid(), number)
-        assert stopped.wait(2)
-    assert signal.getsignal(number) is before
-
-
-def test_a_cell_name_that_is_no_name_is_refused(tmp_path: Any) -> None:
-    with pytest.raises(UsageError, match="not usable"):
-        run_gate(tmp_path, GateConfig(cell="**"), Output(quiet=True))
-
-
-def test_a_zenoh_configuration_is_used(tmp_path: Any) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    config = GateConfig(zenoh_config=tmp_path / "missing.json5")
-    with pytest.raises(WireConfigError, match=r"missing\.json5 cannot be read"):
-        run_gate(run.path, config, Output(quiet=True))

@@ -1,9 +1,6 @@
 """The gate sees a cell from where its cameras were calibrated, as recordings are judged."""
 
-import threading
-from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,9 +23,6 @@ from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT
-from bridge.terminal import Output
-from twin.gate import service
-from twin.gate.config import GateConfig
 from twin.robot.model import load_robot
 from twin.scene.localise.live import LiveView
 from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
@@ -136,14 +130,6 @@ def test_the_gate_sees_what_the_recording_is_judged_by(
         assert live.depth_m.max() == pytest.approx(0.5 * 1.02)
 
 
-def test_a_calibrated_camera_needs_no_tf(tmp_path: Path) -> None:
-    view = LiveView("standin", calibration_of(tmp_path, "base_link"))
-    calibrate(view)
-    shoot(view, S)
-    (frame,) = look(view).frames
-    np.testing.assert_allclose(frame.T_base_depth, T_LINK_CAMERA, atol=1e-9)
-
-
 def test_a_camera_in_the_hand_is_nowhere_without_joints(tmp_path: Path) -> None:
     """/tf would have a place for it: that it is wrong may be why it was calibrated."""
     view = LiveView("standin", calibration_of(tmp_path, "tool0"))
@@ -209,39 +195,6 @@ def test_it_says_by_what_cameras_are_posed(tmp_path: Path) -> None:
     assert said.startswith("camera side by robot-gst calibrate")
     assert calibration.calibration_id in said
     assert LiveView("standin").cameras_from() == "cameras by /tf"
-
-
-@pytest.mark.parametrize("link", ["tool0", None])
-def test_the_gate_says_at_its_start_where_it_has_its_cameras_from(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    link: str | None,
-) -> None:
-    heard: list[str] = []
-    session = SimpleNamespace(
-        query_alive=lambda _key: [],
-        declare_alive=lambda _key: None,
-        subscribe=lambda key, _take: heard.append(key),
-        now_ns=lambda: 0,
-    )
-    done = threading.Event()
-    done.set()
-    monkeypatch.setattr("bridge.wire.session.open_session", lambda _wire: nullcontext(session))
-    monkeypatch.setattr(service, "stop_signals", lambda: nullcontext(done))
-    monkeypatch.setattr(service, "TwinProcess", lambda *_: nullcontext())
-    monkeypatch.setattr(service, "make_gate", lambda *_: None)
-    monkeypatch.setattr(service, "serve_gate", lambda *_: None)
-    monkeypatch.setattr(service, "serve_localisation", lambda *_: None)
-    if link is None:
-        RunFolder.create(tmp_path / "run")
-    else:
-        calibration_of(tmp_path, link)
-    service.run_gate(tmp_path / "run", GateConfig(), Output())
-    said = " ".join(capsys.readouterr().err.split())
-    assert ("camera side by robot-gst calibrate (" in said) == (link is not None)
-    assert ("gate/verdict, cameras by /tf" in said) == (link is None)
-    assert "standin/joint_states" in heard
 
 
 def test_cameras_of_two_trees_are_not_mixed(tmp_path: Path) -> None:

@@ -71,27 +71,6 @@ def normal_error_rad(world: World) -> float:
     return float(np.average(angles, weights=[point[9] for point in points]))
 
 
-def test_a_sliding_cube_stops_where_coulomb_says_and_stays_there(urdf: str) -> None:
-    friction, speed = 0.4, 0.8
-    config = PhysicsConfig(object_friction=friction, surface_friction=1.0)
-    with World(urdf, {}, config) as world:
-        world.add_table(0.0)
-        world.add_free("slab", np.array([0.06, 0.06, 0.01]), 0.05, se3.transform_from(
-            np.array([1.0, 0, 0, 0]), np.array([0.6, 0.0, 0.005])))  # fmt: skip
-        for _ in range(60):
-            world.step()
-        start = world.T_base_object("slab")[0, 3]
-        body = world.free_ids["slab"]
-        pybullet.resetBaseVelocity(body, [speed, 0, 0], physicsClientId=world.client)
-        path = []
-        for _ in range(240):
-            world.step()
-            path.append(world.T_base_object("slab")[0, 3] - start)
-    assert path[-1] == pytest.approx(speed**2 / (2 * friction * G), rel=0.05)
-    # An anchor's own spring, at the last speed that it saw: 0.10 mm.
-    assert max(path) - path[-1] < 2e-4, "an anchor that was dragged along pulls it back"
-
-
 @pytest.mark.parametrize("turn_rad", [0.0, 1.2])
 def test_fingers_hold_what_friction_carries_and_lose_what_it_does_not(
     urdf: str, turn_rad: float

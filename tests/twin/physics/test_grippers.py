@@ -50,23 +50,6 @@ def test_the_fingers_go_to_the_width_that_they_are_told(name: str) -> None:
                 np.testing.assert_allclose(here[:3, 3], expected[:3, 3], atol=2e-3)
 
 
-def pad_gap_m(world: World, robot: Robot) -> float:
-    """Distance between the two fingers' origins along the closing direction."""
-    left, right = (world.robot.T_base_link(link)[:3, 3] for link in robot.gripper.finger_links)
-    return float(np.linalg.norm(left - right))
-
-
-def test_a_finger_that_mimics_moves_as_far_as_the_one_it_mimics() -> None:
-    world, model = opened(PANDA)
-    with world:
-        widths = (0.08, 0.03)
-        gaps = []
-        for width in widths:
-            commanded(world, model, width)
-            gaps.append(pad_gap_m(world, PANDA))
-        assert gaps[0] - gaps[1] == pytest.approx(widths[0] - widths[1], abs=1e-3)
-
-
 def squeezed_N(robot: Robot, thickness_m: float = 0.03) -> float:
     """What the fingers press with on a fixed block between them, mean of both."""
     world, model = opened(robot)

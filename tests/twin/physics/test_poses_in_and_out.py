@@ -10,22 +10,12 @@ from twin.physics.engine import pybullet
 from twin.physics.world import World
 from twin.robot.model import with_absolute_meshes
 
-HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
 
 
 @pytest.fixture(scope="module")
 def urdf() -> str:
     return with_absolute_meshes(ROBOT.urdf_text())
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_an_object_lies_where_and_as_it_was_put(urdf: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    T = se3.transform_from(rng.normal(size=4), np.array([0.5, 0.1, 0.8]))
-    with World(urdf, {}, PhysicsConfig()) as world:
-        world.add_free("a", np.array([0.02, 0.04, 0.06]), 0.05, T)
-        np.testing.assert_allclose(world.T_base_object("a"), T, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

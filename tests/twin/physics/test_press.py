@@ -68,12 +68,6 @@ def test_the_whole_force_is_there_after_a_few_iterations(
         assert np.abs(holding(world)[-20:, :, 1]).max() < 20.0, "at the usual speed it is not"
 
 
-def test_fingers_that_hold_something_stand_still(urdf: str) -> None:
-    with World(urdf, {}, STRONG) as world:
-        assert np.abs(holding(world)[-20:, :, 0]).max() < 1e-3
-        assert world.robot.width_m() == pytest.approx(0.04, abs=3e-4)
-
-
 def test_fingers_keep_their_speed_until_they_meet_something(urdf: str) -> None:
     with World(urdf, {}, STRONG) as world:
         world.reset_robot(HOME, OPEN_M)
@@ -96,11 +90,3 @@ def test_fingers_whose_cube_is_gone_are_slow_again_after_a_few_steps(urdf: str) 
         usual_m = 2 * FINGER_SPEED_M_S * 12 / STRONG.rate_hz
         farthest_m = 2 * arm.EVERY_STEPS * arm.PRESS_M_S / STRONG.rate_hz
         assert world.robot.width_m() > width_m - usual_m - farthest_m - 1e-3
-
-
-def test_fingers_that_open_are_as_fast_as_ever(urdf: str) -> None:
-    with World(urdf, {}, STRONG) as world:
-        holding(world)
-        speeds = np.abs(run(world, 30, OPEN_M)[:, :, 0])
-        assert speeds.max() < 1.05 * FINGER_SPEED_M_S
-        assert world.robot.width_m() > 0.05

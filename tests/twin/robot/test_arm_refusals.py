@@ -12,7 +12,7 @@ from bridge.data_files import datasets_folder
 from bridge.errors import GstError, UsageError
 from bridge.robots.robot import Robot, read_robot
 from twin.robot.check import check_robot
-from twin.robot.collision import RobotHulls, link_hulls
+from twin.robot.collision import link_hulls
 from twin.robot.model import RobotDescriptionError, RobotModel, check_dynamics
 
 ROBOTS = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
@@ -72,17 +72,6 @@ def test_a_branch_that_moves_is_refused_unless_it_is_held(kind: str, found: str)
         model(PANDA, urdf)
 
 
-def test_a_held_branch_stands_still(tmp_path: Path) -> None:
-    (tmp_path / "more.urdf").write_text(
-        '<robot name="more">' + WHEEL.format(name="spin", kind="revolute", parent="panda_link3")
-    )
-    robot = replace(PANDA, name="mine", attached=("more.urdf",), folder=tmp_path)
-    with pytest.raises(RobotDescriptionError, match="spin"):
-        model(robot)
-    held = model(replace(robot, held=("spin",)))
-    assert "spin" not in list(held.model.names)
-
-
 @pytest.mark.parametrize(
     ("pattern", "changed", "found"),
     [
@@ -114,17 +103,6 @@ def test_limits_of_the_record_go_before_those_of_the_urdf() -> None:
     np.testing.assert_allclose(limited.upper_rad, 2.0)
     np.testing.assert_allclose(limited.velocity_limit_rad_s, speeds)
     np.testing.assert_allclose(limited.home_rad, (limited.lower_rad + limited.upper_rad) / 2)
-
-
-def test_links_said_to_overlap_are_not_watched() -> None:
-    pair = ("panda_link5", "panda_link7")
-
-    def watched(robot: Robot) -> set[frozenset[str]]:
-        hulls = RobotHulls(model(robot))
-        return {frozenset((hulls.hulls[a].link, hulls.hulls[b].link)) for a, b in hulls.pairs}
-
-    assert frozenset(pair) in watched(PANDA)
-    assert frozenset(pair) not in watched(replace(PANDA, name="mine", may_overlap=(pair,)))
 
 
 def test_a_sphere_lies_inside_its_hull() -> None:

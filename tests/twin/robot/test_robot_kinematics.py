@@ -9,7 +9,7 @@ from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.inverse import pose_error, solve_ik
-from twin.robot.model import RobotDescriptionError, RobotModel, load_robot, with_absolute_meshes
+from twin.robot.model import RobotDescriptionError, RobotModel, load_robot
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
@@ -90,26 +90,10 @@ def test_the_tolerance_decides_what_counts_as_reached(robot: RobotModel) -> None
         assert (position <= IkConfig().position_tolerance_m) is within
 
 
-def test_the_same_pose_gives_the_same_joints_on_every_call(robot: RobotModel) -> None:
-    T = robot.T_base_tcp(np.array([1.0, -2.0, 1.0, 0.4, 1.2, -0.4]))
-    first = solve_ik(robot, T, IkConfig()).joints_rad
-    assert np.array_equal(first, solve_ik(robot, T, IkConfig()).joints_rad)
-
-
 def test_a_description_without_an_arm_joint_is_refused_with_the_joints_there_are() -> None:
     urdf = ROBOT.urdf_text().replace("wrist_3_joint", "last_joint")
     with pytest.raises(RobotDescriptionError, match=r"wrist_3_joint.*last_joint"):
         RobotModel(urdf)
-
-
-def test_a_description_that_is_not_xml_is_refused() -> None:
-    with pytest.raises(RobotDescriptionError, match="not XML"):
-        with_absolute_meshes("<robot")
-
-
-def test_an_sdf_world_is_refused() -> None:
-    with pytest.raises(RobotDescriptionError, match="<sdf>"):
-        with_absolute_meshes("<sdf/>")
 
 
 def test_an_unknown_frame_lists_the_frames_there_are(robot: RobotModel) -> None:

@@ -1,8 +1,6 @@
 """The closed form: all branches reach, singular poses have none, other arms are refused."""
 
 import re
-import sysconfig
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from twin.robot.inverse import UrInverse
 from twin.robot.model import RobotModel, load_robot
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
-ROBOTS = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share/example-robot-data/robots"
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +22,6 @@ def inverse(robot: RobotModel) -> UrInverse:
     found = UrInverse.for_robot(robot)
     assert found is not None
     return found
-
-
-def other_ur(size: str) -> RobotModel:
-    """A UR of another size, with a tool frame that is turned and shifted."""
-    text = (ROBOTS / "ur_description" / "urdf" / f"ur{size}_robot.urdf").read_text()
-    tool = (
-        '<link name="tcp"/><joint name="tcp_joint" type="fixed"><parent link="tool0"/>'
-        '<child link="tcp"/><origin xyz="0.03 -0.02 0.11" rpy="0.3 -0.4 0.9"/></joint></robot>'
-    )
-    return RobotModel(text.replace("</robot>", tool))
 
 
 def errors(robot: RobotModel, joints: np.ndarray, T: np.ndarray) -> tuple[float, float]:
@@ -71,29 +58,6 @@ def test_the_posture_that_made_a_pose_is_among_its_answers(
     assert nearest.max() < 1e-6
 
 
-def test_the_branches_of_a_pose_are_eight_different_postures(
-    robot: RobotModel, inverse: UrInverse
-) -> None:
-    joints, valid, _ = inverse.solve(robot.T_base_tcp(HOME)[None])
-    assert valid.all()
-    for first in range(8):
-        for second in range(first):
-            assert np.abs(joints[0, first] - joints[0, second]).max() > 0.05
-
-
-@pytest.mark.parametrize("size", ["3", "10"])
-def test_other_sizes_and_other_tools_are_solved_too(size: str) -> None:
-    robot = other_ur(size)
-    inverse = UrInverse.for_robot(robot)
-    assert inverse is not None
-    Ts = robot.Ts_base_tcp(np.random.default_rng(13).uniform(-3.0, 3.0, (40, 6)))
-    joints, valid, _ = inverse.solve(Ts)
-    assert valid.any(axis=1).all()
-    for index, branch in np.argwhere(valid):
-        offset, turned = errors(robot, joints[index, branch], Ts[index])
-        assert max(offset, turned) < 1e-8
-
-
 def test_lengths_are_those_of_the_data_sheet(inverse: UrInverse) -> None:
     g = inverse.geometry
     assert (g.a2_m, g.a3_m) == pytest.approx((0.425, 0.39225))
@@ -118,33 +82,12 @@ def test_an_arm_whose_axes_do_not_meet_is_refused(joint: str, origin: str) -> No
         assert found is None
 
 
-def test_an_arm_with_a_tilted_axis_is_refused() -> None:
-    urdf = ROBOT.urdf_text()
-    tilted = re.sub(
-        r'(<joint name="elbow_joint".*?rpy=")[^"]*(")',
-        r"\g<1>0.02 0.0 0.0\g<2>",
-        urdf,
-        flags=re.DOTALL,
-    )
-    assert tilted != urdf
-    assert UrInverse.for_robot(RobotModel(tilted)) is None
-
-
 def test_a_pose_out_of_reach_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
     T = robot.T_base_tcp(HOME)
     T[:3, 3] = (2.0, 0.0, 0.3)
     joints, valid, _ = inverse.solve(T[None])
     assert not valid.any()
     assert np.all(joints == 0.0)
-
-
-def test_a_pose_that_is_not_a_number_has_no_answer(robot: RobotModel, inverse: UrInverse) -> None:
-    Ts = np.stack([robot.T_base_tcp(HOME)] * 2)
-    Ts[0, 1, 3] = np.nan
-    joints, valid, _ = inverse.solve(Ts)
-    assert not valid[0].any()
-    assert valid[1].all()
-    assert np.isfinite(joints).all()
 
 
 def test_a_straight_wrist_is_not_valid_and_nearly_straight_is(
@@ -160,18 +103,6 @@ def test_a_straight_wrist_is_not_valid_and_nearly_straight_is(
         assert any(valid[0, b] for b in own_side) is determined
         for branch in np.flatnonzero(valid[0]):
             assert max(errors(robot, joints[0, branch], T)) < 1e-9
-
-
-def test_a_stretched_arm_is_reached_from_both_elbows_at_once(
-    robot: RobotModel, inverse: UrInverse
-) -> None:
-    posture = HOME.copy()
-    posture[2] = 0.0
-    T = robot.T_base_tcp(posture)
-    joints, valid, _ = inverse.solve(T[None])
-    assert valid.any()
-    for branch in np.flatnonzero(valid[0]):
-        assert max(errors(robot, joints[0, branch], T)) < 1e-9
 
 
 def test_a_wrist_inside_the_shoulder_cylinder_has_no_answer(
@@ -203,9 +134,3 @@ def test_joints_are_within_limits_and_whole_turns_are_used_to_stay_there(robot: 
     assert valid.any(axis=1).all()
     assert np.all(joints[valid] >= narrow.lower_rad - 1e-6)
     assert np.all(joints[valid] <= narrow.upper_rad + 1e-6)
-
-
-def test_no_poses_give_no_joints(inverse: UrInverse) -> None:
-    joints, valid, _ = inverse.solve(np.zeros((0, 4, 4)))
-    assert joints.shape == (0, 8, 6)
-    assert valid.shape == (0, 8)

@@ -21,14 +21,20 @@ from bridge.errors import GstError
 from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
-from twin.calibrate.physics.cases import UnusableCaseError
-from twin.calibrate.physics.parameters import FINGER_FRICTION, SURFACE_FRICTION
-from twin.calibrate.physics.pushes import Push, motion_of, read_push, replay_push
+from twin.calibrate.physics.pushes import (
+    Push,
+    UnusablePushError,
+    motion_of,
+    read_push,
+    replay_push,
+)
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.robot.hand import Hand
 from twin.scene.store.calibration import write_physics
 
+FINGER_FRICTION = "finger_pair_friction"
+SURFACE_FRICTION = "surface_pair_friction"
 METHOD = "pushes"
 """Marks the physics part of a calibration that was made here."""
 FINGERS_RAD = np.linspace(0.0, 0.25, 6)
@@ -49,11 +55,7 @@ def _hand(urdf: Path, joints: tuple[str, ...], hand_link: str) -> Hand:
 
 @lru_cache(maxsize=32)
 def load_push(run_path: Path, episode_id: str) -> Push | None:
-    """Read an imported recording once per process; None for any other episode.
-
-    Raises:
-        GstError: When it, its record or its robot cannot be used.
-    """
+    """Read an imported recording once per process; None for any other episode."""
     run = RunFolder.open(run_path)
     episode = Episode.open(run.episodes_dir / f"{episode_id}.mcap")
     motion = motion_of(episode)
@@ -61,17 +63,6 @@ def load_push(run_path: Path, episode_id: str) -> Push | None:
         return None
     hand = _hand(run.path / motion.robot, motion.joints, motion.hand_link)
     return read_push(run, episode, motion, hand)
-
-
-def has_motions(run: RunFolder) -> bool:
-    """Whether a run holds imported recordings that can be replayed without a plan."""
-    for path in run.episodes():
-        try:
-            if motion_of(Episode.open(path)) is not None:
-                return True
-        except GstError:
-            continue
-    return False
 
 
 def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConfig:
@@ -91,7 +82,7 @@ def end_point_error_m(
     result = replay_push(push, "executed", config, finger_rad)
     if result.Ts_world_box is None or push.box_track is None:
         message = f"{push.episode} has no box."
-        raise UnusableCaseError(message)
+        raise UnusablePushError(message)
     end_m = result.Ts_world_box[-1, :3, 3]
     return float(np.linalg.norm(end_m - push.box_track.p_m[-1])), end_m
 
@@ -112,15 +103,11 @@ class GridRow:
 
 
 def errors_of(item: GridRow) -> list[float]:
-    """End point errors [m], one for each friction of the hand.
-
-    Raises:
-        UnusableCaseError: When the recording has no box.
-    """
+    """End point errors [m], one for each friction of the hand."""
     push = load_push(item.run_path, item.episode)
     if push is None:
         message = f"{item.episode} is not an imported push."
-        raise UnusableCaseError(message)
+        raise UnusablePushError(message)
     nominal = PhysicsConfig()
     return [
         end_point_error_m(push, frictions(item.surface, hand, nominal), item.finger_rad)[0]
@@ -168,13 +155,13 @@ def calibrate_pushes(
         The physics record, and the id of the calibration that holds now.
 
     Raises:
-        UnusableCaseError: When there are too few pushes, or one cannot be simulated.
+        UnusablePushError: When there are too few pushes, or one cannot be simulated.
     """
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))
     if len(fitted) < FEWEST or not held_out:
         message = f"{len(pushes)} pushes in {run.path}; at least {2 * FEWEST} are needed."
-        raise UnusableCaseError(message)
+        raise UnusablePushError(message)
     output.say(f"{len(pushes)} pushes: {len(fitted)} identify, {len(held_out)} are held out")
     workers = config.workers or default_size()
     runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
@@ -218,7 +205,7 @@ def _pushes(run: RunFolder) -> tuple[dict[str, Push], dict[str, str]]:
         message = (
             f"pushes of several tasks in {run.path}: {', '.join(tasks)}; calibrate them apart."
         )
-        raise UnusableCaseError(message)
+        raise UnusablePushError(message)
     return found, skipped
 
 
@@ -239,7 +226,7 @@ def _simulate(run: RunFolder, fitted: Sequence[str], runner: Runner, output: Out
     with output.progress("physics", len(items)) as advance:
         for done, (item, answer) in enumerate(runner.run(errors_of, items, GridRow.cost), start=1):
             if isinstance(answer, Failed):
-                raise UnusableCaseError(answer.message)
+                raise UnusablePushError(answer.message)
             errors[item] = answer
             advance(done, item.episode)
     shape = (len(fitted), len(FINGERS_RAD), len(SURFACE), len(HAND))

@@ -80,11 +80,7 @@ class PushResult:
 
 
 def motion_of(episode: Episode) -> ScriptedMotion | None:
-    """Read what an imported recording's arm was told; None for any other episode.
-
-    Raises:
-        InvalidRecordError: When the record is damaged.
-    """
+    """Read what an imported recording's arm was told; None for any other episode."""
     if episode.info.kind != "imported":
         return None
     record = record_of(episode.files[0], RECORD_NAME)
@@ -139,11 +135,7 @@ def _with_box(push: Push, episode: Episode, box: str) -> Push:
 
 
 def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:
-    """Median position and mean rotation while everything is at rest at the start.
-
-    Raises:
-        UnusablePushError: When nothing was recorded then.
-    """
+    """Median position and mean rotation while everything is at rest at the start."""
     t_s = (track.stamps_ns - track.stamps_ns[0]) / NS_PER_S
     there = (t_s >= REST_S[0]) & (t_s <= REST_S[1])
     if not there.any():

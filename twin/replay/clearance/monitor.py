@@ -455,11 +455,7 @@ class ClearanceMonitor:
 
 
 def active_stage(stages: tuple[Stage, ...], t_ns: int) -> Stage | None:
-    """The last stage that has begun; before the first one begins, the first.
-
-    Args:
-        stages: Of a plan, in the order in which they begin.
-    """
+    """The last stage that has begun; before the first one begins, the first."""
     begun = [stage for stage in stages if stage.t_start_ns <= t_ns]
     if begun:
         return begun[-1]
@@ -471,9 +467,6 @@ def allowed_pairs(stages: tuple[Stage, ...], t_ns: int) -> Allowed:
 
     Where a stage released an object, or pushed it and left, it may go on lying on what that stage
     allowed it to touch; the gripper's own leave ends with the stage.
-
-    Args:
-        stages: Of a plan, in the order in which they begin.
     """
     active = active_stage(stages, t_ns)
     if active is None:

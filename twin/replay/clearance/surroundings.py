@@ -155,9 +155,6 @@ class Surroundings:
         """Return the smallest distance of placed links to what stands still [m].
 
         The same as the smallest of ``measure``, without the other distances.
-
-        Args:
-            left_out: Links that are not asked about.
         """
         pairing = self._pairing((), ())
         links, near = self._hulls, pairing.near

@@ -63,12 +63,7 @@ class Confidence:
 def depth_errors(
     views: Sequence[RobotView], surfaces: Sequence[PosedSurface], pose: ScenePose
 ) -> DepthErrors:
-    """Compare every third pixel of each view with the depth at which it should see the robot.
-
-    Args:
-        views: Depth images and where their cameras are in the source frame.
-        pose: Where the source frame lies in the robot's base, and the depth scale.
-    """
+    """Compare every third pixel of each view with the depth at which it should see the robot."""
     errors = [np.zeros(0)]
     for view, surface in zip(views, surfaces, strict=True):
         rays = view.camera.rays()[::STRIDE_PX, ::STRIDE_PX]
@@ -140,9 +135,6 @@ def search(
 
     The base frame's z = 0 is taken to lie in the plane; refinement corrects that by some
     centimetres.
-
-    Args:
-        views: Depth images with the robot at rest; at most ``MAX_VIEWS`` of them are used.
     """
     used = list(views[:: max(1, -(-len(views) // MAX_VIEWS))])
     samples = [sample_surface(robot, v.posture, NUM_SAMPLES, seed=i) for i, v in enumerate(used)]
@@ -357,10 +349,6 @@ def align_robot(
 
     Args:
         start: A pose known to some centimetres; nothing else is then searched.
-
-    Raises:
-        RobotNotAlignedError: Nothing fits, or several places fit alike.
-        RobotDescriptionError: The description has no usable shapes.
     """
     if not views:
         raise RobotNotAlignedError(

@@ -131,9 +131,6 @@ def find_planes(views: Sequence[RobotView], *, seed: int = 0) -> list[LevelPlane
 
     Gravity is not known: a wall that faces the camera is told from a table by the camera's upper
     edge, which points up, and what is left over is told by where the robot fits.
-
-    Args:
-        views: Depth images and where their cameras are in the source frame.
     """
     clouds = thin(views, NUM_POINTS)
     p = np.concatenate(

@@ -293,11 +293,6 @@ def check_geometry(
 ) -> tuple[ScanReport, list[FrameChoice]]:
     """Look for a wrong number in each moving camera; refuse, remark, or correct it.
 
-    Args:
-        cameras: What the training frames of each showed.
-        report: Of what was checked before; cameras whose poses are read wrongly are left alone.
-        config: Whether wrong geometry is refused, or corrected.
-
     Returns:
         The report with what was found, and the choices, corrected where that was asked for.
 

@@ -279,12 +279,7 @@ class EgoMask:
         return float(self.half.mean())
 
     def drop_from(self, points: PointSet, view: TrainingView) -> PointSet:
-        """Return a frame's points without those that lie in these pixels.
-
-        Args:
-            points: The surface that the frame measured, root frame.
-            view: The same frame; says where its camera was.
-        """
+        """Return a frame's points without those that lie in these pixels."""
         camera = view.half.camera
         p_camera = se3.apply(se3.invert(view.T_base_color), points.p_m.astype(np.float64))
         uv, _ = camera.project(np.where(p_camera[:, 2:] > 0, p_camera, 1.0))

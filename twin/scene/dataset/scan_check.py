@@ -387,10 +387,6 @@ class ScanReport:
 def check_scan(cameras: Sequence[CameraCheck], config: FrameConfig) -> ScanReport:
     """Look for what makes a scan useless, or worth less than it seems.
 
-    Args:
-        cameras: What the training frames of each showed.
-        config: Depth limits, and whether wrong poses are refused.
-
     Raises:
         NoDepthError: When no camera has depth images that can be used.
         PoseConventionError: When a camera's poses fit only if read in another convention.
@@ -457,11 +453,7 @@ def _pose_reports(usable: Sequence[CameraCheck]) -> dict[str, PoseReport]:
 
 
 def _moved_cameras(usable: Sequence[CameraCheck], *, refuse: bool) -> list[str]:
-    """Say which cameras moved although their poses do not.
-
-    Raises:
-        MovedCameraError: When one did beyond doubt, and that is to be refused.
-    """
+    """Say which cameras moved although their poses do not."""
     found = []
     for camera in usable:
         agreement = stationary_agreement(camera.images) if camera.choice.stationary else None
@@ -490,8 +482,7 @@ def _no_depth(camera: CameraCheck, config: FrameConfig) -> str:
     if len(values) == 0:
         return (
             f"{camera.name} measured no depth at all, every pixel is 0 or not a number: check the "
-            "unit of depth and that the camera sends it; what was taken without depth is rebuilt "
-            "after robot-gst import images"
+            "unit of depth and that the camera sends it"
         )
     median = float(np.median(values))
     if median > config.max_depth_m:

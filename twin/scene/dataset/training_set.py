@@ -65,17 +65,7 @@ class _Read:
 def read_training_set(
     choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
 ) -> TrainingSet:
-    """Read every training frame, check the scan, and set aside what moved.
-
-    Args:
-        choices: Which frames of which cameras to read.
-
-    Raises:
-        NoFramesError: When no frame has colour, depth and a pose together.
-        NoDepthError: When no depth image holds anything usable.
-        PoseConventionError: When the poses fit only if read in another convention.
-        WrongGeometryError: When one number of a camera's geometry is clearly off.
-    """
+    """Read every training frame, check the scan, and set aside what moved."""
     robot = find_robot(choices, output)
     read = _read(choices, config, robot, output)
     if not read.views:

@@ -17,7 +17,6 @@ from scipy import ndimage
 
 from bridge.geometry import se3
 from twin.scene.fit.initialise import flat_gaussians
-from twin.scene.frames.plane_sweep import without_specks
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud, concatenate
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
@@ -69,11 +68,7 @@ def complete_holes(
     config: InitialiseConfig,
     raster: RasterConfig | None = None,
 ) -> GaussianCloud:
-    """Gaussians that close the holes of the training views, marked; none without holes.
-
-    Args:
-        config: ``completion`` and ``max_splats`` say how many there may be.
-    """
+    """Gaussians that close the holes of the training views, marked; none without holes."""
     added = cloud.take(np.zeros(0, dtype=np.int64))
     most = round(config.completion * config.max_splats)
     rasteriser = Rasteriser(raster or RasterConfig())
@@ -101,6 +96,16 @@ def _hole(view: TrainingView, cloud: GaussianCloud, rasteriser: Rasteriser) -> _
         beside = drawn.depth_m[rows, columns]
     mask = without_specks(empty, LEAST_PX) & (beside > 0)
     return _Hole(view=view, mask=mask, beside_m=beside)
+
+
+def without_specks(
+    mask: Bool[np.ndarray, "height width"], least_px: int
+) -> Bool[np.ndarray, "height width"]:
+    """The patches of a mask that have at least so many pixels."""
+    labels, number = ndimage.label(mask)
+    sizes = np.bincount(labels.ravel(), minlength=number + 1)
+    sizes[0] = 0
+    return np.asarray((sizes >= least_px)[labels])
 
 
 def _closed(

@@ -94,12 +94,7 @@ def score(
 
 
 def densify(cloud: GaussianCloud, scores: Scores, *, max_splats: int, most: int) -> Densified:
-    """Drop what shows nothing or hides everything, and split where the error is large.
-
-    Args:
-        max_splats: Never more Gaussians than this.
-        most: Never more splits than this at once.
-    """
+    """Drop what shows nothing or hides everything, and split where the error is large."""
     kept = _kept_mask(cloud, scores)
     free = max(min(max_splats - int(kept.sum()), most), 0)
     wanting = np.flatnonzero(kept & (scores.size_px > FINEST_PX) & (scores.error > 0))

@@ -52,9 +52,6 @@ def fuse(
         points: What each frame measured, all in one frame.
         config: Voxel size, budget and the shape of new Gaussians.
         views: Whose depth says where the surface is on average; none: voxels stay where they are.
-
-    Raises:
-        NoSurfaceError: When no voxel has two points.
     """
     p = np.concatenate([item.p_m for item in points])
     if len(p) < MIN_POINTS:

@@ -210,11 +210,7 @@ class Events:
         return sorted(events, key=lambda event: event.at)
 
     def keep(self, state: FitState, at: Progress) -> None:
-        """Do what is due; what is already behind is not done again.
-
-        Args:
-            state: The fit so far; what is done changes it.
-        """
+        """Do what is due; what is already behind is not done again."""
         coarse = at.fraction < self._config.coarse_fraction
         while (
             state.events_done < len(self._schedule)
@@ -280,11 +276,7 @@ def keep_colors_in_range(cloud: GaussianCloud) -> None:
 
 
 def order_of_views(seed: int, epoch: int, num_views: int) -> np.ndarray:
-    """The order in which one pass shows the views; the same whenever it is asked for.
-
-    Args:
-        epoch: Number of the pass, from 0.
-    """
+    """The order in which one pass shows the views; the same whenever it is asked for."""
     return np.random.default_rng([seed, epoch]).permutation(num_views)
 
 

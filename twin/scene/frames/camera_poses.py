@@ -32,11 +32,7 @@ def same_pose(
     distance_m: float,
     angle_rad: float,
 ) -> bool:
-    """Say whether two poses lie nearer to each other than both limits.
-
-    Args:
-        T_base_b: The other, in the same frame.
-    """
+    """Say whether two poses lie nearer to each other than both limits."""
     near = np.linalg.norm(T_base_a[:3, 3] - T_base_b[:3, 3]) < distance_m
     return bool(near and se3.rotation_angle_rad(T_base_a[:3, :3].T @ T_base_b[:3, :3]) < angle_rad)
 
@@ -248,12 +244,7 @@ def find_poses(
 
 
 def check_connected(tree: TransformTree, episode: Episode, camera_id: str) -> None:
-    """See that colour and depth are posed in one frame.
-
-    Raises:
-        FrameNotFoundError: When the tree does not know the colour frame.
-        UnusableCameraError: When nothing says how the depth frame lies to it.
-    """
+    """See that colour and depth are posed in one frame."""
     color, depth = _frame_ids(episode, camera_id)
     root = tree.root_of(color)
     if depth not in tree.frames() or tree.root_of(depth) != root:
@@ -271,15 +262,7 @@ def calibrated_poses(
     mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_frames"],
 ) -> CameraPoses:
-    """Pose a camera's images as ``robot-gst calibrate`` says it is mounted.
-
-    Args:
-        episode: Gives joints for a camera in the hand, and how colour and depth lie to each other.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
-    """
+    """Pose a camera's images as ``robot-gst calibrate`` says it is mounted."""
     return CameraPoses(
         tree=calibrated_tree(episode, camera_id, mount, stamps_ns),
         source="hand-eye",
@@ -294,15 +277,7 @@ def calibrated_tree_at(
     mount: MountedCamera,
     stamps_ns: Int[np.ndarray, " num_stamps"],
 ) -> TransformTree:
-    """Pose a calibrated camera at its images and at some more instants, where joints are known.
-
-    Args:
-        episode: Gives joints for a camera in the hand, and the stamps of the images.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
-    """
+    """Pose a calibrated camera at its images and at some more instants, where joints are known."""
     stamps = np.unique(np.concatenate([paired_stamps_ns(episode, camera_id), stamps_ns]))
     lost = without_joints(episode, mount, stamps)
     known = np.array([t for t in stamps.tolist() if t not in lost], dtype=np.int64)

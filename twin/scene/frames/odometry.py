@@ -248,10 +248,6 @@ def follow_camera(
 
     Args:
         frames: In time order; their poses are not looked at, except how colour lies to depth.
-
-    Raises:
-        LostError: When most frames cannot be placed.
-        MissingDependencyError: Without Open3D.
     """
     aligner = Aligner(config)
     follower = _Follower(aligner)

@@ -27,9 +27,6 @@ def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_
 
     Colour without depth nearby is not among them, and of two colour images beside one depth image
     only that which gets it.
-
-    Args:
-        episode: Whose images are paired; none is decoded.
     """
     found = {color[0] for color, _ in _pairs(episode, camera_id, keep=False)}
     return np.array(sorted(found), dtype=np.int64)
@@ -38,11 +35,7 @@ def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_
 def frames_at(
     episode: Episode, camera_id: str, tree: TransformTree, stamps_ns: Collection[int]
 ) -> Iterator[RgbdFrame]:
-    """Yield those of ``streams.rgbd_frames`` whose colour image carries one of some stamps.
-
-    Args:
-        tree: Poses both of its frames.
-    """
+    """Yield those of ``streams.rgbd_frames`` whose colour image carries one of some stamps."""
     wanted = set(stamps_ns)
     if not wanted:
         return

@@ -237,10 +237,6 @@ def find_sources(run: RunFolder) -> Sources:
     """Take all scans; without a scan, every episode that has posed RGB-D frames.
 
     An episode that cannot be read is passed over, with a remark.
-
-    Raises:
-        NoFramesError: When no episode has a camera with colour, depth and intrinsics.
-        EpisodeError: When there is none that can be read, but one that cannot.
     """
     usable: list[Episode] = []
     broken: list[BridgeError] = []
@@ -260,8 +256,8 @@ def find_sources(run: RunFolder) -> Sources:
     if not usable:
         message = (
             f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
-            "Record a scan, or import a folder: robot-gst import rgbd FOLDER RUN, or posed images "
-            "without depth: robot-gst import images FOLDER RUN."
+            "Record a scan, or import a folder: robot-gst import rgbd FOLDER RUN. Images without "
+            "depth can be looked at, and not rebuilt."
         )
         raise NoFramesError(message)
     kinds = sorted({episode.info.kind for episode in usable})
@@ -298,10 +294,6 @@ def choose_frames(
     Args:
         output: Told which cameras are left out, and why.
         calibration: Where cameras are mounted; None: they are where ``/tf`` or odometry says.
-
-    Raises:
-        NoFramesError: When nothing is left to learn from.
-        UnusableCameraError: When no camera can be used: the first one's reason.
     """
     found = [
         (episode, camera_id)

@@ -66,9 +66,6 @@ def localise_episode(
         before_ns: Only frames earlier than this source time.
         held_out_ns: Frames that must not be looked at.
         last_seen_m: Where objects were seen before; tells equal ones apart.
-
-    Raises:
-        GstError: When no camera can be used; what is wrong with the first.
     """
     config = LocaliseConfig() if config is None else config
     if after_ns is None and before_ns is None:
@@ -144,10 +141,6 @@ def write_localised(
 
     Args:
         scene_hash: The scene the poses are meant for; its first twelve digits name the file.
-
-    Raises:
-        GstError: When no camera can be used; what is wrong with the first.
-        UnreadableCalibrationError: When ``calibration.json`` cannot be understood.
     """
     config = LocaliseConfig() if config is None else config
     calibration = read_calibration(run)

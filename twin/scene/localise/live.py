@@ -141,10 +141,6 @@ def frames_of(
     Args:
         quiet_since_ns: When the last execution ended; images must be later, on the cell's clock.
         max_frames: At most so many, the newest.
-
-    Raises:
-        CameraNotReadyError: When there are none; what is missing.
-        RobotDescriptionError: A camera in the hand of another robot.
     """
     missing = [f"{name}/info" for name in ("color", "depth") if name not in camera.infos]
     if missing:

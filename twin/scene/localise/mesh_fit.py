@@ -72,11 +72,7 @@ def known_surface(model: ObjectModel, num_samples: int) -> MeshSurface:
 def facing(
     T_object_base: Float[np.ndarray, "4 4"], view: CameraView, surface: MeshSurface
 ) -> Bool[np.ndarray, " num_samples"]:
-    """Tell which samples turn their outside to a view's camera.
-
-    Args:
-        surface: Samples and their normals, in the object's frame.
-    """
+    """Tell which samples turn their outside to a view's camera."""
     ray = se3.apply(T_object_base, view.T_base_depth[None, :3, 3])[0] - surface.p_m
     along = np.einsum("ij,ij->i", ray, surface.normals)
     return np.asarray(along > FACING * lengths(ray))
@@ -167,10 +163,6 @@ def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSur
 
     Args:
         task: Other objects have a shape of their own there.
-
-    Raises:
-        UnreadableSceneError: When ``object.json`` cannot be understood.
-        UnreadableMeshError: When a mesh is damaged.
     """
     found = ScannedSurfaces()
     for key, model in task.objects.items():

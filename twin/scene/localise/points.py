@@ -256,11 +256,7 @@ def object_points(
 def voxel_mean(
     points: Float[np.ndarray, "num_points 3"], voxel_m: float
 ) -> Float[np.ndarray, "num_voxels 3"]:
-    """Replace the points of each occupied voxel by their mean.
-
-    Args:
-        points: In any frame [m].
-    """
+    """Replace the points of each occupied voxel by their mean."""
     if len(points) == 0:
         return points
     keys = np.floor(points / voxel_m).astype(np.int64)
@@ -277,11 +273,7 @@ def clusters(
     view_ids: Int[np.ndarray, " num_points"],
     gap_m: float,
 ) -> list[Cluster]:
-    """Connected groups seen from above, largest first.
-
-    Args:
-        points: In the base frame [m].
-    """
+    """Connected groups seen from above, largest first."""
     if len(points) == 0:
         return []
     cells = np.floor(points[:, :2] / (gap_m / 2)).astype(np.int64)

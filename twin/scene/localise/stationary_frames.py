@@ -53,9 +53,6 @@ def stationary_frames(
         before_ns: Only frames earlier than this source time.
         evenly: Spread them evenly over the interval instead of taking the last ones.
         held_out_ns: Frames that must not be looked at.
-
-    Raises:
-        GstError: When no camera can be used; what is wrong with the first.
     """
     tree = base_tree(episode)
     failed: list[GstError] = []
@@ -166,10 +163,6 @@ def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Pos
 
     Args:
         calibration: Of the run; None: no camera was calibrated.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     mounts = {} if calibration is None else calibration.cameras
     return {

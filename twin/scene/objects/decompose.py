@@ -297,11 +297,7 @@ class Decomposition:
     """Reconstructed from the views, in the frame of each object, or why not."""
 
     def write(self, run: RunFolder, views: Sequence[TrainingView] = ()) -> dict[str, Any]:
-        """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them.
-
-        Args:
-            views: What the scene was fitted to; says what is static.
-        """
+        """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them."""
         static = write_static(run.scene_dir, views, self.task, self.places)
         if self.parts is None or self.localised is None or self.task is None:
             return {"objects": {}, "objects_remark": self.remark, "sdf": static}
@@ -347,11 +343,7 @@ class ScannedTasks:
 
 
 def scanned_tasks(sources: Sources) -> ScannedTasks:
-    """Find the task files whose objects are looked for.
-
-    Raises:
-        EpisodeError: When one that an episode carries is damaged.
-    """
+    """Find the task files whose objects are looked for."""
     files: dict[str, tuple[Episode, TaskFile]] = {}
     missing: dict[str, None] = {}
     for episode in sources.episodes:
@@ -439,14 +431,7 @@ def _localised(
 
 
 def read_objects(run: RunFolder, record: Mapping[str, Any]) -> dict[str, ObjectSplats]:
-    """Load the objects that ``scene.json`` lists, each in its own frame.
-
-    Raises:
-        PathNotFoundError: When a splat file is gone.
-        UnreadablePlyError: When one is damaged.
-        UnreadableArraysError: When distances are damaged.
-        UnreadableSceneError: When ``scene.json`` or ``object.json`` cannot be understood.
-    """
+    """Load the objects that ``scene.json`` lists, each in its own frame."""
     objects = {}
     for key in record.get("objects", {}):
         folder = run.scene_dir / "objects" / check_episode_id(key)
@@ -468,11 +453,7 @@ def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def read_pose(pose: Any, path: Path) -> Float[np.ndarray, "4 4"]:
-    """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform.
-
-    Raises:
-        UnreadableSceneError: When they are no pose; names the file.
-    """
+    """Turn ``p_m`` and ``q_wxyz`` of a scene's JSON file into a transform."""
     try:
         return se3.pose_from_record(pose)
     except InvalidRecordError as error:

@@ -110,11 +110,7 @@ class CudaRasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
         torch = self._torch
         leaves = {name: torch.tensor(rows, device=self._device) for name, rows in arrays(cloud)}
         T = se3.invert(T_base_camera).astype(np.float32)
@@ -130,11 +126,7 @@ class CudaRasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw what one camera sees."""
         planes = self.draw_planes(cloud, camera, T_base_camera)
         alpha = planes[4]
         solid = alpha >= SOLID_ALPHA
@@ -248,11 +240,6 @@ def open_rasteriser(config: RasterConfig | None = None) -> Rasteriser | CudaRast
     """Open the backend that ``RasterConfig.backend`` names.
 
     ``auto`` takes CUDA where both a device and gsplat are there, the CPU otherwise.
-
-    Raises:
-        SplatExtensionMissingError: When the CPU code was never built.
-        CudaMissingError: When cuda was asked for and there is no device.
-        MissingDependencyError: When cuda was asked for and gsplat is not installed.
     """
     config = config or RasterConfig()
     wants_cuda = config.backend == "cuda" or (config.backend == "auto" and has_cuda())

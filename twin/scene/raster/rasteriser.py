@@ -38,11 +38,7 @@ class SplatExtensionMissingError(TwinError):
 
 
 def load_native() -> ModuleType:
-    """Import the extension; idle OpenMP threads sleep instead of spinning.
-
-    Raises:
-        SplatExtensionMissingError: When it was never built.
-    """
+    """Import the extension; idle OpenMP threads sleep instead of spinning."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read once, when libgomp is loaded
     try:
         return importlib.import_module("twin.scene._splat")
@@ -273,11 +269,7 @@ class Rasteriser:
     def draw_planes(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> Float32[np.ndarray, "5 height width"]:
-        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw red, green, blue, weighted depth [m] and alpha as five planes over black."""
         planes: np.ndarray = self._native.draw(
             cloud.means_m,
             cloud.quats_wxyz,
@@ -313,11 +305,7 @@ class Rasteriser:
     def draw_features(
         self, features: Float32[np.ndarray, "num_splats num_channels"]
     ) -> Float32[np.ndarray, "num_channels height width"]:
-        """Draw any channels with the weights A of the last ``draw_planes``: A F.
-
-        Raises:
-            ValueError: When there is not one row per Gaussian of that drawing.
-        """
+        """Draw any channels with the weights A of the last ``draw_planes``: A F."""
         planes: np.ndarray = self._native.draw_features(as_float32(features))
         return planes
 
@@ -327,9 +315,6 @@ class Rasteriser:
         """Gather maps with the weights A of the last ``draw_planes``: A^T M, not normalised.
 
         The adjoint of ``draw_features``. A map of ones gives the sum of each Gaussian's weights.
-
-        Raises:
-            ValueError: When the maps are not of that drawing's size.
         """
         features: np.ndarray = self._native.lift(as_float32(maps))
         return features
@@ -357,11 +342,7 @@ class Rasteriser:
     def view(
         self, cloud: GaussianCloud, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]
     ) -> View:
-        """Draw what one camera sees.
-
-        Args:
-            cloud: The Gaussians, in the base frame.
-        """
+        """Draw what one camera sees."""
         planes = self.draw_planes(cloud, camera, T_base_camera)
         image = np.ascontiguousarray(np.moveaxis(planes[:3], 0, -1))
         return View(image=image, depth_m=self.surface_depth(), alpha=planes[4])

@@ -186,7 +186,7 @@ def describe_scene(record: Mapping[str, Any]) -> str:
     ]
     if fitted.get("underfitted"):
         lines.insert(2, "underfitted: the time limit struck first; give --budget more time")
-    lines += _view_lines(record["views"])
+    lines.append(_view_line(record["views"]))
     lines += record["scan"]["remarks"]
     if record["remark"]:
         lines.append(record["remark"])
@@ -202,29 +202,11 @@ def _images_done(fitted: Mapping[str, Any]) -> str:
     )
 
 
-def _view_lines(views: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for ending, what in (
-        ("", "held-out views of moving cameras"),
-        ("_still_cameras", "held-out images of cameras that stand still (no new viewpoint)"),
-    ):
-        if views[f"psnr_db{ending}"] is None:
-            continue
-        count, raw, gain = (
-            views[f"{name}{ending}"] for name in ("num_images", "psnr_db", "gain_psnr_db")
-        )
-        line = f"{what} ({count}): PSNR {raw:.2f} dB raw, {gain:.2f} dB with a gain per channel"
-        if views[f"static_psnr_db{ending}"] is not None:
-            line += f", {views[f'static_psnr_db{ending}']:.2f} dB raw where nothing moved"
-        if views.get(f"seen_psnr_db{ending}") is not None:
-            share = 100 * views[f"seen_fraction{ending}"]
-            line += f", {views[f'seen_psnr_db{ending}']:.2f} dB in the {share:.0f} % that was seen"
-        line += f"; SSIM {views[f'ssim{ending}']:.3f}"
-        for name in ("median", "mean"):
-            value = views.get(f"depth_{name}_abs_m{ending}")  # older scenes have no median
-            if value is not None:
-                line += f"; {name} depth error {1e3 * value:.1f} mm"
-        lines.append(line)
-    if not views["images"]:
-        lines.append("no frame could be held out: too few frames")
-    return lines
+def _view_line(views: Mapping[str, Any]) -> str:
+    images = views["images"]
+    if not images:
+        return "no frame could be held out: too few frames"
+    stationary = sum(bool(item["stationary_camera"]) for item in images)
+    which = f", {stationary} of cameras that stand still" if stationary else ""
+    mean_db = sum(item["psnr_db"] for item in images) / len(images)
+    return f"held-out views ({len(images)}{which}): PSNR {mean_db:.2f} dB"

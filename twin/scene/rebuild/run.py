@@ -27,8 +27,7 @@ from twin.scene.dataset.training_set import (
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
-from twin.scene.frames.selection import FrameChoice, Sources, choose_frames
-from twin.scene.frames.swept_episode import find_or_sweep_sources
+from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
@@ -84,19 +83,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     """Rebuild the static scene of a run and return the content of ``scene.json``.
 
     Work already done with the same inputs and settings is not repeated unless forced.
-
-    Raises:
-        NoFramesError: When the run has no RGB-D frames, and no posed images without depth.
-        UnusableCameraError: When no camera can be used or followed.
-        NoDepthError: When the depth images hold nothing usable.
-        PoseConventionError: When poses fit the depth only if read in another convention.
-        MovedCameraError: When a camera moved that is said to stand still.
-        SplatExtensionMissingError: When the native code is not built.
-        UsageError: When a model that was named cannot be used.
-        MissingDependencyError: When a model was named and the leaf or its extra is not installed.
     """
     load_native()
-    sources = find_or_sweep_sources(run, config.frames, output)
+    sources = find_sources(run)
     if sources.remark:
         output.say(sources.remark)
     calibration = read_calibration(run)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from bridge.episode import schema, streams
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage
@@ -25,7 +25,7 @@ from bridge.episode.topics import camera_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UndefinedStatisticError
 from bridge.media.color import encode_png
-from bridge.media.image_quality import aligned, as_float, psnr_db, ssim
+from bridge.media.image_quality import as_float, psnr_db
 from bridge.terminal import Advance
 from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
@@ -33,21 +33,15 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, trai
 from twin.scene.frames.selection import FrameChoice, load
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
-from twin.scene.render import seen_mask
 from twin.scene.robot.extraction import DrivenRobot
 
 VIEWS_NOTE = (
-    "held out from initialisation, poses, exposure, fit and objects; means of the images' values; "
-    "native resolution; raw: no colour alignment; gain_: one factor per image and channel, fitted "
-    "to the recorded image; static_: without pixels that show something that moved; "
-    "seen_: only pixels that show what was measured in the scan, not what was completed; the "
-    "evaluator computes the official numbers from the views episode"
+    "held out from initialisation, poses, exposure, fit and objects; mean of the images' values, "
+    "whole images as recorded, native resolution, no colour alignment; robot-gst evaluate rates "
+    "the views episode further"
 )
 MOST_DB = 100.0
-AVERAGED = (
-    *("psnr_db", "static_psnr_db", "seen_psnr_db", "seen_fraction", "gain_psnr_db", "ssim"),
-    *("depth_mean_abs_m", "depth_median_abs_m"),
-)
+"""JSON has no word for identical images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,105 +54,36 @@ class ViewNumbers:
     stationary_camera: bool
     """The camera does not move, so training frames show the same view."""
     psnr_db: float
-    """Over the whole image, as recorded: a robot in view counts as error."""
-    static_psnr_db: float | None
-    """Over the pixels that show nothing that moved; None when there are none."""
-    static_fraction: float
-    """Share of those pixels."""
-    seen_psnr_db: float | None
-    """Over the pixels that show what was measured in the scan, and not what was completed."""
-    seen_fraction: float
-    """Share of those pixels."""
-    gain_psnr_db: float
-    """Over the whole image, each channel brightened by the factor that fits best."""
-    ssim: float
-    """Structural similarity of the whole image, as the fit sees it (zero padding)."""
-    depth_mean_abs_m: float | None
-    """Against the recorded depth where nothing moved and both exist."""
-    depth_median_abs_m: float | None
-    """The same; most of the mean are silhouettes."""
+    """Over the whole image, as recorded; at most 100."""
     coverage_fraction: float
     """Mean alpha of the rendered image."""
 
 
-def rate_view(
-    frame: RgbdFrame,
-    recorded: TrainingView,
-    view: View,
-    static_mask: Bool[np.ndarray, "height width"],
-    seen: Bool[np.ndarray, "height width"],
-    *,
-    episode: str,
-    stationary: bool,
-) -> ViewNumbers:
-    """Compare one rendered view with its recorded frame.
-
-    Args:
-        recorded: The same frame as the fit would have seen it; gives depth.
-        static_mask: True where nothing moved.
-    """
-    rendered_u8 = view.image_u8()
-    rendered, wanted = as_float(rendered_u8), as_float(frame.image_u8)
-    both = (recorded.full.depth_m > 0) & (view.depth_m > 0)
-    difference = np.abs(recorded.full.depth_m - view.depth_m)[both]
+def rate_view(frame: RgbdFrame, view: View, choice: FrameChoice) -> ViewNumbers:
+    """Compare one rendered view with its recorded frame."""
+    try:
+        found_db = psnr_db(as_float(frame.image_u8), as_float(view.image_u8()))
+    except UndefinedStatisticError:
+        found_db = MOST_DB
     return ViewNumbers(
-        episode=episode,
+        episode=choice.episode.info.id,
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
-        stationary_camera=stationary,
-        psnr_db=finite_psnr_db(wanted, rendered),
-        static_psnr_db=finite_psnr_db(wanted, rendered, static_mask) if static_mask.any() else None,
-        static_fraction=float(static_mask.mean()),
-        seen_psnr_db=finite_psnr_db(wanted, rendered, seen) if seen.any() else None,
-        seen_fraction=float(seen.mean()),
-        gain_psnr_db=finite_psnr_db(wanted, aligned(frame.image_u8, rendered_u8, "gain")),
-        ssim=ssim(wanted, rendered, padding="zero"),
-        depth_mean_abs_m=float(difference.mean()) if both.any() else None,
-        depth_median_abs_m=float(np.median(difference)) if both.any() else None,
+        stationary_camera=choice.stationary,
+        psnr_db=min(found_db, MOST_DB),
         coverage_fraction=float(view.alpha.mean()),
     )
 
 
-def finite_psnr_db(
-    wanted: Float[np.ndarray, "height width 3"],
-    rendered: Float[np.ndarray, "height width 3"],
-    mask: Bool[np.ndarray, "height width"] | None = None,
-) -> float:
-    """Peak signal-to-noise ratio, at most 100 dB: JSON has no word for identical images.
-
-    Args:
-        wanted: The recorded image, 0..1.
-        rendered: The drawn image, 0..1.
-        mask: Pixels that count; None: all of them.
-    """
-    try:
-        return min(psnr_db(wanted, rendered, mask=mask), MOST_DB)
-    except UndefinedStatisticError:
-        return MOST_DB
-
-
 def summarise_views(numbers: Sequence[ViewNumbers], files: Sequence[str]) -> dict[str, Any]:
-    """Average the held-out views; cameras that stand still are kept apart."""
-    moving = [item for item in numbers if not item.stationary_camera]
-    stationary = [item for item in numbers if item.stationary_camera]
-    averages = {
-        f"{name}{ending}": _mean([getattr(item, name) for item in items])
-        for ending, items in (("", moving), ("_still_cameras", stationary))
-        for name in AVERAGED
-    }
+    """Average the held-out views, as ``robot-gst evaluate`` does."""
+    each = [item.psnr_db for item in numbers]
     return {
         "files": list(files),
         "note": VIEWS_NOTE,
-        **averages,
-        "num_images": len(moving),
-        "num_images_still_cameras": len(stationary),
+        "psnr_db": round(float(np.mean(each)), 4) if each else None,
         "images": [asdict(item) for item in numbers],
     }
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return round(float(np.mean(known)), 4) if known else None
 
 
 ENGINE = "robot-gst splat"
@@ -211,8 +136,6 @@ class HeldOutViews:
     recorded: TrainingView
     """The frame with what moved masked; nothing is trained on it."""
     view: View
-    seen_mask: Bool[np.ndarray, "height width"]
-    """Where the view shows what was measured in the scan."""
     masks: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
 
 
@@ -242,17 +165,7 @@ def write_views(
             for choice in own:
                 for item in _rendered(choice, rasteriser, job):
                     _write_view(writer, item)
-                    numbers.append(
-                        rate_view(
-                            item.frame,
-                            item.recorded,
-                            item.view,
-                            item.masks["static"],
-                            item.seen_mask,
-                            episode=choice.episode.info.id,
-                            stationary=choice.stationary,
-                        )
-                    )
+                    numbers.append(rate_view(item.frame, item.view, choice))
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
@@ -265,7 +178,6 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
         recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
         view = rasteriser.view(cloud, camera, T)
-        seen = seen_mask(rasteriser, view.alpha, cloud)
         if job.backdrop is not None:
             view = job.backdrop.behind(view, camera, T)
         masks = {"static": recorded.full.static_mask}
@@ -277,7 +189,6 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
             frame=frame,
             recorded=recorded,
             view=view,
-            seen_mask=seen,
             masks=masks,
         )
 

@@ -102,10 +102,6 @@ class RobotFrames:
         """Return a frame's points without the robot's, and its view with the robot masked.
 
         The robot's points are kept for its links when it stood still.
-
-        Args:
-            frame: Only its stamp counts.
-            points: The surface that the frame measured, root frame.
         """
         surface = self._surface(episode, frame.stamp_ns)
         if surface is None:
@@ -116,11 +112,7 @@ class RobotFrames:
         return points.take(owner < 0), view.without(shown)
 
     def collect(self, episode: Episode, stamp_ns: int, points: PointSet) -> None:
-        """Keep the robot's points of a frame that the background does not need.
-
-        Args:
-            points: The surface that it measured, root frame.
-        """
+        """Keep the robot's points of a frame that the background does not need."""
         surface = self._surface(episode, stamp_ns)
         if surface is not None:
             self._keep(episode, stamp_ns, surface, points)

@@ -79,9 +79,6 @@ def fit_lighting(seen: Sequence[Patches]) -> Lighting:
 
     Alternating least squares: paint of each piece, light of all. Pieces seen facing one way only
     say nothing of light.
-
-    Args:
-        seen: Of all links; ids of different links differ.
     """
     if not seen or not sum(len(item.ids) for item in seen):
         return EVEN

@@ -48,11 +48,7 @@ class SeenLink:
 def link_lighting(
     shapes: Mapping[str, Sequence[Triangles]], seen: Mapping[str, Sequence[SeenLink]]
 ) -> Lighting:
-    """The light on a robot, from links that were seen turned in several ways.
-
-    Args:
-        shapes: Of the links, in their frames.
-    """
+    """The light on a robot, from links that were seen turned in several ways."""
     patches: list[Patches] = []
     first = 0
     for link, items in sorted(seen.items()):
@@ -121,11 +117,7 @@ def on_surface(
     spacing_m: float,
     config: InitialiseConfig,
 ) -> GaussianCloud | None:
-    """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured.
-
-    Args:
-        sets: What was measured of it, in its frame.
-    """
+    """Gaussians on a link's shapes, in its frame; None where these do not fit what was measured."""
     p, normals = even_points(shapes, spacing_m)
     seen_m, seen_normals, seen_colors = (
         np.concatenate([getattr(item, name) for item in sets])

@@ -40,9 +40,6 @@ def posed(
 
     Returns:
         One cloud in the base frame, links in the order of the mapping; empty without links.
-
-    Raises:
-        RobotDescriptionError: The description lacks one of the links; lists those it has.
     """
     robot = load_robot(urdf)
     placed = [
@@ -109,12 +106,7 @@ def write_links(run: RunFolder, links: Mapping[str, GaussianCloud]) -> dict[str,
 
 
 def read_links(run: RunFolder, record: Mapping[str, Any]) -> dict[str, GaussianCloud]:
-    """Load the links that ``scene.json`` lists under ``robot``, each in its own frame.
-
-    Raises:
-        PathNotFoundError: A file is gone.
-        UnreadablePlyError: A file is damaged.
-    """
+    """Load the links that ``scene.json`` lists under ``robot``, each in its own frame."""
     folder: Path = run.scene_dir / FOLDER
     return {
         link: read_ply(folder / f"{check_episode_id(link)}.ply")

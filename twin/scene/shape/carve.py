@@ -38,11 +38,7 @@ class MaskedView:
     """Which camera it is: views of one camera share the errors of its depth."""
 
     def __post_init__(self) -> None:
-        """Refuse images that do not belong together.
-
-        Raises:
-            ShapeError: When sizes differ, or the pose is not finite.
-        """
+        """Refuse images that do not belong together."""
         size = (self.camera.height, self.camera.width)
         if self.depth_m.shape != size or self.mask.shape != size:
             message = (
@@ -121,11 +117,7 @@ class Sight:
 
 
 def look(box: VoxelBox, view: MaskedView) -> Sight:
-    """Project all voxel centres into a view and compare depths.
-
-    Args:
-        box: The voxels, in the frame the view is given in.
-    """
+    """Project all voxel centres into a view and compare depths."""
     x, y, z = _in_camera(box, se3.invert(view.T_base_camera))
     camera = view.camera
     inverse = 1.0 / np.maximum(z, np.float32(NEAR_M))
@@ -281,9 +273,6 @@ def solid_of(
 
     Args:
         support_z_m: Height of the plane it stands on; nothing of it is below. None without one.
-
-    Raises:
-        ShapeError: When next to nothing is left.
     """
     box = evidence.box
     solid = ~evidence.empty

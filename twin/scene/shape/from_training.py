@@ -268,9 +268,6 @@ def write_static(
     """Write ``sdf.npz``, the static scene without the objects, and return its record.
 
     Only a task says that z = 0 is a table; without one nothing closes the scene below.
-
-    Args:
-        task: Whose objects were taken out; None when there is none.
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
@@ -299,9 +296,6 @@ def from_outside_m(
 
     What cameras that are a little off see of a container's far wall lies in its cavity. Were it
     left in the scene, nothing could be put there once the container stands elsewhere.
-
-    Args:
-        points: In the base frame [m].
     """
     if model.mesh is not None and model.soft is None:
         distance = object_mesh(model).solid(se3.apply(se3.invert(T_base_object), points))

@@ -30,11 +30,7 @@ def yaw_period_rad(model: ObjectModel) -> float:
 def starts(
     points: Float[np.ndarray, "num_points 3"], model: ObjectModel
 ) -> list[Float[np.ndarray, "4"]]:
-    """Candidate states: where a side is cut off, the known size is laid along either end.
-
-    Args:
-        points: What was seen of the object, base frame [m].
-    """
+    """Candidate states: where a side is cut off, the known size is laid along either end."""
     z = model.rest_height_m
     if model.origin_at_centre:
         z = float(np.percentile(points[:, 2], 95)) - model.size_m[2] / 2
@@ -92,9 +88,6 @@ def surface_distances(
 
     Outside, the distance to a union is the smallest of the parts'; inside a panel the walls it
     shares with a neighbour count too, which matters only for points deep in the material.
-
-    Args:
-        points: In the base frame [m].
     """
     p = se3.apply(se3.invert(T_base_object), points)
     rows = np.arange(len(p))

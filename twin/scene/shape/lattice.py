@@ -57,11 +57,7 @@ class Lattice:
 
     @staticmethod
     def load(path: Path) -> "Lattice":
-        """Read what ``save`` wrote.
-
-        Raises:
-            UnreadableArraysError: When it is damaged, too large, or no lattice.
-        """
+        """Read what ``save`` wrote."""
         found = read_npz(path, _NAMES, MAX_BYTES)
         num = len(found["nodes_m"])
         shapes = [found[n].shape[1:] for n in ("nodes_m", "tets")] == [(3,), (4,)]
@@ -88,11 +84,7 @@ def tet_volumes_m3(
 
 
 def lattice(shape: ObjectShape, config: LatticeConfig | None = None) -> Lattice:
-    """Fill a shape with a lattice.
-
-    Raises:
-        ShapeError: When the shape is thinner than the spacing everywhere.
-    """
+    """Fill a shape with a lattice."""
     config = LatticeConfig() if config is None else config
     cells, first = _cells(shape, config.spacing_m)
     corners = cells[:, None] + _CORNERS

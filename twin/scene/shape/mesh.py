@@ -43,11 +43,7 @@ def is_watertight(faces: Faces) -> bool:
 
 
 def volume_m3(vertices_m: Vertices, faces: Faces) -> float:
-    """Volume of a closed mesh by the divergence theorem; negative when faces look inwards.
-
-    Args:
-        vertices_m: Of the mesh, in any frame.
-    """
+    """Volume of a closed mesh by the divergence theorem; negative when faces look inwards."""
     a, b, c = (vertices_m[faces[:, k]] for k in range(3))
     return float(np.einsum("ni,ni->n", a, np.cross(b, c)).sum() / 6)
 
@@ -55,11 +51,7 @@ def volume_m3(vertices_m: Vertices, faces: Faces) -> float:
 def face_normals(
     vertices_m: Vertices, faces: Faces
 ) -> tuple[Float[np.ndarray, "num_faces 3"], Float[np.ndarray, " num_faces"]]:
-    """Unit normals (zero for a face without area) and areas [m^2].
-
-    Args:
-        vertices_m: Of the mesh; the normals are in their frame.
-    """
+    """Unit normals (zero for a face without area) and areas [m^2]."""
     a, b, c = (vertices_m[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
@@ -86,13 +78,7 @@ def _header(num_vertices: int, num_faces: int) -> list[str]:
 
 
 def read_mesh(path: Path) -> tuple[Vertices, Faces]:
-    """Read a mesh that ``mesh_ply`` wrote: vertices [m] and faces.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        UnreadableMeshError: When it is another kind of file, cut short, or names vertices that
-            do not exist.
-    """
+    """Read a mesh that ``mesh_ply`` wrote: vertices [m] and faces."""
     if not path.is_file():
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="mesh", hint=hint)

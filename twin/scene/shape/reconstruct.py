@@ -179,11 +179,7 @@ def describe_solid(
     num_views: int,
     truncation_m: float,
 ) -> ObjectShape:
-    """Mesh a solid and say what of it was seen.
-
-    Args:
-        evidence: Where views saw a surface, and what is known to be empty.
-    """
+    """Mesh a solid and say what of it was seen."""
     vertices, faces = isosurface(grid.values_m, grid.origin_m, grid.voxel_m)
     completed = ~_observed(vertices, faces, evidence)
     _, areas = face_normals(vertices, faces)
@@ -247,11 +243,7 @@ def _extent(
 def moved_views(
     views: Sequence[MaskedView], T_new_base: Float[np.ndarray, "4 4"]
 ) -> list[MaskedView]:
-    """The same views in another frame.
-
-    Args:
-        views: In the base frame.
-    """
+    """The same views in another frame."""
     return [replace(v, T_base_camera=T_new_base @ v.T_base_camera) for v in views]
 
 
@@ -275,9 +267,6 @@ def shape_of_mesh(
         vertices_m: In the frame that is wanted, z up.
         points_m: What was measured on the object, in the same frame.
         config: Size of the voxels; the defaults when None.
-
-    Raises:
-        ShapeError: When the triangles enclose nothing.
     """
     config = ShapeConfig() if config is None else config
     low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)

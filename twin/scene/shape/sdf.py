@@ -66,11 +66,7 @@ class SdfGrid:
 
     @staticmethod
     def load(path: Path) -> "SdfGrid":
-        """Read what ``save`` wrote.
-
-        Raises:
-            UnreadableArraysError: When it is damaged, too large, or no grid of distances.
-        """
+        """Read what ``save`` wrote."""
         found = read_npz(path, _NAMES, MAX_VOXELS * 4 + 4096)
         values, origin, voxel, closed = (found[name] for name in _NAMES)
         shapes = (values.ndim, origin.shape, voxel.shape, closed.shape) == (3, (3,), (), ())

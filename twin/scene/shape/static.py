@@ -7,7 +7,7 @@ the unseen for solid; the observed one takes it for free. Beyond the grid nothin
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -94,11 +94,7 @@ class StaticSdf:
 
     @staticmethod
     def load(path: Path) -> "StaticSdf":
-        """Read what ``save`` wrote.
-
-        Raises:
-            UnreadableArraysError: When it is damaged, too large, or no static scene.
-        """
+        """Read what ``save`` wrote."""
         grid = SdfGrid.load(path)
         names = ("observed_m", "state", "truncation_m", "table_z_m")
         found = read_npz(path, names, MAX_VOXELS * 5 + 4096)
@@ -116,16 +112,6 @@ class StaticSdf:
             state=state,
             truncation_m=float(found["truncation_m"]),
             table_z_m=None if np.isnan(table) else table,
-        )
-
-    def shifted(self, offset_m: Float[np.ndarray, "3"]) -> "StaticSdf":
-        """The same place as it is found ``offset_m`` away; values are not copied."""
-        height_m = float(offset_m[2])
-        return replace(
-            self,
-            conservative=replace(self.conservative, origin_m=self.conservative.origin_m + offset_m),
-            observed=replace(self.observed, origin_m=self.observed.origin_m + offset_m),
-            table_z_m=None if self.table_z_m is None else self.table_z_m + height_m,
         )
 
     def to_record(self) -> dict[str, Any]:
@@ -156,9 +142,6 @@ def static_sdf(
         views: What the scene was fitted to; pixels that show something moving are left out.
         table_z_m: Height of the table: all below is solid. None when there is none.
         objects: Distances to the things that may be moved: the scene is made free of them.
-
-    Raises:
-        ShapeError: When the views measured next to nothing.
     """
     config = StaticConfig() if config is None else config
     masked = [everything_in(views[k]) for k in spread(np.arange(len(views)), config.max_views)]

@@ -78,11 +78,7 @@ class Calibration:
 
 
 def read_calibration(run: RunFolder) -> Calibration | None:
-    """Read ``scene/calibration.json``, or return None when there is none.
-
-    Raises:
-        UnreadableCalibrationError: When it cannot be understood.
-    """
+    """Read ``scene/calibration.json``, or return None when there is none."""
     path = run.scene_dir / CALIBRATION_FILE
     if not path.is_file():
         return None
@@ -111,12 +107,7 @@ def _mount(record: Mapping[str, Any]) -> MountedCamera:
 def write_calibration(
     run: RunFolder, cameras: Mapping[str, Any], not_identified: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Write ``calibration.json``; cameras identified earlier and not looked at now are kept.
-
-    Args:
-        cameras: Per camera what was found, with ``link``, ``stream`` and ``T_link_camera``.
-        not_identified: Per camera why nothing was found.
-    """
+    """Write ``calibration.json``; cameras identified earlier and not looked at now are kept."""
     kept = _kept(run)
     known = {**kept.get("cameras", {}), **cameras}
     lost = {**kept.get("not_identified", {}), **not_identified}
@@ -148,11 +139,7 @@ def write_physics(run: RunFolder, physics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_posterior(run: RunFolder, posterior: Mapping[str, Any]) -> dict[str, Any]:
-    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced.
-
-    Args:
-        posterior: The record, with ``draws`` and the trials they were weighed by.
-    """
+    """Write what the run's trials say of what nobody measured; an earlier posterior is replaced."""
     return _store(run, {**_kept(run), "posterior": posterior})
 
 
@@ -186,10 +173,6 @@ def calibrated_tree(
 
     A camera in the hand follows the recorded joints. How colour and depth lie to each other comes
     from the recording's own transforms; without them they count as aligned.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     color = streams.camera_info(episode, camera_id).frame_id
     has_depth = streams.find_camera_topic(episode, camera_id, "depth/info") is not None
@@ -244,10 +227,6 @@ def without_joints(
 
     Args:
         mount: A fixed camera needs no joints: the answer is empty.
-
-    Raises:
-        EpisodeError: A camera in the hand, and no joint states.
-        RobotDescriptionError: A camera in the hand, and no usable robot description.
     """
     return unknown_postures(None if mount.fixed else posture_track(episode), stamps_ns)
 

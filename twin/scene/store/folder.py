@@ -41,11 +41,7 @@ class Scene:
 
 
 def read_record(run: RunFolder) -> dict[str, Any] | None:
-    """Return ``scene.json``, or None when there is no scene yet.
-
-    Raises:
-        UnreadableSceneError: When it cannot be understood.
-    """
+    """Return ``scene.json``, or None when there is no scene yet."""
     path = run.scene_dir / SCENE_FILE
     if not path.is_file():
         return None
@@ -64,11 +60,7 @@ def read_record(run: RunFolder) -> dict[str, Any] | None:
 
 
 def scene_hash_of(run: RunFolder) -> str | None:
-    """The hash that verdicts, replays, localisations and views name a run's scene by.
-
-    Raises:
-        UnreadableSceneError: When ``scene.json`` cannot be understood.
-    """
+    """The hash that verdicts, replays, localisations and views name a run's scene by."""
     record = read_record(run)
     return None if record is None else str(record["scene_hash"])
 
@@ -79,14 +71,7 @@ def background_hash(run: RunFolder) -> str:
 
 
 def read_scene(run: RunFolder) -> Scene:
-    """Load the rebuilt scene of a run.
-
-    Raises:
-        PathNotFoundError: When the run was not rebuilt yet.
-        UnreadableSceneError: When ``scene.json`` cannot be understood, or describes another
-            background than the one that lies beside it.
-        UnreadablePlyError: When the background is damaged.
-    """
+    """Load the rebuilt scene of a run."""
     record = read_record(run)
     if record is None:
         raise PathNotFoundError(

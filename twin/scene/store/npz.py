@@ -21,12 +21,7 @@ class UnreadableArraysError(UnreadableFileError):
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays, whole or not at all.
-
-    Args:
-        path: Of the file; one that is there is replaced.
-        arrays: By name; of plain numbers, no Python objects.
-    """
+    """Write arrays, whole or not at all."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, rows in arrays.items():
@@ -38,14 +33,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_npz(path: Path, names: Sequence[str], max_bytes: int) -> dict[str, np.ndarray]:
-    """Read named arrays; sizes are checked before anything is unpacked, pickles are refused.
-
-    Args:
-        names: The arrays that are wanted; others are passed over.
-
-    Raises:
-        UnreadableArraysError: When the file is none, lacks an array, or holds too much.
-    """
+    """Read named arrays; sizes are checked before anything is unpacked, pickles are refused."""
     try:
         with zipfile.ZipFile(path) as archive:
             sizes = {about.filename: about.file_size for about in archive.infolist()}

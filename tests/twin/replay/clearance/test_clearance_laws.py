@@ -48,13 +48,6 @@ def test_no_point_of_an_object_travels_farther_than_is_said(
         assert travelled.max() <= object_travel_m(with_cube(T), with_cube(at(1)), "cube", radius_m)
 
 
-def test_the_travel_of_a_pure_turn_is_its_arc() -> None:
-    turned = np.eye(4)
-    turned[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, 1.2]))
-    travel = object_travel_m(with_cube(np.eye(4)), with_cube(turned), "cube", 0.1)
-    assert travel == pytest.approx(0.12, rel=1e-6)
-
-
 def test_a_contact_keeps_the_smallest_distance_of_its_time(script: SimpleNamespace) -> None:
     scene = script.scene()
     monitor = ClearanceMonitor(

@@ -10,15 +10,12 @@ from scripted_plans import joints_over
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.plan.release.distances import candidate_clearance
 from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of
-from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
-from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
+from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
 from twin.replay.config import ReplayConfig
-from twin.replay.rebuilt_scene import Correction
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.config import IkConfig
@@ -131,10 +128,6 @@ def test_the_robots_own_foot_is_not_in_its_way(script: SimpleNamespace) -> None:
     assert not monitor.failures
 
 
-def test_a_scene_of_a_table_only_costs_nothing_more(hulls: RobotHulls) -> None:
-    assert unmodelled_obstacles(static_of(), 0.0, stationary_links(hulls)[1], []) is None
-
-
 def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> None:
     """Against distances made anew everywhere, the slow way."""
     box: Box = ((0.3, 0.1, 0.05), (0.16, 0.16, 0.1))
@@ -150,19 +143,6 @@ def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> N
     close = np.abs(full.values_m) < 0.1
     assert np.all(local.values_m <= full.values_m + 1e-5)
     assert np.abs(local.values_m - full.values_m)[close & (full.values_m > 0)].max() < 2 * VOXEL_M
-
-
-def test_lookups_are_those_of_the_grid_and_beyond_it_never_too_large() -> None:
-    rng = np.random.default_rng(4)
-    grid = replace(static_of(POST).observed, closed=True)
-    points = rng.uniform([-0.6, -0.8, -0.1], [1.0, 0.8, 0.7], (4000, 3))
-    found, known = GridLookup(grid).distance(points), grid.distance(points)
-    end = grid.origin_m + VOXEL_M * (np.array(grid.values_m.shape) - 1)
-    held = np.clip(points, grid.origin_m, end)
-    alike = (grid.distance(held) > 0) | (held == points).all(axis=1)
-    np.testing.assert_allclose(found[alike], known[alike], atol=1e-5)
-    assert np.all(found <= known + 1e-5)
-    assert np.sum(~alike) > 50, "below the table: solid goes on there"
 
 
 def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
@@ -193,23 +173,6 @@ def test_everything_below_a_point_of_a_tree_is_within_its_radius() -> None:
             away = np.linalg.norm(tree.points_m[index] - tree.points_m[above])
             assert away + tree.cover_m <= tree.radius_m[above] + 1e-9
             above = parent[above]
-
-
-def test_candidates_are_measured_as_one_by_one() -> None:
-    rng = np.random.default_rng(7)
-    lookup = GridLookup(replace(static_of(POST).observed, closed=True))
-    points = rng.normal(size=(200, 3))
-    points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
-    R = np.stack([se3.rotation_from_vector(v) for v in rng.uniform(-0.35, 0.35, (150, 3))])
-    Ts = np.repeat(np.eye(4)[None], 150, axis=0)
-    Ts[:, :3, :3] = R
-    Ts[:, :3, 3] = np.array([0.62, -0.3, 0.35]) + rng.uniform(-0.08, 0.08, (150, 3))
-    found = candidate_clearance(lookup, points, Ts)
-    alone = [lookup.distance(se3.apply(T, points)).min() for T in Ts]
-    np.testing.assert_allclose(found, alone, atol=1e-5)
-    assert (found < 0).any()
-    assert (found > 0).any()
-    assert len(candidate_clearance(lookup, points, Ts[:0])) == 0
 
 
 def test_reach_bounds_how_far_any_point_of_a_link_moves(hulls: RobotHulls) -> None:
@@ -273,20 +236,6 @@ def test_a_thin_wall_of_the_box_is_not_jumped_over(script: SimpleNamespace) -> N
     monitor.measure(0, before, 0.0, {})
     monitor.measure(20_000_000, after, 0.0, {})
     assert any(failure.bodies[1] == "box" for failure in monitor.failures)
-
-
-def test_a_slow_motion_far_from_everything_needs_no_states_in_between(
-    script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = replace(script.scene(), static_sdf=static_of(POST))
-    monitor = monitor_of(script, scene)
-    looks = []
-    look = monitor._look
-    monkeypatch.setattr(monitor, "_look", lambda state: looks.append(state.t_ns) or look(state))
-    joints = joints_over(scene, 0.4, 0.05, 0.3)
-    for index in range(10):
-        monitor.measure(index * 16_000_000, joints + 0.004 * index, WIDTH_M, {})
-    assert len(looks) == 10
 
 
 def ball(centre: tuple[float, float, float], radius: float = 0.03) -> np.ndarray:
@@ -374,18 +323,6 @@ def test_an_object_that_leaps_did_not_fly_through_what_lies_between(
         T[:3, 3] = box + np.array([offset, 0.0, 0.03])
         monitor.measure(t_ns, joints, WIDTH_M, {"cube": T})
     assert not monitor.failures
-
-
-def test_a_pose_bias_moves_what_was_seen_of_a_container_with_the_container() -> None:
-    """Left where cameras saw it, a part of its own wall would be in the way as "scene"."""
-    extents, seen = np.array([0.1, 0.1, 0.08]), np.eye(4)
-    seen[:3, 3] = (0.55, 0.1, 0.05)
-    static = static_of((tuple(seen[:3, 3].tolist()), tuple(extents.tolist())), table_m=None)
-    correction = Correction(bias=(0.021, -0.026, 0.0))
-    moved = correction.poses({"box": seen})["box"]
-    assert unmodelled_obstacles(static, 0.0, None, [(moved, extents)]) is not None
-    assert unmodelled_obstacles(correction.static(static), 0.0, None, [(moved, extents)]) is None
-    assert unmodelled_obstacles(static, 0.0, None, [(seen, extents)]) is None
 
 
 def test_a_posture_is_as_clear_as_the_nearest_of_all_its_distances(

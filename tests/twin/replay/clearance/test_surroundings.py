@@ -9,7 +9,7 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
-from twin.replay.clearance.bodies import TABLE, own_links, placed_panels, placement_of
+from twin.replay.clearance.bodies import TABLE, placed_panels, placement_of
 from twin.replay.clearance.surroundings import Pair, Surroundings
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import RobotHulls, hulls_of, signed_distance
@@ -21,16 +21,6 @@ WIDTH_M = 0.08
 @pytest.fixture(scope="module")
 def hulls(script: SimpleNamespace) -> RobotHulls:
     return hulls_of(load_robot(script.scene().urdf))
-
-
-def test_links_touch_where_their_distance_says_so(hulls: RobotHulls) -> None:
-    rng = np.random.default_rng(4)
-    touching = []
-    for _ in range(200):
-        hulls.place(rng.uniform(-3.0, 3.0, 6), WIDTH_M)
-        touching.append(own_links(hulls).touch())
-        assert touching[-1] == (hulls.self_distance().distance_m <= 0)
-    assert 20 < sum(touching) < 180
 
 
 def every_distance(

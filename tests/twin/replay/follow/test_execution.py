@@ -65,15 +65,6 @@ def test_stamps_count_from_the_first_one_and_repeats_are_dropped(script: SimpleN
     assert path.end_ns() == times[-1]
 
 
-def test_a_kinematic_path_keeps_the_recorded_width(script: SimpleNamespace) -> None:
-    times, width = recorded_grasp(0.2)
-    track = JointTrack(names=ARM_JOINTS, stamps_ns=times, position=np.zeros((len(times), 6)))
-    widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
-    config = ReplayConfig(mode="kinematic")
-    path = path_of_execution(track, widths, script.plan(script.scene()), config, ROBOT)
-    assert np.array_equal(path.width_m, width)
-
-
 def test_stages_take_the_times_the_recording_gives_them(script: SimpleNamespace) -> None:
     plan = script.plan(script.scene())
     start = 1_000_000_000_000
@@ -165,19 +156,6 @@ def test_a_joint_that_is_not_the_arms_may_say_nothing(script: SimpleNamespace) -
     widths = JointTrack(names=("gripper_width",), stamps_ns=times, position=width[:, None])
     path = path_of_execution(track, widths, script.plan(script.scene()), ReplayConfig(), ROBOT)
     assert path.joints_rad[0] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
-
-
-def test_widths_that_were_not_recorded_are_not_made_up(script: SimpleNamespace) -> None:
-    times, width = recorded_grasp(0.0)
-    plan = script.plan(script.scene())
-    there = (times < 1_000_000_000) | (times > 4_000_000_000)
-    widths = JointTrack(
-        names=("gripper_width",), stamps_ns=times[there], position=width[there, None]
-    )
-    with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 3\.0 s from"):
-        path_of_execution(still_arm(times), widths, plan, ReplayConfig(), ROBOT)
-    with pytest.raises(UnusablePlanError, match=r"no gripper widths were recorded for 2\.0 s at"):
-        check_covers(widths, "gripper widths", int(times[-1]) + 2_000_000_000, plan.id)
 
 
 def test_an_execution_of_hours_is_refused_before_it_takes_hours(script: SimpleNamespace) -> None:

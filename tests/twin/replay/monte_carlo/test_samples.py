@@ -76,22 +76,6 @@ def test_what_stands_goes_on_standing_and_moves_as_far_as_localisation_is_unsure
     assert np.std(turns) == pytest.approx(0.02, rel=0.12)
 
 
-def test_an_object_in_the_air_moves_in_all_six_directions(script: SimpleNamespace) -> None:
-    scene = scene_with(script)
-    lifted = scene.Ts_base_object["cube"].copy()
-    lifted[2, 3] += 0.1
-    scene = replace(scene, Ts_base_object={**scene.Ts_base_object, "cube": lifted})
-    moved = np.array([draw.Ts_base_object["cube"] for draw in draws(scene, 500)])
-    steps = np.concatenate(
-        [
-            moved[:, :3, 3] - lifted[:3, 3],
-            se3.vector_from_rotation(moved[:, :3, :3] @ lifted[:3, :3].T),
-        ],
-        axis=1,
-    )
-    np.testing.assert_allclose(np.std(steps, axis=0), np.sqrt(np.diag(CORRELATED)), rtol=0.16)
-
-
 def test_given_upright_is_the_conditional_distribution() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(6, 6)) * 1e-2
@@ -254,14 +238,6 @@ def test_a_variation_that_cannot_be_replayed_costs_only_itself(script: SimpleNam
     assert samples[1].reason == "the cube lies inside the box"
 
 
-def test_a_kinematic_replay_has_no_probability(script: SimpleNamespace) -> None:
-    config = ReplayConfig(mode="kinematic", samples=3)
-    with pytest.raises(UsageError, match="moves no objects: it has no success probability"):
-        replay_samples(
-            lambda *_: verdict(True), scene_with(script), config, plan_id="p", identity="s"
-        )
-
-
 def test_a_late_gripper_lags_behind_the_arm(
     script: SimpleNamespace,
 ) -> None:
@@ -274,11 +250,6 @@ def test_a_late_gripper_lags_behind_the_arm(
     assert path.first_close_ns is not None
     assert late.first_close_ns == path.first_close_ns + 200_000_000
     assert path.with_late_gripper(0.0) is path
-
-
-def test_what_was_identified_of_pairs_is_not_varied_once_more(script: SimpleNamespace) -> None:
-    found = draws(scene_with(script), 50, calibrated=(("finger_friction", 0.05),))
-    assert {draw.physics.object_friction for draw in found} == {0.8}
 
 
 def calibration(**identified: Any) -> Calibration:

@@ -1,6 +1,5 @@
 """A session's own trials as evidence: what draws are kept, how much a yes is trusted afterwards."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-import robot_gst
 from bridge.episode.run_folder import RunFolder
 from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
@@ -18,7 +16,6 @@ from bridge.terminal import Output
 from twin.replay import posterior
 from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
 from twin.replay.monte_carlo import (
-    Sample,
     draw_variation,
     halving,
     replay_samples,
@@ -208,23 +205,6 @@ def test_each_rigid_mover_has_edges_and_weight_of_its_own_within_the_priors() ->
     assert rigid_movers(load_task("sloth_into_basket")) == ()
 
 
-def test_a_draw_of_boxes_survives_its_record_and_reaches_the_varied_start() -> None:
-    (draw,) = draw_beforehand(1, rigid_movers(TASK))
-    assert PosteriorDraw.from_record(json.loads(json.dumps(asdict(draw)))) == draw
-    box = replace(draw.boxes[0], edge_share=0.25, centre_of_mass=(0.5, -0.25, 0.0))
-    draw = replace(draw, boxes=(box,), weight=1.0)
-    half = np.array(TASK.objects["block"].size_m) / 2
-    config = ReplayConfig(variation=VariationConfig(posterior=(draw,)))
-    start = scene()
-    varied = draw_variation(sample_rng(0, "s", 0), start, config).scene(start)
-    assert set(varied.unseen) == {"block"}
-    assert varied.unseen["block"].edge_m == pytest.approx(0.25 * half.min())
-    np.testing.assert_allclose(varied.unseen["block"].centre_of_mass_m, half * [0.5, -0.25, 0.0])
-    assert start.unseen == {}
-    old = {key: value for key, value in asdict(draw).items() if key != "boxes"}
-    assert PosteriorDraw.from_record(old).boxes == (), "a file from before: as even as then"
-
-
 def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
     shares = [halving(index) for index in range(16)]
     np.testing.assert_allclose(np.diff(sorted(shares)), 1 / 17, atol=0.04)
@@ -254,24 +234,6 @@ def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() ->
     assert p["value"] == pytest.approx((0.6 + 0.6 + 0.1 + 0.1) / 4)
     assert (p["k"], p["n"]) == (2, 4)
     assert p["low"] < p["value"] < p["high"]
-
-
-def test_without_a_posterior_the_interval_is_wilsons() -> None:
-    samples = [
-        Sample(
-            plan_id="p",
-            index=index,
-            variation={},
-            accepted=index < 5,
-            first_failing=None,
-            reason=None,
-        )
-        for index in range(16)
-    ]
-    p = with_probability(VERDICT, samples).p_success
-    wilson = stats.binomtest(5, 16).proportion_ci(0.95, method="wilson")
-    assert p is not None
-    assert (p["low"], p["high"]) == pytest.approx((wilson.low, wilson.high))
 
 
 def of_one_task(draws: Sequence[PosteriorDraw]) -> dict[str, object]:
@@ -364,11 +326,3 @@ def test_a_run_without_executed_trials_says_so(tmp_path: Path) -> None:
     with pytest.raises(NoTrialsError, match="no executed trial"):
         calibrate_posterior(run, num_draws=2, workers=1, output=QUIET)
     assert not (run.scene_dir / "calibration.json").exists()
-
-
-def test_only_one_thing_is_calibrated_at_a_time(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    assert robot_gst.run(["calibrate", str(run.path), "--posterior", "--physics"]) == 2
-    assert "--posterior" in capsys.readouterr().err

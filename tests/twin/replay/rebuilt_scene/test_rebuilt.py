@@ -12,7 +12,7 @@ from bridge.task.task_file import load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.config import ReplayConfig
-from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene, shape_hashes
+from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
@@ -117,13 +117,6 @@ def test_distances_that_cannot_be_read_are_no_free_way(run: RunFolder) -> None:
     assert read_rebuilt_scene(run, TASK).static_sdf is not None
 
 
-def test_other_shapes_are_other_replays(run: RunFolder) -> None:
-    before = shape_hashes(run)
-    assert list(before) == ["objects/sloth/soft.npz"]
-    lattice_of_task(stretch=1.1).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
-    assert shape_hashes(run) != before
-
-
 def calibration(**identified: object) -> Calibration:
     record = {"calibration_id": "12345678", "physics": {"identified": identified}}
     return Calibration(record=record, cameras={})
@@ -137,8 +130,3 @@ def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
     mine = ReplayConfig(physics=PhysicsConfig(object_friction=0.7))
     physics = calibrated(mine, found, TASK).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.7, 9.0)
-
-
-def test_without_a_calibration_nothing_is_moved() -> None:
-    assert calibrated(ReplayConfig(), None, TASK) == ReplayConfig()
-    assert calibrated(ReplayConfig(), calibration(unheard_of=3.0), TASK).physics == PhysicsConfig()

@@ -2,10 +2,10 @@
 
 import pytest
 
-from twin.replay import workers
+from twin.replay import runner
 
 
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test replaces is in this process: others start only where a test asks for them."""
-    monkeypatch.setattr(workers, "default_size", lambda: 1)
+    monkeypatch.setattr(runner, "default_size", lambda: 1)

@@ -22,9 +22,9 @@ from bridge.task.plan import Plan
 from bridge.terminal import Output
 from twin.replay import runner
 from twin.replay.config import ReplayConfig, ReplayRunConfig
+from twin.replay.runner import replay_run
 from twin.replay.scene import StartState, StartStates
 from twin.replay.summary import describe_run
-from twin.replay.workers import replay_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000

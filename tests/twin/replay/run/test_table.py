@@ -81,13 +81,6 @@ def test_what_was_seen_is_held_against_the_label_too() -> None:
     }
 
 
-def test_tasks_have_a_table_each() -> None:
-    rows = [{**item, "task": item["episode"]} for item in ROWS]
-    text = describe_run({**summary(), "executions": executions_of(rows, LABELS)})
-    assert ("\na:\n" in text, "\nb:\n" in text, "\nc:\n" in text) == (True, True, False)
-    assert text.count("planned in twin   accepted") == 2
-
-
 def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
     rows = [
         row("a", "planned", None, reason="undecided: cube (hidden)"),
@@ -100,13 +93,6 @@ def test_every_answer_that_is_no_yes_is_listed_with_its_reason_once() -> None:
     assert "rejected:\n  b p planned dynamic: ik: unreachable\n" in text
     assert "not evaluated:\n  c p planned dynamic: NaN" in text
     assert "no physics" not in text, "said of every kinematic replay"
-
-
-def test_one_cause_that_spoils_every_replay_of_a_plan_is_one_line() -> None:
-    spoilt = {"accepted": None, "reason": "not evaluated: NaN", "error": "not evaluated: NaN"}
-    rows = [row("c", name, **spoilt) for name in ("planned", "executed")]
-    text = describe_run({**summary(), "rows": rows, "counts": count_verdicts(rows)})
-    assert "\n  c p planned dynamic, executed dynamic: NaN" in text
 
 
 def seen(*findings: tuple[str, bool | None]) -> Verdict:

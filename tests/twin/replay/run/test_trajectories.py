@@ -20,19 +20,16 @@ from bridge.errors import UsageError
 from bridge.process_pool import ProcessPool, Serial
 from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
 from bridge.terminal import Output
-from twin import cli
 from twin.replay import run_job as run_job_module
+from twin.replay import runner
 from twin.replay import runner as runner_module
-from twin.replay import workers
 from twin.replay.config import ReplayConfig, ReplayRunConfig
-from twin.replay.divergence import diverge
 from twin.replay.job import ReplayJob
 from twin.replay.job_row import divergence_of, row_of_failure
 from twin.replay.result import ReplayResult
-from twin.replay.runner import Execution, execution_of
+from twin.replay.runner import Execution, execution_of, replay_run
 from twin.replay.scene import StartState, StartStates
-from twin.replay.summary import count_verdicts, describe_run
-from twin.replay.workers import replay_run
+from twin.replay.summary import describe_run
 from twin.scene.localise.episode import Phase
 
 T0 = 1_700_000_000_000_000_000
@@ -222,34 +219,6 @@ def test_both_engines_write_an_episode_each_and_the_first_decides(
     assert len(done) == 1, "an engine's episode that is missing is made again"
 
 
-def test_engines_that_differ_are_named_in_the_row_and_in_what_is_said(
-    run: RunFolder, script: SimpleNamespace, good: ReplayResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def replay(config: ReplayConfig, plan: Any) -> ReplayResult:
-        (engine,) = config.engines()
-        terminal = Factor(value=engine == "pybullet", cause="inside", detail="30 mm outside")
-        verdict = replace(good.verdict, plan_id=plan.id, engine=f"{engine}-1", terminal=terminal)
-        return replace(good, verdict=replace(verdict, reason=None))
-
-    def planned(plan: Any, scene: Any, config: ReplayConfig) -> ReplayResult:
-        return replay(config, plan)
-
-    def executed(*args: Any, plan: Any) -> ReplayResult:
-        return replay(args[-1], plan)
-
-    monkeypatch.setattr(run_job_module, "replay_plan", planned)
-    monkeypatch.setattr(run_job_module, "replay_joints", executed)
-    monkeypatch.setattr(run_job_module, "compare", lambda *_: diverge("round-1", []))
-    replayed = replace(QUICK, engine="both")
-    summary = replay_run(run, ReplayRunConfig(replay=replayed), QUIET)
-    (row,) = [row for row in summary["rows"] if row["plan"] == "round-0"]
-    assert row["accepted"] is True
-    assert "pybullet-1 accepted; mujoco-1 rejected" in row["engines_disagree"]
-    said = describe_run(summary)
-    assert "engines agree on 0 of 3 replays" in said
-    assert "round-0 planned: engines disagree: pybullet-1 accepted" in said
-
-
 class PoolForReplays(ProcessPool):
     """Lists jobs in this process, where the fixture localises; replays in the others."""
 
@@ -266,7 +235,7 @@ def test_two_processes_say_what_one_process_says(
     config = ReplayRunConfig(replay=QUICK)
     replay_run(run, config, QUIET)
     before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(workers, "ProcessPool", PoolForReplays)
+    monkeypatch.setattr(runner, "ProcessPool", PoolForReplays)
     summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
     assert not any(row["skipped"] or row["error"] for row in summary["rows"])
     assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
@@ -279,21 +248,6 @@ def _messages(path: Path) -> list[tuple[str, int, bytes]]:
 def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:
     with pytest.raises(UsageError, match="trial_0001"):
         replay_run(run, ReplayRunConfig(episode=("trial_9",)), QUIET)
-
-
-def test_an_episode_named_twice_is_replayed_once(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two processes must not write one file."""
-    done: list[ReplayJob] = []
-
-    def note(job: ReplayJob) -> dict[str, Any]:
-        done.append(job)
-        return row_of_failure(job, "only looked at")
-
-    monkeypatch.setattr(runner_module, "run_job", note)
-    replay_run(run, ReplayRunConfig(episode=("trial_0001", "trial_0001")), QUIET)
-    assert len(done) == len({job.path() for job in done}) == 4
 
 
 def write_scene(run: RunFolder) -> None:
@@ -324,23 +278,6 @@ def test_distances_that_cannot_be_read_leave_everything_not_evaluated(
     for row in summary["rows"]:
         assert row["accepted"] is None
         assert "sdf.npz: not a file of arrays" in row["error"]
-
-
-def test_a_run_without_plans_says_so(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "scanned")
-    with EpisodeWriter(run.episodes_dir / "scan.mcap") as writer:
-        writer.describe(EpisodeInfo(id="scan", kind="scan"))
-    summary = replay_run(run, ReplayRunConfig(), QUIET)
-    said = describe_run(summary)
-    assert said.startswith("No trial to replay.")
-    assert "scan: not evaluated: a scan" in said
-    json.dumps(summary)
-
-
-def test_a_folder_that_is_no_run_is_refused_and_stays_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no episodes in"):
-        cli.replay(tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 def marks(*said: str) -> list[dict[str, Any]]:
@@ -390,18 +327,6 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
         assert row["accepted"] is None
     assert summary["counts"]["planned dynamic"]["n"] == 1
     assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
-
-
-def test_counts_keep_never_executed_plans_apart() -> None:
-    rows = [
-        {"trajectory": "planned", "mode": "dynamic", "executed": e, "accepted": a, "error": x}
-        for e, a, x in ((True, True, None), (False, False, None), (True, None, "broken"))
-    ]
-    counts = count_verdicts(rows)
-    assert counts["planned dynamic"] == {
-        "n": 2, "accepted": 1, "rejected": 0, "undecided": 0, "failed": 1
-    }  # fmt: skip
-    assert counts["planned dynamic, never executed"]["rejected"] == 1
 
 
 def test_a_plan_made_during_an_execution_has_no_known_start(script: SimpleNamespace) -> None:

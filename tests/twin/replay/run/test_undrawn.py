@@ -11,8 +11,7 @@ from bridge.errors import PathNotFoundError
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
-from twin.replay.runner import describe_undrawn
-from twin.replay.workers import replay_run
+from twin.replay.runner import describe_undrawn, replay_run
 
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
@@ -33,8 +32,3 @@ def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() ->
         "cube: not in the scene, not in pictures (cube not found: hidden)",
         "robot: not in the scene, not in pictures (no joints)",
     ]
-
-
-def test_a_whole_scene_lacks_nothing() -> None:
-    whole = {"objects": {"box": {}, "cube": {}}, "robot": {"links": {"tool0": {}}}}
-    assert describe_undrawn(whole, [load_task("cube_into_box")]) == []

@@ -23,8 +23,8 @@ from twin import cli
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.result import ReplayResult
+from twin.replay.runner import replay_run
 from twin.replay.scene import StartState, StartStates
-from twin.replay.workers import replay_run
 from twin.scene.localise.episode import Phase
 
 START = 1_700_000_000_000_000_000

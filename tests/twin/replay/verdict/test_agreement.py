@@ -47,16 +47,6 @@ def test_both_engines_hold_and_place_and_name_themselves(both: tuple[ReplayResul
     assert np.array_equal(both[0].stamps_ns, both[1].stamps_ns)
 
 
-def test_an_engine_alone_says_the_same_as_beside_another(
-    both: tuple[ReplayResult, ...], script: SimpleNamespace
-) -> None:
-    scene = script.scene()
-    config = replace(ReplayConfig(), engine="mujoco")
-    alone = replay_plan(script.plan(scene), scene, config)
-    assert alone.verdict == both[1].verdict
-    assert alone.joints_rad.tobytes() == both[1].joints_rad.tobytes()
-
-
 def test_engines_that_differ_keep_their_answers_and_say_so() -> None:
     verdicts = [verdict("pybullet-1", True, True, True), verdict("mujoco-2", True, True, False)]
     told = compared(verdicts)

@@ -142,18 +142,6 @@ def test_every_planted_over_estimate_is_found_and_no_true_one_is_called_wrong(
     assert min(found.values()) >= 3, found
 
 
-def test_a_whole_replay_is_confirmed_for_less_than_its_budget(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    plan = limited_to_task(script.plan(script.scene()), script.scene().task)
-    factor = audit(good, plan, script.scene(), CONFIG)
-    assert factor.value is True
-    assert "states and" in str(factor.detail)
-    few = audit(good, plan, script.scene(), CONFIG, max_queries=10)
-    assert few.value is None
-    assert "more than 10 distances" in str(few.detail)
-
-
 def test_a_clearance_that_is_a_millimetre_too_large_somewhere_is_found(
     script: SimpleNamespace, good: ReplayResult
 ) -> None:

@@ -71,15 +71,6 @@ def test_a_plan_that_starts_elsewhere_is_refused_with_both_numbers(
     assert Verdict.from_json(verdict.to_json()) == verdict
 
 
-def test_a_start_within_the_joints_limit_and_beyond_the_tools_is_refused(
-    script: SimpleNamespace, dense: Plan
-) -> None:
-    """0.045 rad of the shoulder swing the tool by about 20 mm."""
-    where = start_of(dense)
-    where[0] += 0.045
-    assert judged(script, dense, where).checks["start"].value is False
-
-
 def test_a_plan_without_joints_goes_on_from_where_the_arm_is(script: SimpleNamespace) -> None:
     """Of the eight postures of its first pose the arm is in one: that one is replayed."""
     scene = script.scene()

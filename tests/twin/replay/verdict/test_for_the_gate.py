@@ -1,13 +1,7 @@
 """The gate's process with the real replay behind it."""
 
-import itertools
 import math
-import os
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,43 +53,3 @@ def test_the_gates_process_says_what_the_replay_says_and_adds_samples(
         lost = replace(plan, tau=(*plan.tau[:3], nowhere, *plan.tau[4:]))
         with pytest.raises(UndecidedError, match="not finite"):
             twin.replay(lost, scene.task, found, scene.urdf, start_rad, soon(60))
-
-
-@contextmanager
-def slowed(process_id: int) -> Iterator[None]:
-    """Stop a process nine tenths of the time, as a machine does that has other things to do."""
-    done = threading.Event()
-
-    def alternate() -> None:
-        for number in itertools.count():
-            if done.wait(0.09 if number % 2 else 0.01):
-                break
-            os.kill(process_id, signal.SIGCONT if number % 2 else signal.SIGSTOP)
-
-    thread = threading.Thread(target=alternate)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-        os.kill(process_id, signal.SIGCONT)
-
-
-@pytest.mark.slow
-def test_a_loaded_machine_gives_the_same_verdict(
-    tmp_path: Path, script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    plan, found = script.plan(scene), as_localised(scene)
-    run = RunFolder.create(tmp_path / "run")
-    config = GateConfig(samples=9, max_steps=5500, replay=ReplayConfig())
-    with TwinProcess(run.path, config, Output(quiet=True)) as twin:
-        start_rad = good.joints_rad[0]
-        idle = twin.replay(plan, scene.task, found, scene.urdf, start_rad, soon(300))
-        assert twin._worker is not None
-        with slowed(twin._worker.pid):
-            loaded = twin.replay(plan, scene.task, found, scene.urdf, start_rad, soon(300))
-    assert idle.p_success is not None
-    assert idle.p_success["n"] == 2
-    assert loaded.to_json() == idle.to_json()

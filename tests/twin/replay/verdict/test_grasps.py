@@ -86,22 +86,9 @@ def test_a_gripper_that_acts_after_the_hand_left_is_looked_at_from_then_on(
     assert not held(plan, result, late), "the fingers have left the cube when it closes"
 
 
-def test_a_grasp_that_misses_is_neither_touched_nor_held(script: SimpleNamespace) -> None:
-    plan, result = carried(script)
-    nothing = {"cube": np.zeros(len(result.stamps_ns), dtype=bool)}
-    (grasp,) = grasps_seen(plan, path_of(plan), replace(result, finger_contact=nothing))
-    assert (grasp["touched"], grasp["held"], grasp["p_object_m"]) == (False, False, None)
-
-
 def test_what_is_touched_beside_the_object_that_is_grasped_is_no_grasp(
     script: SimpleNamespace,
 ) -> None:
     plan, result = carried(script)
     stages = tuple(replace(stage, grasp=stage.grasp and "duck") for stage in plan.stages)
     assert grasps_seen(replace(plan, stages=stages), path_of(plan), result) == ()
-
-
-def test_a_hand_that_never_leaves_carries_nothing(script: SimpleNamespace) -> None:
-    plan, result = carried(script)
-    still = np.repeat(result.Ts_base_tcp[:1], len(result.stamps_ns), axis=0)
-    assert not held(plan, replace(result, Ts_base_tcp=still))

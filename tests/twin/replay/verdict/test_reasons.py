@@ -9,7 +9,6 @@ import pytest
 from bridge.task.verdict import Factor
 from twin.gate.gate import no_verdict
 from twin.replay.config import ReplayConfig
-from twin.replay.failure import with_reasons
 from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.replay.verdict import reason_of, terminal_factor
@@ -86,15 +85,3 @@ def test_what_is_open_for_another_reason_is_told_beside(script: SimpleNamespace)
     result = at_rest(script, replace(scene, Ts_base_object=poses))
     factor = terminal(scene, replace(result, finger_contact={}))
     assert (factor.value, factor.detail) == (None, "finger contact is not known")
-
-
-def test_a_task_that_asks_for_nothing_says_so(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    bare = replace(scene, task=replace(scene.task, success=()))
-    factor = terminal(bare, at_rest(script, scene))
-    assert (factor.value, factor.detail) == (None, "the task asks for nothing")
-
-
-def test_names_share_their_reason() -> None:
-    found = with_reasons({"cube": "no frames", "duck": None, "box": "no frames", "lid": "hidden"})
-    assert found == "cube, box (no frames); duck; lid (hidden)"

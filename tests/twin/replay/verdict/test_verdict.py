@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bridge.errors import UsageError
 from bridge.geometry import se3
 from twin.physics.world import World
 from twin.replay.config import Mode, ReplayConfig
@@ -18,14 +17,6 @@ from twin.replay.verdict import replay_joints, replay_plan
 KINEMATIC = ReplayConfig(mode="kinematic")
 
 
-def test_a_good_plan_is_accepted(good: ReplayResult) -> None:
-    verdict = good.verdict
-    assert (verdict.ik.value, verdict.clearance.value, verdict.terminal.value) == (True,) * 3
-    assert verdict.accepted is True
-    assert verdict.engine.startswith("pybullet-")
-    assert (verdict.trajectory, verdict.mode) == ("planned", "dynamic")
-
-
 def test_the_cube_is_carried_between_the_fingers(good: ReplayResult) -> None:
     """While held, the cube moves with the tool: the slip is millimetres."""
     held = good.finger_contact["cube"] & (good.Ts_base_object["cube"][:, 2, 3] > 0.08)
@@ -33,16 +24,6 @@ def test_the_cube_is_carried_between_the_fingers(good: ReplayResult) -> None:
     T_tcp_cube = se3.invert(good.Ts_base_tcp[held]) @ good.Ts_base_object["cube"][held]
     slip = np.linalg.norm(T_tcp_cube[:, :3, 3] - T_tcp_cube[0, :3, 3], axis=1)
     assert slip.max() < 4e-3
-
-
-def test_all_tracks_of_a_replay_have_one_length(good: ReplayResult) -> None:
-    n = len(good.stamps_ns)
-    assert good.stamps_ns[0] == 0
-    assert np.all(np.diff(good.stamps_ns) > 0)
-    tracks = [good.joints_rad, good.width_m, good.Ts_base_tcp, good.clearance_m]
-    tracks += [*good.Ts_base_object.values(), *good.finger_contact.values()]
-    assert {len(track) for track in tracks} == {n}
-    assert set(good.Ts_base_object) == {"cube", "box"}
 
 
 @pytest.mark.slow
@@ -68,13 +49,6 @@ def test_a_dip_below_the_table_is_rejected_by_clearance(
     assert clearance.bodies[1] == "table"
     assert clearance.first_t_ns is not None
     assert 0.7e9 < clearance.first_t_ns < 1.1e9, "the tool arrives at 1 s"
-
-
-def test_the_clearance_of_a_dip_is_its_depth(script: SimpleNamespace) -> None:
-    """The tips are 10 mm below the tool: at tool height -0.02 they are 30 mm in the table."""
-    scene = script.scene()
-    result = replay_plan(script.plan(scene, grasp_offset_m=(0.12, 0.0, -0.04)), scene, KINEMATIC)
-    assert result.clearance_m.min() == pytest.approx(-0.03, abs=1e-4)
 
 
 def test_a_finger_that_lands_on_the_cube_is_named(script: SimpleNamespace) -> None:
@@ -119,15 +93,6 @@ def test_an_unreachable_waypoint_is_rejected_by_ik_at_its_time(script: SimpleNam
     assert verdict.ik.first_t_ns == tau[40].t_ns
     assert verdict.clearance.value is None, "what comes after the pose is not known"
     assert verdict.accepted is False
-
-
-def test_an_unreachable_first_waypoint_gives_a_verdict_too(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    tau = (replace(plan.tau[0], p_m=(0.0, 0.0, 3.0)), *plan.tau[1:])
-    verdict = replay_plan(replace(plan, tau=tau), scene, ReplayConfig()).verdict
-    assert (verdict.ik.value, verdict.ik.first_t_ns) == (False, 0)
-    assert verdict.terminal.value is None
 
 
 def test_joints_that_contradict_the_pose_are_rejected(script: SimpleNamespace) -> None:
@@ -245,16 +210,6 @@ def test_recorded_joints_that_jump_are_rejected(
     assert result.verdict.ik.cause == "joint_jump"
 
 
-def test_a_recording_without_the_arm_is_refused_by_name(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    track, widths = script.recorded_tracks(good)
-    with pytest.raises(UnusablePlanError, match="shoulder_pan_joint"):
-        replay_joints(widths, widths, scene, KINEMATIC, plan=script.plan(scene))
-    assert track.names[0] == "shoulder_pan_joint"
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -271,41 +226,6 @@ def test_a_plan_that_cannot_be_replayed_is_refused(
         replay_plan(replace(script.plan(scene), **change), scene, KINEMATIC)
 
 
-def test_waypoints_out_of_order_are_refused(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    with pytest.raises(UnusablePlanError, match="do not increase"):
-        replay_plan(replace(plan, tau=plan.tau[::-1]), scene, KINEMATIC)
-
-
-def test_a_pose_that_is_not_a_number_is_refused(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    tau = (replace(plan.tau[0], p_m=(float("nan"), 0.0, 0.3)), *plan.tau[1:])
-    with pytest.raises(UnusablePlanError, match="not finite"):
-        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
-
-
-@pytest.mark.parametrize("change", [{"width_m": float("nan")}, {"joints_rad": (float("inf"),) * 6}])
-def test_a_command_that_is_not_a_number_is_refused(
-    script: SimpleNamespace, change: dict[str, object]
-) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    tau = (*plan.tau[:-1], replace(plan.tau[-1], **change))
-    with pytest.raises(UnusablePlanError, match="not finite"):
-        replay_plan(replace(plan, tau=tau), scene, KINEMATIC)
-
-
-def test_a_plan_of_one_waypoint_stands_still(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    result = replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.3))
-    assert result.verdict.ik.value is True
-    assert result.verdict.terminal.value is not True
-    assert result.verdict.accepted is not True
-
-
 def test_a_rigid_body_that_physics_lost_is_not_judged(
     script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -317,20 +237,6 @@ def test_a_rigid_body_that_physics_lost_is_not_judged(
         NotEvaluatedError, match="not evaluated: physics lost cube: its place is no"
     ):
         replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.1))
-
-
-def test_quaternions_of_another_length_mean_the_same_path(script: SimpleNamespace) -> None:
-    scene = script.scene()
-    plan = script.plan(scene)
-    longer = tuple(replace(w, q_wxyz=tuple(2.0 * q for q in w.q_wxyz)) for w in plan.tau)
-    one = replay_plan(plan, scene, KINEMATIC)
-    two = replay_plan(replace(plan, tau=longer), scene, KINEMATIC)
-    np.testing.assert_allclose(two.joints_rad, one.joints_rad, atol=1e-6)
-
-
-def test_a_sample_rate_that_does_not_divide_the_physics_rate_is_refused() -> None:
-    with pytest.raises(UsageError, match="does not divide"):
-        ReplayConfig(sample_rate_hz=50)
 
 
 @pytest.mark.slow

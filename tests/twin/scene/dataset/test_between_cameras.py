@@ -69,15 +69,6 @@ def test_a_pose_in_another_convention_is_named(
     assert found in report.better.describe()
 
 
-def test_without_anything_to_compare_with_nothing_is_said() -> None:
-    assert check_between(side(), []).agreement is None
-    blind = [replace(t, depth_m=np.zeros_like(t.depth_m)) for t in side()]
-    assert check_between(blind, thumbs()).agreement is None
-    away = side(lambda T: T + np.array([[0, 0, 0, 50.0], *[[0] * 4] * 3]))
-    report = check_between(away, thumbs())
-    assert (report.agreement, report.better) == (None, None)
-
-
 def test_a_fixed_camera_elsewhere_is_said_and_one_read_wrongly_is_refused(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:

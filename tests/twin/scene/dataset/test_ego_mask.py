@@ -12,7 +12,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.terminal import Output
 from twin.scene.dataset.masks import EgoMask, find_ego_mask
-from twin.scene.dataset.scan_check import ScanReport
 from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -115,10 +114,6 @@ def test_a_tip_that_wobbles_is_known_by_its_depth_and_a_patch_elsewhere_is_not(
     assert not found.half[patch].any()  # it hangs on nothing that is carried
 
 
-def test_a_scene_without_a_gripper_is_left_alone(views: list[TrainingView]) -> None:
-    assert find_ego_mask(views) is None
-
-
 def test_an_edge_along_the_path_is_scene_when_depth_says_so() -> None:
     """A camera slides along a striped wall: stripes stay where they are in the image."""
     views = []
@@ -166,12 +161,6 @@ def test_points_and_pixels_of_the_gripper_are_left_out(views: list[TrainingView]
     np.testing.assert_array_equal(masked.half.static_mask, ~mask.half)
     assert not masked.full.depth_m[~masked.full.static_mask].any()
     assert masked.full.static_mask.mean() == pytest.approx(1 - mask.share)
-
-
-def test_what_was_left_out_is_said() -> None:
-    report = ScanReport(poses={}, found=(), ego_mask_shares={"camera wrist of episode scan": 0.123})
-    assert "12 % of the image of camera wrist of episode scan" in report.remarks()[0]
-    assert report.to_record()["carried_fraction"] == {"camera wrist of episode scan": 0.123}
 
 
 @pytest.mark.slow

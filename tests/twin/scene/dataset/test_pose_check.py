@@ -9,7 +9,7 @@ import textured_room
 
 from bridge.geometry import se3
 from twin.scene.dataset.scan_check import BODY_AXES, FLIP_YZ, check_poses
-from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth, meet, thinned_camera
+from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth, thinned_camera
 
 NUM_FRAMES = 10
 
@@ -93,20 +93,7 @@ def test_views_of_different_places_are_said_not_to_overlap() -> None:
     assert "hardly overlap" in check_poses(away).remark()
 
 
-def test_images_without_any_depth_say_nothing() -> None:
-    empty = [replace(t, depth_m=np.zeros_like(t.depth_m)) for t in thumbs()]
-    assert check_poses(empty).num_pairs == 0
-    assert check_poses([]).num_pairs == 0
-
-
 def test_a_thinned_camera_looks_through_the_pixels_that_were_kept() -> None:
     camera = textured_room.DEPTH
     rays = camera.rays()
     np.testing.assert_allclose(thinned_camera(camera, 5).rays(), rays[::5, ::5], atol=1e-12)
-
-
-def test_a_frame_meets_itself_everywhere() -> None:
-    thumb = thumbs()[3]
-    met = meet(thumb, thumb, np.eye(4))
-    assert met.overlap == 1.0
-    assert met.agreement == 1.0

@@ -117,13 +117,3 @@ def test_a_limit_that_does_not_strike_changes_nothing_and_one_that_does_is_repor
     assert [found.underfitted for found in (free, roomy, cut)] == [False, False, True]
     np.testing.assert_array_equal(free.cloud.means_m, roomy.cloud.means_m)
     np.testing.assert_array_equal(free.cloud.colors, roomy.cloud.colors)
-
-
-def test_counting_images_knows_no_time(
-    room: tuple[GaussianCloud, list[TrainingView]], clock: DrawingClock
-) -> None:
-    clock.draw_s = 100.0
-    found = fitted(room, clock, config=replace(BUDGET, iterations=12, budget_s=None))
-    assert found.iterations == 12
-    assert found.colour_steps == BUDGET.appearance_steps
-    assert np.isfinite(found.exposures).all()

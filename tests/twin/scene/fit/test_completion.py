@@ -78,14 +78,3 @@ def test_what_was_measured_stays_visible(
     # At the rim of the hole pixels show half of each; what is opaque is the nearer.
     assert np.mean(shares) < 0.01
     assert max(shares) < 0.02
-
-
-def test_without_holes_or_without_leave_nothing_is_added(
-    scanned: tuple[GaussianCloud, list[TrainingView], RgbdFrame],
-) -> None:
-    cloud, views, _ = scanned
-    assert len(complete_holes(cloud, views, replace(CONFIG, completion=0.0), RASTER)) == 0
-    few = complete_holes(cloud, views, replace(CONFIG, completion=0.01), RASTER)
-    assert 0 < len(few) <= 200
-    masked = [view.without(np.ones(view.half.depth_m.shape, dtype=bool)) for view in views]
-    assert len(complete_holes(cloud, masked, CONFIG, RASTER)) == 0

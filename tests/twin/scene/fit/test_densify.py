@@ -9,7 +9,7 @@ from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.densify import Scores, densify, score
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32
+from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import SAME_EXPOSURE, RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
 
@@ -101,29 +101,9 @@ def test_what_is_transparent_unseen_or_huge_goes(
     assert len(done.cloud) == len(cloud) - 3
 
 
-def test_what_no_image_can_resolve_is_not_split(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
-    cloud = room[0]
-    scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
-    assert densify(cloud, scores, max_splats=10_000, most=100).num_split == 0
-
-
 def test_nothing_is_lost_when_nothing_is_seen(
     room: tuple[GaussianCloud, list[ImageObservation]],
 ) -> None:
     cloud = room[0]
     scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
     assert len(densify(cloud, scores, max_splats=len(cloud), most=0).cloud) == len(cloud)
-
-
-def test_the_same_again_gives_the_same(
-    room: tuple[GaussianCloud, list[ImageObservation]],
-) -> None:
-    cloud, observations = room
-    results = []
-    for threads in (1, 2):
-        scores = score(cloud, observations, Rasteriser(RasterConfig(threads=threads)))
-        results.append(densify(cloud, scores, max_splats=len(cloud) + 50, most=50).cloud)
-    for name, rows in arrays(results[0]):
-        np.testing.assert_array_equal(rows, getattr(results[1], name))

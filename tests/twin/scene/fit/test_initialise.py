@@ -37,12 +37,6 @@ def test_points_lie_on_the_surfaces_and_carry_their_colour() -> None:
     assert np.quantile(error, 0.99) < 0.05
 
 
-def test_normals_face_the_camera() -> None:
-    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
-    table = (np.abs(points.p_m[:, 2]) < 0.003) & (points.p_m[:, 1] < 0.5)
-    np.testing.assert_allclose(np.median(points.normals[table], axis=0), [0, 0, 1], atol=0.05)
-
-
 def test_pixels_without_a_measurement_never_enter() -> None:
     item = textured_room.frame(2, 6)
     depth = item.depth_m.copy()
@@ -88,17 +82,6 @@ def test_gaussians_lie_flat_on_their_surface() -> None:
     )
 
 
-def test_the_first_gaussians_already_show_the_room() -> None:
-    cloud = room_cloud(InitialiseConfig())
-    item = textured_room.frame(2, 6)
-    view = Rasteriser(RasterConfig(threads=1)).view(cloud, item.color_camera, item.T_base_color)
-    middle = (slice(8, -8), slice(8, -8))
-    error = np.abs(view.image[middle] - item.image_u8[middle] / 255.0)
-    assert error.mean() < 0.06
-    expected, _ = textured_room.depth_and_points(item.color_camera, item.T_base_color)
-    assert np.median(np.abs(view.depth_m - expected)[middle]) < 0.01
-
-
 def registered_frame(index: int, depth_factor: float) -> RgbdFrame:
     """A frame of one camera, whose depth reads too far by a factor."""
     item = textured_room.frame(index, 6)
@@ -135,14 +118,6 @@ def test_views_that_disagree_make_one_surface_and_not_layers() -> None:
     assert height_m["surface, off"] < 0.75 * height_m["layers, off"]
 
 
-def test_views_that_agree_move_nothing() -> None:
-    surfaces = [FrameSurface(registered_frame(i, 1.0), LIMITS) for i in range(6)]
-    points = [surface.points() for surface in surfaces]
-    cloud = fuse(points, InitialiseConfig(), [training_view(surface) for surface in surfaces])
-    table, wall = np.abs(cloud.means_m[:, 2]), np.abs(cloud.means_m[:, 1] - 0.6)
-    assert np.quantile(np.minimum(table, wall), 0.95) < 1e-3
-
-
 def test_frames_without_depth_are_refused() -> None:
     item = textured_room.frame(0, 1)
     empty = replace(item, depth_m=np.zeros_like(item.depth_m))
@@ -163,10 +138,3 @@ def test_depth_that_is_no_number_is_no_measurement(nothing: float) -> None:
         surface.trusted, FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
     )
     assert np.isfinite(surface.depth_in_color_camera()).all()
-
-
-def test_a_frame_without_any_depth_has_no_points() -> None:
-    item = textured_room.frame(2, 6)
-    surface = FrameSurface(replace(item, depth_m=np.zeros_like(item.depth_m)), LIMITS)
-    assert len(surface.points().p_m) == 0
-    assert not surface.depth_in_color_camera().any()

@@ -60,21 +60,6 @@ def test_images_and_poses_of_two_clocks_are_refused_and_not_taken_for_a_still_ca
         choose_frames(find_sources(run), FrameConfig(), QUIET)
 
 
-def test_frames_after_the_last_pose_are_left_out_and_counted(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(
-        run,
-        monkeypatch,
-        lambda items: [item for item in items if item.stamp_ns < 2 * SECOND],
-        num_frames=30,
-    )
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output()).choices
-    assert max(choice.train_ns | choice.holdout_ns) <= 1.9 * SECOND + 0.5 * SECOND
-    said = " ".join(capsys.readouterr().err.split())
-    assert "15 of 30 frames of camera wrist are left out: /tf says nothing within 0.5 s" in said
-
-
 def test_a_camera_that_stands_still_may_say_so_once(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,16 +137,6 @@ def test_a_lens_that_distorts_is_refused_by_the_name_of_its_camera(
         textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=6)
     with pytest.raises(GstError, match=r"camera wrist of episode scan .*lens distortion"):
         choose_frames(find_sources(run), FrameConfig(), QUIET)
-
-
-def test_one_camera_that_cannot_be_used_is_named_and_the_others_are_kept(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other_info(monkeypatch, run, lambda c: replace(c, width=128, height=96))
-    textured_room.write_episode(run.episodes_dir / "scan_2.mcap", num_frames=6)
-    (choice,) = choose_frames(find_sources(run), FrameConfig(), Output()).choices
-    assert choice.episode.info.id == "scan_2"
-    assert "left out: camera wrist of episode scan " in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_camera_whose_images_never_come_in_pairs_is_named(

@@ -6,7 +6,7 @@ from seen_colors import effective_colors
 
 from bridge.geometry import se3
 from twin.scene.gaussians import GaussianCloud, moved_cloud
-from twin.scene.skinning import SkinError, bind, node_rotations, pose_cloud
+from twin.scene.skinning import SkinError, bind, pose_cloud
 
 
 @pytest.fixture
@@ -58,43 +58,6 @@ def test_a_rigid_motion_of_the_nodes_moves_every_gaussian_rigidly(
     np.testing.assert_allclose(
         effective_colors(posed, eye), effective_colors(expected, eye), atol=1e-5
     )
-
-
-def test_gaussians_on_nodes_go_where_the_nodes_go(nodes: np.ndarray, cloud: GaussianCloud) -> None:
-    rng = np.random.default_rng(5)
-    on_nodes = cloud.take(np.arange(len(nodes)))
-    moved = GaussianCloud(
-        means_m=nodes.astype(np.float32),
-        quats_wxyz=on_nodes.quats_wxyz,
-        scales_log=on_nodes.scales_log,
-        opacities_logit=on_nodes.opacities_logit,
-        colors=on_nodes.colors,
-    )
-    bent = nodes + 0.001 * rng.normal(size=nodes.shape)
-    posed = pose_cloud(moved, bind(moved.means_m, nodes), bent)
-    # Neighbours pull a little: less than the bending itself.
-    assert np.abs(posed.means_m - bent).max() < 0.003
-
-
-def test_bending_turns_the_ends_by_different_angles(nodes: np.ndarray) -> None:
-    radius = 0.1
-    angle = nodes[:, 0] / radius
-    bent = np.stack(
-        [np.sin(angle) * (radius + nodes[:, 2]), nodes[:, 1],
-         np.cos(angle) * (radius + nodes[:, 2]) - radius], axis=1
-    )  # fmt: skip
-    binding = bind(nodes, nodes)
-    R = node_rotations(nodes, bent, binding.neighbours)
-    turned = np.arctan2(R[:, 0, 2], R[:, 2, 2])
-    inner = (nodes[:, 0] > 0.01) & (nodes[:, 0] < 0.05)
-    np.testing.assert_allclose(turned[inner], angle[inner], atol=0.06)
-
-
-def test_weights_are_shares_of_eight_nodes(nodes: np.ndarray, cloud: GaussianCloud) -> None:
-    weights = bind(cloud.means_m, nodes).weights
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
-    assert weights.data.min() >= 0.0
-    assert (np.diff(weights.indptr) == 8).all()
 
 
 def test_what_does_not_fit_is_refused(nodes: np.ndarray, cloud: GaussianCloud) -> None:

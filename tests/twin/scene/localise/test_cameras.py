@@ -21,7 +21,6 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame, localisations
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.media.color import encode_jpeg
 from bridge.task.task_file import Task
@@ -152,25 +151,3 @@ def test_a_camera_that_nobody_placed_does_not_spoil_the_others(
     assert found.detail["cameras"] == ["side"]
     assert found.T_base_object is not None
     np.testing.assert_allclose(found.T_base_object[:3, 3], CUBE[:3, 3], atol=0.004)
-
-
-def test_without_any_camera_that_can_be_used_the_reason_is_said(
-    run: RunFolder, frame: RgbdFrame, task: Task
-) -> None:
-    with pytest.raises(GstError, match="no transform for frame 'side_color_optical'"):
-        localise_episode(write(run, (frame, None)), task)
-
-
-def test_poses_below_a_world_frame_are_given_in_the_robots_base(
-    run: RunFolder, frame: RgbdFrame, task: Task
-) -> None:
-    T_world_base = se3.transform_from(np.array([0.8, 0.0, 0.0, 0.6]), np.array([1.0, 2.0, 0.7]))
-    path = run.episodes_dir / "trial_1.mcap"
-    with EpisodeWriter(path) as writer:
-        writer.describe(EpisodeInfo(id="trial_1", kind="trial", cell="c", stand_in=True))
-        world = FrameTransform(
-            stamp_ns=0, parent="world", child="base_link", T_parent_child=T_world_base
-        )
-        put(writer, "/tf_static", transforms_to_cdr([world]), schema.TF_MESSAGE, 0)
-        put_camera(writer, frame, "base_link")
-    np.testing.assert_allclose(place_of(run, task, Episode.open(path)), CUBE[:3, 3], atol=0.004)

@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from bridge.task.task_file import load_task
 from twin.scene.localise.objects import TableConfig, fit_table
 from twin.scene.localise.points import (
-    ColourConfig,
     clusters,
-    likeness,
-    linear_image,
-    voxel_mean,
 )
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
 
@@ -53,39 +49,6 @@ def test_the_smallest_rectangle_gives_the_yaw_of_a_filled_rectangle(yaw: float, 
     found = rectangle_yaw_rad(local @ np.array([[c, s], [-s, c]]))
     difference = np.mod(found - yaw + np.pi / 4, np.pi / 2) - np.pi / 4
     assert abs(difference) < 0.12  # 98 % of the points cut the corners a little
-
-
-def test_points_on_a_line_have_a_yaw_of_zero() -> None:
-    assert rectangle_yaw_rad(np.column_stack([np.linspace(0, 1, 50), np.zeros(50)])) == 0.0
-
-
-@settings(max_examples=50, deadline=None)
-@given(shade=st.floats(0.15, 1.0))
-def test_likeness_does_not_depend_on_shading(shade: float) -> None:
-    albedo = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
-    like = likeness(albedo * shade, (200, 45, 40), ColourConfig())
-    np.testing.assert_allclose(like, 1.0, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "other", [(120, 120, 124), (60, 110, 180), (150, 140, 128), (0, 0, 0), (40, 160, 60)]
-)
-def test_other_colours_are_not_alike(other: tuple[int, int, int]) -> None:
-    pixel = linear_image(np.array([[other]], dtype=np.uint8))
-    assert likeness(pixel, (200, 45, 40), ColourConfig()).item() < 0.3
-
-
-def test_a_pixel_that_is_half_grey_is_half_alike() -> None:
-    """Equal luminance of object and grey: the likeness is the covered share."""
-    red = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
-    mixed = 0.5 * red + 0.5 * red.mean()
-    np.testing.assert_allclose(likeness(mixed, (200, 45, 40), ColourConfig()), 0.5, atol=1e-5)
-
-
-def test_voxel_mean_keeps_the_mean_of_each_voxel() -> None:
-    points = np.array([[0.0001, 0, 0], [0.0009, 0, 0], [-0.0005, 0, 0], [0.5, 0.5, 0.5]])
-    means = voxel_mean(points, 0.001)
-    assert sorted(means[:, 0].round(6)) == [-0.0005, 0.0005, 0.5]
 
 
 def test_clusters_are_separated_by_a_gap_and_ordered_by_size() -> None:

@@ -157,13 +157,6 @@ def test_the_underside_is_marked_and_has_the_colours_of_the_sides(closed: Gaussi
     assert error.max() <= 6.0
 
 
-def test_what_no_view_shows_is_not_closed(views: Sequence[TrainingView]) -> None:
-    away = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([3.0, 0, 0]))
-    assert closed_object(cube(), views, away, InitialiseConfig()) is None
-    hidden = [replace(v, full=v.full.without(np.ones_like(v.full.static_mask))) for v in views]
-    assert closed_object(cube(), hidden, T_BASE_CUBE, InitialiseConfig()) is None
-
-
 def test_the_weighted_median_is_the_median_of_repeated_values() -> None:
     rng = np.random.default_rng(1)
     values, weights = rng.normal(size=(7, 20, 3)), rng.integers(0, 4, size=(7, 20))

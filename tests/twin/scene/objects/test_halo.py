@@ -98,12 +98,6 @@ def test_table_under_a_toy_is_dropped_and_filled_and_table_beside_it_is_kept(
     assert np.abs(parts.filling.colors - np.array(WHITE)).max() < 1e-3
 
 
-def test_without_a_reconstructed_shape_nothing_is_guessed() -> None:
-    cloud = cloud_of(np.array([[0.48, -0.17, 0.0], [0.48, -0.17, -0.02]]))
-    given = np.array([-1, -1])
-    assert not hidden_table(cloud, given, {"sloth": T}, {}, TASK).any()
-
-
 def test_what_a_shift_put_onto_the_table_in_the_toys_colour_is_dropped_too(
     shape: ObjectShape,
 ) -> None:

@@ -57,16 +57,6 @@ def written(tmp_path: Path) -> tuple[RunFolder, dict, GaussianCloud, np.ndarray]
     return run, record, parts.background, T
 
 
-def test_the_cube_is_read_back_where_it_was(
-    written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
-) -> None:
-    run, record, _, T = written
-    cube = read_objects(run, record)["cube"]
-    assert len(cube.cloud) >= 590
-    assert np.linalg.norm(cube.T_base_object[:3, 3] - T[:3, 3]) < 2e-3
-    assert np.abs(cube.cloud.means_m).max() < 0.026
-
-
 def test_putting_together_gives_every_gaussian_back(
     written: tuple[RunFolder, dict, GaussianCloud, np.ndarray],
 ) -> None:

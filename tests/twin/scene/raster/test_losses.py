@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from reference_loss import Loss
 
-from twin.scene.raster.rasteriser import psnr_db
-
 Kind = Literal["3dgs", "paper"]
 
 
@@ -48,8 +46,3 @@ def test_the_paper_loss_is_the_squared_error_plus_weighted_depth() -> None:
     assert mse == pytest.approx(float(np.mean((planes[:3] - target) ** 2)), rel=1e-5)
     relative = np.abs(planes[3] - planes[4] * 2.0) / 2.0
     assert value == pytest.approx(mse + 0.5 * float(relative.mean()), rel=1e-5)
-
-
-def test_psnr_of_a_known_error() -> None:
-    assert psnr_db(0.01) == pytest.approx(20.0)
-    assert psnr_db(0.0) == float("inf")

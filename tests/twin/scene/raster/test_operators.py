@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from seen_colors import effective_colors
 
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
@@ -46,26 +45,6 @@ def test_lifting_is_the_adjoint_of_drawing(isa: str, channels: int) -> None:
     assert abs(left - right) < 1e-6 * size
 
 
-def test_colours_and_alpha_are_features_too() -> None:
-    cloud = shiny_cloud(500)
-    rasteriser = Rasteriser(RasterConfig(threads=1))
-    planes = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
-    features = np.concatenate(
-        [effective_colors(cloud, np.zeros(3)), np.ones((500, 1), np.float32)], axis=1
-    )
-    np.testing.assert_allclose(rasteriser.draw_features(features), planes[[0, 1, 2, 4]], atol=2e-5)
-
-
-def test_the_gradient_on_colours_is_what_lifting_gives() -> None:
-    cloud = shiny_cloud(500)
-    rasteriser = Rasteriser(RasterConfig(threads=1))
-    planes = rasteriser.draw_planes(cloud, CAMERA, np.eye(4))
-    upstream = np.random.default_rng(2).normal(size=planes.shape).astype(np.float32)
-    upstream[3:] = 0
-    gradient = rasteriser.pull_back(planes, upstream)
-    np.testing.assert_allclose(rasteriser.lift(upstream[:3]), gradient.colors, atol=1e-4)
-
-
 def test_the_label_with_most_weight_wins() -> None:
     cloud = shiny_cloud(600)
     rasteriser = drawn(cloud, RasterConfig(threads=1))
@@ -78,19 +57,6 @@ def test_the_label_with_most_weight_wins() -> None:
     clear = ordered[-1] - ordered[-2] > 1e-5
     np.testing.assert_array_equal(ids[clear], known[sums.argmax(axis=0)][clear])
     assert set(np.unique(ids)) == set(known.tolist())
-
-
-def test_weights_of_one_label_add_up_and_nothing_is_zero() -> None:
-    cloud = shiny_cloud(1)
-    twice = GaussianCloud(**{name: np.concatenate([rows, rows]) for name, rows in arrays(cloud)})
-    rasteriser = Rasteriser(RasterConfig(threads=1))
-    alpha = rasteriser.draw_planes(twice, CAMERA, np.eye(4))[4]
-    ids, weight = rasteriser.label_map(np.array([4, 4], dtype=np.uint16))
-    np.testing.assert_allclose(weight, alpha, atol=1e-6)
-    np.testing.assert_array_equal(ids, np.where(alpha > 0, 4, 0))
-    # The one in front hides some of the one behind: equal depths keep the order of the rows.
-    ids, _ = rasteriser.label_map(np.array([9, 4], dtype=np.uint16))
-    assert set(np.unique(ids)) == {0, 9}
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
@@ -118,27 +84,6 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     for other in results[1:]:
         for first, second in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(first, second)
-
-
-def test_tables_and_maps_of_another_size_are_refused() -> None:
-    rasteriser = drawn(shiny_cloud(20), RasterConfig(threads=1))
-    with pytest.raises(ValueError, match="one row per Gaussian"):
-        rasteriser.draw_features(np.zeros((19, 3), np.float32))
-    with pytest.raises(ValueError, match="one row per Gaussian"):
-        rasteriser.label_map(np.zeros(21, np.uint16))
-    with pytest.raises(ValueError, match="last draw"):
-        rasteriser.lift(np.zeros((3, CAMERA.height, CAMERA.width + 1), np.float32))
-
-
-def test_nothing_can_be_lifted_before_something_was_drawn() -> None:
-    with pytest.raises(ValueError, match="last draw"):
-        Rasteriser(RasterConfig(threads=1)).lift(np.zeros((1, 4, 4), np.float32))
-
-
-def test_no_channels_are_no_planes() -> None:
-    rasteriser = drawn(shiny_cloud(20), RasterConfig(threads=1))
-    assert rasteriser.draw_features(np.zeros((20, 0), np.float32)).shape == (0, 35, 50)
-    assert rasteriser.lift(np.zeros((0, 35, 50), np.float32)).shape == (20, 0)
 
 
 STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e30, 1e-30, -50.0, 80.0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bridge.geometry.camera import Camera
-from twin.scene.gaussians import GaussianCloud, arrays, as_float32, concatenate
+from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster import rasteriser as raster
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, SplatExtensionMissingError
 
@@ -44,15 +44,6 @@ def draw(cloud: GaussianCloud, config: RasterConfig | None = None) -> np.ndarray
     return Rasteriser(config or RasterConfig(threads=1)).draw_planes(cloud, CAMERA, IDENTITY)
 
 
-def test_a_single_gaussian_lands_on_its_pixel() -> None:
-    planes = draw(one_gaussian(x_px=12.5, y_px=7.5))
-    row, column = np.unravel_index(np.argmax(planes[4]), planes[4].shape)
-    assert (row, column) == (7, 12)
-    # The centre of pixel (12, 7) is (12.5, 7.5): its neighbours see the Gaussian alike.
-    assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 13], rel=1e-5)
-    assert planes[4, 6, 12] == pytest.approx(planes[4, 8, 12], rel=1e-5)
-
-
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0, -65.0])
 def test_depth_follows_the_plane_of_a_flat_gaussian(tilt_deg: float) -> None:
     """Not the depth of its centre: rays meet a tilted disc at other distances."""
@@ -70,28 +61,6 @@ def test_depth_follows_the_plane_of_a_flat_gaussian(tilt_deg: float) -> None:
     spread = np.ptp(expected[row][shown])
     assert np.abs(depth_m - expected)[row][shown].max() < 0.5 * spread**2 + 1e-3
     assert tilt_deg == 0.0 or spread > 0.05
-
-
-def test_what_shines_through_does_not_move_the_surface() -> None:
-    """The weighted mean of depth lies between a wall and what is behind its gaps; a surface no."""
-    wall = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.5, opacity_logit=1.5)
-    behind = one_gaussian(x_px=20.5, y_px=16.5, depth_m=3.0, sigma_m=3.0, opacity_logit=4.0)
-    rasteriser = Rasteriser(RasterConfig(threads=1))
-    cloud = concatenate([behind, wall])
-    planes = rasteriser.draw_planes(cloud, CAMERA, IDENTITY)
-    mean_m = (planes[3] / planes[4])[16, 20]
-    assert mean_m > 1.2
-    assert rasteriser.surface_depth()[16, 20] == pytest.approx(1.0, abs=1e-4)
-    thin = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.5, opacity_logit=-1.0)
-    assert rasteriser.view(concatenate([thin, behind]), CAMERA, IDENTITY).depth_m[
-        16, 20
-    ] == pytest.approx(3.0, abs=1e-3)
-    assert rasteriser.view(thin, CAMERA, IDENTITY).depth_m.max() == 0.0
-
-
-def test_a_gaussian_between_two_pixels_shows_in_both_alike() -> None:
-    planes = draw(one_gaussian(x_px=12.0, y_px=7.5))
-    assert planes[4, 7, 11] == pytest.approx(planes[4, 7, 12], rel=1e-5)
 
 
 def test_alpha_of_a_single_gaussian_is_the_closed_form() -> None:
@@ -127,39 +96,6 @@ def test_the_nearer_gaussian_hides_the_farther_whatever_their_order() -> None:
     assert images[0][3, 16, 20] / images[0][4, 16, 20] == pytest.approx(1.0, abs=0.02)
 
 
-def test_any_number_of_threads_gives_the_same_bits() -> None:
-    cloud = many_gaussians()
-    upstream = np.random.default_rng(1).normal(size=(5, 33, 40)).astype(np.float32)
-    results = []
-    for threads in (1, 2, 5):
-        rasteriser = Rasteriser(RasterConfig(threads=threads))
-        planes = rasteriser.draw_planes(cloud, CAMERA, IDENTITY)
-        gradient = rasteriser.pull_back(planes, upstream)
-        results.append([planes, *(getattr(gradient, name) for name, _ in arrays(cloud))])
-    assert np.abs(results[0][1]).max() > 0
-    for other in results[1:]:
-        for first, second in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(first, second)
-
-
-def test_equal_depths_and_uneven_shares_show_no_threads() -> None:
-    """Ties go by index, and threads that have little to sort are no exception."""
-    cloud = many_gaussians(9000)
-    cloud.means_m[:, 2] = np.round(cloud.means_m[:, 2] * 4) / 4
-    cloud.means_m[2500:8000, 2] *= -1.0
-    drawn = [draw(cloud, RasterConfig(threads=threads)) for threads in (1, 2, 3, 4, 7)]
-    assert drawn[0][4].max() > 0.5
-    for other in drawn[1:]:
-        np.testing.assert_array_equal(drawn[0], other)
-
-
-def test_a_gaussian_behind_the_camera_is_not_drawn() -> None:
-    cloud = one_gaussian(x_px=20.0, y_px=16.5)
-    behind = GaussianCloud(**(dict(arrays(cloud)) | {"means_m": -cloud.means_m}))
-    assert draw(cloud)[4].max() > 0.3
-    assert draw(behind).max() == 0.0
-
-
 @pytest.mark.parametrize("broken", ["means_m", "scales_log", "opacities_logit", "colors"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) -> None:
@@ -176,63 +112,10 @@ def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) 
         assert all(np.isfinite(getattr(gradient, n)[others]).all() for n, _ in arrays(cloud))
 
 
-def test_a_zero_quaternion_is_left_out() -> None:
-    cloud = many_gaussians(50)
-    cloud.quats_wxyz[3] = 0.0
-    rasteriser = Rasteriser(RasterConfig(threads=1))
-    assert np.isfinite(rasteriser.draw_planes(cloud, CAMERA, IDENTITY)).all()
-    assert not rasteriser.visible_mask()[3]
-
-
-def test_a_transparent_gaussian_changes_nothing() -> None:
-    planes = draw(one_gaussian(x_px=20.0, y_px=16.5, opacity_logit=-20.0))
-    assert planes.max() == 0.0
-
-
 def test_an_empty_cloud_draws_black() -> None:
     planes = draw(many_gaussians(1).take(np.zeros(0, dtype=int)))
     assert planes.shape == (5, 33, 40)
     assert planes.max() == 0.0
-
-
-def test_tables_of_different_length_are_refused() -> None:
-    cloud = many_gaussians(5)
-    native = raster.load_native().Rasteriser(1, "auto")
-    pose = np.eye(4, dtype=np.float32)[:3].copy()
-    tables = [rows for _, rows in arrays(cloud)][:4]
-    with pytest.raises(ValueError, match="one row per Gaussian"):
-        native.draw(*tables, cloud.colors[:3], pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
-
-
-def test_double_precision_is_refused_instead_of_copied() -> None:
-    cloud = many_gaussians(5)
-    native = raster.load_native().Rasteriser(1, "auto")
-    pose = np.eye(4, dtype=np.float32)[:3].copy()
-    tables = [rows.astype(np.float64) for _, rows in arrays(cloud)]
-    with pytest.raises(TypeError):
-        native.draw(*tables, pose, (40, 33, 60.0, 60.0, 20.0, 16.5), 0.01, 0.0)
-
-
-def test_an_unknown_instruction_set_is_refused() -> None:
-    with pytest.raises(ValueError, match="'auto', 'base', 'v3' or 'v4'"):
-        Rasteriser(RasterConfig(isa="sparc"))
-
-
-def test_the_widest_instruction_set_is_chosen() -> None:
-    names = raster.available_isas()
-    assert names[0] == "base"
-    assert Rasteriser(RasterConfig(threads=1)).isa == names[-1]
-    for name in names:
-        assert Rasteriser(RasterConfig(threads=1, isa=name)).isa == name
-
-
-def test_the_view_gives_depth_only_where_the_image_is_solid() -> None:
-    view = Rasteriser(RasterConfig(threads=1)).view(
-        one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.25, sigma_m=0.05), CAMERA, IDENTITY
-    )
-    assert view.depth_m[16, 20] == pytest.approx(1.25, rel=1e-4)
-    assert view.depth_m[0, 0] == 0.0
-    assert view.image_u8().dtype == np.uint8
 
 
 def test_a_missing_extension_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,6 @@ from twin.scene.raster.rasteriser import (
     FitSession,
     RasterConfig,
     Rasteriser,
-    available_isas,
     load_native,
 )
 
@@ -145,49 +144,6 @@ def test_a_step_follows_a_finite_difference_of_the_gain(exposure: np.ndarray) ->
         assert (losses[0] - losses[1]) / 2e-2 == pytest.approx(gradient[channel], rel=1e-2)
 
 
-def test_arrays_without_a_rate_stay() -> None:
-    cloud = some_cloud()
-    session = FitSession(cloud, RasterConfig(threads=1))
-    session.step(some_target(), a_pose(), {"colors": 0.01})
-    for name, rows in arrays(cloud):
-        assert np.array_equal(getattr(session.cloud, name), rows) == (name != "colors")
-
-
-def test_the_callers_cloud_is_not_altered() -> None:
-    cloud = some_cloud()
-    for _, rows in arrays(cloud):
-        rows.flags.writeable = False
-    FitSession(cloud, RasterConfig(threads=1)).step(some_target(), a_pose(), RATES)
-
-
-@pytest.mark.parametrize("isa", available_isas())
-def test_fitting_one_view_lowers_its_loss(isa: str) -> None:
-    session = FitSession(some_cloud(), RasterConfig(threads=1, isa=isa))
-    target = some_target(masked=False)
-    losses = [session.step(target, a_pose(), RATES).loss for _ in range(30)]
-    assert losses[-1] < 0.9 * losses[0]
-
-
-@pytest.mark.parametrize(("num_harmonics", "exposure"), [(3, GAIN), (15, MIXED)])
-def test_any_number_of_threads_fits_the_same_bits(num_harmonics: int, exposure: np.ndarray) -> None:
-    results = []
-    for threads in (1, 2, 3):
-        session = FitSession(some_cloud(5000, num_harmonics), RasterConfig(threads=threads))
-        reports = [session.step(some_target(), a_pose(), RATES, exposure) for _ in range(3)]
-        results.append(
-            [
-                *(rows for _, rows in arrays(session.cloud)),
-                np.array([report.loss for report in reports]),
-                reports[-1].gain,
-                reports[-1].T_camera_base,
-                session.planes(),
-            ]
-        )
-    for other in results[1:]:
-        for first, second in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(first, second)
-
-
 def test_an_image_that_is_masked_everywhere_teaches_nothing() -> None:
     target = some_target()
     nothing = Target(
@@ -217,26 +173,3 @@ def test_moments_go_along_with_their_gaussians() -> None:
     other = twin.step(some_target(), a_pose(), RATES)
     assert report.loss == other.loss
     assert not np.array_equal(session.cloud.means_m[0], twin.cloud.means_m[0])
-
-
-def test_an_image_of_another_size_is_refused() -> None:
-    target = some_target()
-    other = Target(
-        camera=Camera(width=60, height=94, fx=70.0, fy=70.0, cx=30.0, cy=47.0),
-        planes_u8=target.planes_u8,
-        depth_m=target.depth_m,
-        static_mask=target.static_mask,
-    )
-    session = FitSession(some_cloud(10), RasterConfig(threads=1))
-    with pytest.raises(ValueError, match="camera's size"):
-        session.step(other, a_pose(), RATES)
-
-
-def test_an_empty_cloud_is_a_black_image() -> None:
-    empty = some_cloud().take(np.zeros(0, dtype=int))
-    session = FitSession(empty, RasterConfig(threads=1))
-    report = session.step(some_target(), a_pose(), RATES)
-    assert np.isfinite(report.loss)
-    assert not session.planes().any()
-    assert not report.T_camera_base.any()
-    assert len(session.gradient(report).means_m) == 0

@@ -1,7 +1,6 @@
 """The scene folder: what vouches for what, what is damaged, and what is never looked at."""
 
 import json
-import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,11 +15,10 @@ from small_scene import CONFIG, QUIET
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.task.task_file import Task, TaskFile, load_task
 from twin.replay.config import ReplayRunConfig
-from twin.replay.workers import replay_run
+from twin.replay.runner import replay_run
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.frames.selection import choose_frames, find_sources
@@ -35,7 +33,6 @@ from twin.scene.settings import (
     InitialiseConfig,
     RenderConfig,
 )
-from twin.scene.store.calibration import write_physics
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
@@ -80,14 +77,6 @@ def test_a_background_that_is_not_the_described_one_is_refused_and_made_again(
     assert len(read_scene(room).background) > 0
 
 
-def test_a_lost_object_file_is_made_again(room: RunFolder) -> None:
-    lost = {"folder": "objects/cube", "files": {"gaussians.ply": "0" * 64}}
-    change_record(room, lambda record: record["objects"].update(cube=lost))
-    before = (room.scene_dir / "background.ply").stat().st_mtime_ns
-    assert rebuild(room, CONFIG, QUIET)["objects"] == {}
-    assert (room.scene_dir / "background.ply").stat().st_mtime_ns > before
-
-
 @pytest.mark.parametrize(
     "text",
     ["", "{", "[]", '{"T_base_object": null}', '{"T_base_object": {"p_m": [0], "q_wxyz": [1]}}',
@@ -101,32 +90,6 @@ def test_a_damaged_object_file_is_refused(room: RunFolder, text: str) -> None:
     (folder / "object.json").write_text(text)
     with pytest.raises(UnreadableSceneError, match=r"object\.json"):
         read_objects(room, {"objects": {"cube": {}}})
-
-
-def test_views_of_another_program_are_kept_and_our_own_old_ones_are_not(room: RunFolder) -> None:
-    (own,) = room.derived("*.views.*")
-    foreign = room.derived_dir / "scan.views.otherone.mcap"
-    with EpisodeWriter(foreign) as writer:
-        about = Episode.open(own).derived
-        assert about is not None
-        theirs = replace(about, engine="another program")
-        writer.describe(EpisodeInfo(id="scan.views.otherone", kind="scan"), derived=theirs)
-    config = replace(CONFIG, fit=replace(CONFIG.fit, iterations=7))
-    scene_hash = rebuild(room, config, QUIET)["scene_hash"]
-    assert not own.exists()
-    assert room.derived("*.views.*") == sorted(
-        [foreign, room.derived_dir / f"scan.views.{scene_hash}.mcap"]
-    )
-
-
-def test_what_was_found_out_about_physics_does_not_make_a_scene_out_of_date(
-    room: RunFolder,
-) -> None:
-    """A scene made again has another name where time counts, and replays of the old one go."""
-    write_physics(room, {"promoted": True, "identified": {}, "id": "a"})
-    before = (room.scene_dir / "background.ply").stat().st_mtime_ns
-    rebuild(room, CONFIG, QUIET)
-    assert (room.scene_dir / "background.ply").stat().st_mtime_ns == before
 
 
 def test_the_scene_of_black_images_is_described_in_plain_json(
@@ -288,12 +251,6 @@ def test_settings_that_nothing_can_be_made_with_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=found):
         make()
-
-
-def test_only_a_fit_by_time_has_a_limit_by_default() -> None:
-    assert FitConfig().limit_s == 60.0
-    assert math.isinf(FitConfig(iterations=3).limit_s)
-    assert FitConfig(iterations=3, budget_s=5.0).limit_s == 5.0
 
 
 def test_a_scene_whose_time_ended_before_its_images_is_reported_as_underfitted(

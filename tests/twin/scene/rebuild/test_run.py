@@ -13,13 +13,12 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import PathNotFoundError, UsageError
 from bridge.media.color import decode_color
 from bridge.terminal import Output
-from twin.scene.frames.selection import NoFramesError, choose_frames, find_sources
+from twin.scene.frames.selection import find_sources
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.render import render
 from twin.scene.settings import (
     FitConfig,
-    FrameConfig,
     InitialiseConfig,
     RebuildConfig,
     RenderConfig,
@@ -43,13 +42,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=16)
     rebuild(run, CONFIG, QUIET)
     return run
-
-
-def test_held_out_frames_are_never_learnt_from(room: RunFolder) -> None:
-    (choice,) = choose_frames(find_sources(room), FrameConfig(holdout_every=4)).choices
-    assert len(choice.holdout_ns) == 4
-    assert len(choice.train_ns) == 12
-    assert not choice.holdout_ns & choice.train_ns
 
 
 def test_the_scene_resembles_what_was_held_out(room: RunFolder) -> None:
@@ -115,22 +107,6 @@ def test_done_work_is_skipped_and_other_settings_redo_it(
     assert forced["scene_hash"] == record["scene_hash"]  # a number of images is reproducible
 
 
-def test_a_render_from_a_recorded_pose_and_from_a_chosen_one(
-    room: RunFolder, tmp_path: Path
-) -> None:
-    drawn = render(room, RenderConfig(at_s=0.4, depth=True, out=tmp_path / "a.png"))
-    image = decode_color((tmp_path / "a.png").read_bytes())
-    expected = textured_room.frame(4, 16).image_u8
-    assert np.abs(image.astype(float) - expected)[8:-8, 8:-8].mean() < 20
-    assert (tmp_path / "a_depth.png").is_file()
-    assert drawn["camera"] == "wrist"
-    render(
-        room,
-        RenderConfig(eye=(0.0, -0.8, 0.6), target=(0.0, 0.1, 0.0), out=tmp_path / "b.png"),
-    )
-    assert decode_color((tmp_path / "b.png").read_bytes()).max() > 100
-
-
 @pytest.mark.parametrize(
     ("config", "found"),
     [
@@ -145,11 +121,6 @@ def test_a_view_that_cannot_be_drawn_is_refused(
 ) -> None:
     with pytest.raises(UsageError, match=found):
         render(room, config)
-
-
-def test_a_run_without_frames_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(NoFramesError, match="robot-gst import rgbd"):
-        rebuild(RunFolder.create(tmp_path), CONFIG, QUIET)
 
 
 def test_a_run_that_was_not_rebuilt_says_so(tmp_path: Path) -> None:
@@ -177,22 +148,6 @@ def test_scans_are_preferred_and_their_absence_is_said(tmp_path: Path) -> None:
     both = find_sources(run)
     assert [episode.info.id for episode in both.episodes] == ["scan"]
     assert both.remark == ""
-
-
-def test_a_camera_that_stands_still_is_known_as_such(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path)
-    textured_room.write_episode(run.episodes_dir / "scan.mcap", num_frames=24, still=True)
-    (choice,) = choose_frames(find_sources(run), FrameConfig()).choices
-    assert choice.stationary
-    assert len(choice.train_ns) == 4
-    assert len(choice.holdout_ns) == 2
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("60s", 60), ("2min", 120), ("90", 90), ("0.5h", 1800), ("1.5 m", 90)]
-)
-def test_durations_are_read(text: str, seconds: float) -> None:
-    assert parse_duration_s(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "soon", "-3s", "3 days", "1e3"])

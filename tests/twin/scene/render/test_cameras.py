@@ -12,7 +12,6 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.media.color import decode_color
-from twin.scene import render as render_module
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import write_calibration
@@ -70,8 +69,3 @@ def test_an_episode_that_cannot_be_read_does_not_stop_the_others(
 ) -> None:
     (room.episodes_dir / "trial_1.mcap").write_bytes(b"cut short")
     render(room, RenderConfig(out=tmp_path / "a.png"))
-
-
-def test_depth_beyond_what_a_depth_image_can_say_is_not_wrapped_around() -> None:
-    depth = np.array([[0.0, 1.2344, 65.6, 1e4]], dtype=np.float32)
-    assert render_module.depth_image(depth).tolist() == [[0, 1234, 65535, 65535]]

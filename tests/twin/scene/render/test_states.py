@@ -7,19 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import textured_room
-from seen_colors import effective_colors
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.media.color import decode_color
 from bridge.robots.default import ROBOT
 from twin.scene import render as compose_module
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
-    moved_cloud,
     write_ply,
 )
 from twin.scene.render import compose, object_places, render
@@ -35,7 +32,6 @@ pytestmark = pytest.mark.usefixtures("few_voxels")
 
 
 T_BLOB = se3.transform_from(np.array([0.9, 0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.1]))
-EYE = {"eye": (0.0, -0.8, 0.6), "target": (0.0, 0.1, 0.0)}
 HOME = (-0.263, -1.709, 1.365, -1.227, -1.571, 1.308)
 
 
@@ -66,32 +62,6 @@ def rebuilt_once(rebuilt_once: Path, tmp_path_factory: pytest.TempPathFactory) -
     record["objects"] = {"blob": {"folder": "objects/blob", "files": {"gaussians.ply": ""}}}
     write_record(run, record)
     return run.path
-
-
-def picture(run: RunFolder, tmp_path: Path, **settings: object) -> np.ndarray:
-    render(run, RenderConfig(out=tmp_path / "out.png", **{**EYE, **settings}))
-    return decode_color((tmp_path / "out.png").read_bytes()).astype(float)
-
-
-def text_of(T: np.ndarray) -> str:
-    q, p = se3.split(T)
-    return "blob=" + ",".join(repr(float(value)) for value in [*p, *q])
-
-
-def test_an_object_put_where_it_was_changes_nothing(room: RunFolder, tmp_path: Path) -> None:
-    plain = picture(room, tmp_path)
-    same = picture(room, tmp_path, object=(text_of(T_BLOB),))
-    moved = picture(room, tmp_path, object=("blob=-0.2,0.1,0.1",))
-    np.testing.assert_allclose(same, plain, atol=1)
-    assert np.abs(moved - plain).max() > 60
-
-
-def test_all_that_moves_with_the_camera_looks_the_same() -> None:
-    """Colour depends on direction in the object: harmonics turn with it."""
-    T = se3.transform_from(np.array([0.6, 0.3, -0.5, 0.2]), np.array([0.3, 0.2, 0.1]))
-    eye = np.array([0.4, -0.3, 0.2])
-    there = effective_colors(moved_cloud(blob(), T), se3.apply(T, eye[None])[0])
-    np.testing.assert_allclose(there, effective_colors(blob(), eye), atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,12 @@
 """The light on the arm: found from links that turned, taken off their paint, put on again."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.lighting import EVEN, Lighting, Patches, fit_lighting, read_lighting
+from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
 from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.settings import InitialiseConfig
 
@@ -76,33 +75,7 @@ def test_lit_gaussians_are_as_bright_as_where_they_face() -> None:
     assert EVEN.on(cloud) is cloud
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_one_posture_says_nothing_of_light(count: int) -> None:
-    """Every piece faces one way: paint alone explains it all."""
-    found = link_lighting({"arm": [box()]}, {"arm": seen(count)})
-    directions = Rotation.random(100, random_state=3).apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(found.brightness(directions), 1.0, atol=0.02)
-    assert fit_lighting([]) == EVEN
-
-
-def test_no_surface_is_drawn_black_or_inside_out() -> None:
-    harsh = Lighting(coefficients=(0.2, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    assert harsh.brightness(np.array([[0.0, 0.0, -1.0]]))[0] == pytest.approx(0.1)
-
-
 def test_light_is_kept_in_the_record_and_older_scenes_are_lit_evenly() -> None:
     record = {"robot": {"lighting": TRUE.to_record()}}
     assert read_lighting(record) == TRUE
     assert read_lighting({"robot": {"links": {}}}) == read_lighting({}) == EVEN
-
-
-def test_a_piece_seen_in_one_posture_only_does_not_count() -> None:
-    """A dark thing that always faces down is a dark thing, not a dark side of the cell."""
-    down = np.tile([0.0, 0.0, -1.0], (40, 1))
-    dark = Patches(ids=np.arange(40), colors=np.full((40, 3), 0.02), normals=down,
-                   weights=np.full(40, 10.0))  # fmt: skip
-    turns = Rotation.random(30, random_state=5).apply([0.0, 0.0, 1.0])
-    even = Patches(ids=np.full(30, 40), colors=np.full((30, 3), 0.5), normals=turns,
-                   weights=np.full(30, 10.0))  # fmt: skip
-    found = fit_lighting([dark, even])
-    assert found.brightness(np.array([[0.0, 0.0, -1.0]]))[0] == pytest.approx(1.0, abs=0.05)

@@ -1,10 +1,9 @@
 """A link drawn on its own shape: closed, in the colours that each side was seen in."""
 
 import numpy as np
-import pytest
 
 from bridge.geometry.mesh import sample_triangles
-from twin.scene.fit.on_mesh import Triangles, surface_area_m2
+from twin.scene.fit.on_mesh import Triangles
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
 from twin.scene.robot.link_surface import on_surface
@@ -64,8 +63,3 @@ def _evenly(surface: Triangles, count: int) -> tuple[np.ndarray, np.ndarray, np.
 def test_a_shape_that_is_not_the_links_is_not_used() -> None:
     assert on_surface([box(HALF_M + 0.03)], [seen()], 0.01, InitialiseConfig()) is None
     assert on_surface([box(HALF_M + 0.003)], [seen()], 0.01, InitialiseConfig()) is not None
-
-
-def test_the_area_of_a_box() -> None:
-    x, y, z = 2 * HALF_M
-    assert surface_area_m2([box()]) == pytest.approx(2 * (x * y + y * z + z * x))

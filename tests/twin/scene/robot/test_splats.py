@@ -17,7 +17,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.model import RobotDescriptionError, load_robot
-from twin.robot.posture import Posture, posture_track
+from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface, link_poses, sample_surface
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32, moved_cloud
@@ -99,10 +99,6 @@ def test_a_link_moves_exactly_as_forward_kinematics_says(skin: GaussianCloud) ->
         np.testing.assert_array_equal(after.scales_log, before.scales_log)
 
 
-def test_without_links_nothing_is_posed() -> None:
-    assert len(posed({}, HOME, URDF)) == 0
-
-
 def test_an_unknown_link_lists_those_that_exist(skin: GaussianCloud) -> None:
     with pytest.raises(RobotDescriptionError, match="forearm_link"):
         posed({"tentacle": skin}, HOME, URDF)
@@ -178,16 +174,6 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> Episode:
                     log_time_ns=tenth * SECOND // 10,
                 )
     return Episode.open(path)
-
-
-def test_postures_know_when_the_robot_stood_still(episode: Episode) -> None:
-    track = posture_track(episode)
-    assert track.is_stationary(SECOND)
-    assert not track.is_stationary(2 * SECOND)
-    assert track.is_stationary(3 * SECOND)
-    assert not track.is_stationary(30 * SECOND)
-    np.testing.assert_allclose(track.at(3 * SECOND).joints_rad, AWAY, atol=1e-9)
-    assert track.at(SECOND).width_m == pytest.approx(WIDTH_M)
 
 
 def test_the_robot_never_enters_the_background_and_its_hole_is_filled(episode: Episode) -> None:

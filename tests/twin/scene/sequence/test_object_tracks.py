@@ -169,14 +169,6 @@ def test_closing_fingers_push_a_cube_until_it_fits_between_them(
     assert left == pytest.approx(left_deg, abs=3.0)
 
 
-def test_an_object_far_from_the_fingers_is_not_carried() -> None:
-    track = posture_track()
-    before = T_tcp(3, track) @ IN_HAND
-    before[0, 3] += 0.2
-    poses = tracks(before, before).at(5 * S, T_tcp(5, track))
-    np.testing.assert_allclose(poses["cube"], before, atol=1e-12)
-
-
 def test_what_nobody_found_is_absent_and_what_is_lost_stays_where_the_hand_put_it() -> None:
     track = posture_track()
     assert tracks(None, None).absent == {"cube"}

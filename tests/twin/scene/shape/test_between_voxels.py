@@ -5,8 +5,7 @@ import pytest
 
 from twin.scene.shape.carve import Evidence, VoxelBox, signed_distances
 from twin.scene.shape.isosurface import isosurface
-from twin.scene.shape.mesh import volume_m3
-from twin.scene.shape.sdf import distances_of_solid, smoothed
+from twin.scene.shape.sdf import distances_of_solid
 
 VOXEL, TRUNCATION = 0.002, 0.008
 COUNTS = (24, 20, 20)
@@ -49,19 +48,3 @@ def test_where_nobody_measured_faces_between_voxels_are_the_surface() -> None:
     np.testing.assert_allclose(
         signed_distances(solid, blind, TRUNCATION), distances_of_solid(solid, VOXEL), atol=1e-7
     )
-
-
-def test_solid_stays_solid_and_free_stays_free() -> None:
-    solid, evidence = wall(8.02, 11.97)
-    values = signed_distances(solid, evidence, TRUNCATION)
-    np.testing.assert_array_equal(values < 0, solid)
-
-
-def test_smoothing_keeps_what_a_thin_wall_holds() -> None:
-    solid, evidence = wall(8.3, 11.4)
-    before = signed_distances(solid, evidence, TRUNCATION)
-    volumes = [
-        volume_m3(*isosurface(values, BOX.origin_m, VOXEL))
-        for values in (before, smoothed(before, VOXEL, 0.8))
-    ]
-    assert volumes[1] == pytest.approx(volumes[0], rel=0.04)

@@ -13,7 +13,6 @@ from bridge.errors import PathNotFoundError
 from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.mesh import (
     UnreadableMeshError,
-    face_normals,
     is_watertight,
     mesh_ply,
     read_mesh,
@@ -26,16 +25,6 @@ def sphere(radius_m: float, step_m: float) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     values = (np.linalg.norm(points, axis=-1) - radius_m).astype(np.float32)
     return isosurface(values, np.full(3, axis[0]), step_m)
-
-
-def test_a_sphere_is_closed_has_its_volume_and_faces_outwards() -> None:
-    vertices, faces = sphere(0.05, 0.002)
-    assert is_watertight(faces)
-    assert volume_m3(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=2e-3)
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, atol=1e-4)
-    normals, _ = face_normals(vertices, faces)
-    outwards = np.einsum("ni,ni->n", normals, vertices[faces].mean(axis=1))
-    assert np.all(outwards > 0)
 
 
 @settings(max_examples=40, deadline=None)
@@ -65,12 +54,6 @@ def test_the_surface_lies_where_scikit_image_puts_it() -> None:
                                atol=0.02 * step)  # fmt: skip
     their_volume = abs(volume_m3(theirs.astype(np.float64), their_faces.astype(np.int64)))
     assert volume_m3(vertices, faces) == pytest.approx(their_volume, rel=5e-3)
-
-
-def test_a_solid_that_fills_the_grid_is_closed_at_its_border() -> None:
-    vertices, faces = isosurface(np.full((4, 4, 4), -1.0, np.float32), np.zeros(3), 1.0)
-    assert is_watertight(faces)
-    assert volume_m3(vertices, faces) == pytest.approx(4.0**3, rel=0.15)
 
 
 def test_an_open_mesh_a_flipped_face_and_no_mesh_are_not_watertight() -> None:

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from solid_shapes import ball_shape, grid, shape_of
 
 from twin.scene.shape.carve import ShapeError
@@ -25,13 +23,6 @@ def inside(ball: ObjectShape) -> Lattice:
     return lattice(ball)
 
 
-def test_nodes_lie_in_the_solid(ball: ObjectShape, inside: Lattice) -> None:
-    away = ball.sdf.distance(inside.nodes_m.astype(np.float64))
-    assert away.max() < 0.004
-    assert (away > 0.001).mean() < 0.15
-    assert len(inside.nodes_m) > 100
-
-
 def test_tetrahedra_are_positive_and_fill_the_shape(ball: ObjectShape, inside: Lattice) -> None:
     volumes = tet_volumes_m3(inside.nodes_m.astype(np.float64), inside.tets)
     assert np.all(volumes > 0)
@@ -40,23 +31,6 @@ def test_tetrahedra_are_positive_and_fill_the_shape(ball: ObjectShape, inside: L
     assert np.all(inside.mass_fraction > 0)
     centre = inside.mass_fraction @ inside.nodes_m
     np.testing.assert_allclose(centre, ball.vertices_m.mean(axis=0), atol=0.001)
-
-
-def test_every_inner_face_belongs_to_two_tetrahedra(inside: Lattice) -> None:
-    faces = np.concatenate(
-        [inside.tets[:, c] for c in ([0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3])]
-    )
-    _, counts = np.unique(np.sort(faces, axis=1), axis=0, return_counts=True)
-    assert set(counts.tolist()) == {1, 2}
-    # Tetrahedra that did not fit together would leave their faces single.
-    assert (counts == 2).sum() > (counts == 1).sum()
-
-
-def test_tetrahedra_tie_all_nodes_together(inside: Lattice) -> None:
-    num = len(inside.nodes_m)
-    pairs = np.concatenate([inside.tets[:, [0, k]] for k in (1, 2, 3)])
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(num, num))
-    assert connected_components(graph, directed=False)[0] == 1
 
 
 def test_a_lattice_is_read_back(inside: Lattice, tmp_path: Path) -> None:

@@ -7,12 +7,9 @@ import cast_views
 import numpy as np
 import pytest
 
-from bridge.geometry import se3
 from twin.scene.shape.carve import MaskedView, ShapeError
 from twin.scene.shape.mesh import is_watertight, volume_m3
-from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, moved_views, reconstruct
-from twin.scene.shape.registration import laid_together
-from twin.scene.shape.sdf import SdfGrid
+from twin.scene.shape.reconstruct import ObjectShape, ShapeConfig, reconstruct
 
 NOISE = 0.004
 """1 mm at 0.5 m, growing with the square of the distance [1/m]."""
@@ -79,38 +76,6 @@ def test_an_open_box_stays_open(box: ObjectShape) -> None:
     assert box.sdf.distance(middle) > 0.4 * min(model.inner_m)
 
 
-def test_a_figure_with_a_neck_keeps_it() -> None:
-    mesh = cast_views.figure_mesh()
-    shape = reconstruct(views_of(mesh), 0.0, QUICK)
-    check(shape, mesh, volume_m3(*mesh))
-
-
-def test_without_noise_a_sphere_in_the_air_is_closed_by_itself() -> None:
-    ball = cast_views.solid_mesh(
-        lambda p: np.linalg.norm(p, axis=1) - 0.03, (-0.04,) * 3, (0.04,) * 3, 0.002
-    )
-    poses = cast_views.around([0, 0, 0], 16)
-    below = [cast_views.look_at(T[:3, 3] * [1, 1, -1], np.zeros(3)) for T in poses]
-    views = cast_views.cast([ball, cast_views.table(-0.5, 2.0)], [*poses, *below])
-    shape = reconstruct(views, None, QUICK)
-    assert shape.is_watertight
-    assert shape.volume_m3 == pytest.approx(4 / 3 * np.pi * 0.03**3, rel=0.05)
-    assert shape.completed_fraction < 0.02
-
-
-def test_moving_cameras_and_object_together_moves_the_result(cube: ObjectShape) -> None:
-    T = se3.transform_from(np.array([0.92, 0.0, 0.0, 0.39]), np.array([0.4, -0.2, 0.1]))
-    views = moved_views(cube_views(), T)
-    moved = reconstruct(views, 0.1, QUICK)
-    assert moved.volume_m3 == pytest.approx(cube.volume_m3, rel=0.05)
-    back = se3.apply(se3.invert(T), moved.vertices_m)
-    there = np.abs(cube.sdf.distance(back))
-    assert there.mean() < 0.001
-    # In a frame that turns with the views, nothing changes but rounding.
-    again = reconstruct(moved_views(views, se3.invert(T)), 0.0, QUICK)
-    assert again.volume_m3 == pytest.approx(cube.volume_m3, rel=1e-3)
-
-
 def test_views_that_are_shifted_against_each_other_are_laid_together() -> None:
     rng = np.random.default_rng(3)
     shifted = []
@@ -142,34 +107,6 @@ def test_views_that_all_stand_too_far_out_do_not_thin_a_wall() -> None:
     assert thin.volume_m3 < 0.85 * solid
     assert mended.volume_m3 == pytest.approx(solid, rel=0.08)
     assert 0.0007 < mended.view_shift_m < 0.002  # an offset of the depth explains part of it
-
-
-def test_views_that_agree_are_left_where_they_are() -> None:
-    views = cube_views()
-    moved, shift = laid_together(views, 0.0, 6)
-    assert shift < 0.0015  # the noise is 1 mm, and a cube of 4 cm has few points
-    turns = [
-        m.T_base_camera @ se3.invert(v.T_base_camera) for m, v in zip(moved, views, strict=True)
-    ]
-    assert max(float(se3.rotation_angle_rad(T[:3, :3])) for T in turns) < 0.006
-    same, none = laid_together(views, 0.0, 0)
-    assert none == 0.0
-    assert same == views
-
-
-def test_a_flying_pixel_and_a_hole_in_the_depth_change_nothing(cube: ObjectShape) -> None:
-    views = cube_views()
-    rng = np.random.default_rng(0)
-    broken = []
-    for view in views:
-        depth = view.depth_m.copy()
-        depth[rng.random(depth.shape) < 0.05] = np.nan
-        row, column = np.nonzero(view.mask)
-        depth[row[0], column[0]] = 0.9
-        depth[row[-1], column[-1]] = -np.inf
-        broken.append(replace(view, depth_m=depth))
-    shape = reconstruct(broken, 0.0, QUICK)
-    assert shape.volume_m3 == pytest.approx(cube.volume_m3, rel=0.06)
 
 
 def test_an_opening_nobody_looked_into_stays_solid() -> None:
@@ -216,24 +153,3 @@ def test_poses_that_contradict_each_other_are_refused() -> None:
     ]
     with pytest.raises(ShapeError, match="Check the camera poses"):
         reconstruct(apart, 0.0, QUICK)
-
-
-def test_a_plane_above_the_object_is_refused() -> None:
-    with pytest.raises(ShapeError, match="below the plane"):
-        reconstruct(cube_views(4), 1.0, QUICK)
-
-
-def test_sizes_that_differ_and_a_pose_that_is_no_number_are_refused() -> None:
-    (view,) = cube_views(1)
-    with pytest.raises(ShapeError, match="320 x 240"):
-        replace(view, mask=np.zeros((10, 10), dtype=bool))
-    with pytest.raises(ShapeError, match="not finite"):
-        replace(view, T_base_camera=np.full((4, 4), np.nan))
-
-
-def test_the_grid_of_distances_holds_the_whole_solid(cube: ObjectShape) -> None:
-    values = cube.sdf.values_m
-    assert isinstance(cube.sdf, SdfGrid)
-    assert cube.sdf.closed
-    for axis in range(3):
-        assert values.take([0, -1], axis=axis).min() > 0

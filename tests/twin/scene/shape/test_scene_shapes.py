@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cast_views
 import numpy as np
-import open3d as o3d
 import pytest
 
 from bridge.geometry import se3
@@ -15,13 +14,11 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import ObjectSplats, SceneParts, write_objects
 from twin.scene.shape.from_training import (
-    masked_view,
     shapes_of,
 )
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import is_watertight, volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
-from twin.scene.shape.sdf import SdfGrid
 
 TASK, POSES = cast_views.TASK, cast_views.POSES
 
@@ -69,13 +66,6 @@ def test_an_object_whose_frame_leans_is_reconstructed_all_the_same(
     assert shape.volume_m3 == pytest.approx(known_volume("cube"), rel=0.1)
 
 
-def test_a_pixel_belongs_to_the_nearest_object(views: list[TrainingView]) -> None:
-    masks = {key: masked_view(views[0], key, TASK.objects, POSES).mask for key in POSES}
-    assert masks["cube"].any()
-    assert masks["box"].any()
-    assert not (masks["cube"] & masks["box"]).any()
-
-
 def test_what_cannot_be_reconstructed_says_why(views: list[TrainingView]) -> None:
     tipped = {"cube": se3.transform_from(np.array([0.7, 0.7, 0, 0]), np.array([0.5, -0.1, 0.02]))}
     assert "upright" in str(shapes_of(views, TASK.objects, tipped)["cube"])
@@ -107,25 +97,6 @@ def localised(key: str) -> LocalisedObject:
         reason=None,
         stamp_ns=1,
     )
-
-
-@pytest.mark.slow
-def test_the_folder_holds_what_object_json_says(
-    shapes: dict[str, ObjectShape | str], tmp_path: Path
-) -> None:
-    where = {key: localised(key) for key in POSES}
-    record = write_objects(tmp_path, parts_of("cube", "box"), where, TASK, shapes)
-    for key in POSES:
-        folder = tmp_path / "objects" / key
-        about = json.loads((folder / "object.json").read_text())
-        assert about["schema_version"] == 4
-        assert about["shape_source"].startswith("reconstructed from 24")
-        assert about["geometry"]["watertight"] is True
-        present = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-        assert present == set(record[key]["files"])
-        mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
-        assert mesh.is_edge_manifold(allow_boundary_edges=False)
-        assert SdfGrid.load(folder / "sdf.npz").distance(np.zeros(3)) < 0.01
 
 
 @pytest.mark.slow

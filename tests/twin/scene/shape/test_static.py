@@ -10,12 +10,10 @@ import pytest
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.from_training import (
     from_outside_m,
     rim_height_m,
     with_heights,
-    write_static,
 )
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.sdf import SdfGrid
@@ -87,31 +85,6 @@ def test_an_observed_distance_that_is_not_finite_is_refused(
     damaged.save(tmp_path / "sdf.npz")
     with pytest.raises(UnreadableArraysError, match="a distance is not finite"):
         StaticSdf.load(tmp_path / "sdf.npz")
-
-
-def test_a_budget_of_voxels_makes_them_larger(views: list[TrainingView]) -> None:
-    small = static_sdf(views, 0.0, [], StaticConfig(max_voxels=8000))
-    assert small.state.size <= 9000
-    assert small.conservative.voxel_m > 0.008
-
-
-def test_without_views_there_is_no_static_scene_but_a_reason(tmp_path: Path) -> None:
-    with pytest.raises(ShapeError, match="0 points"):
-        static_sdf([], 0.0)
-    (tmp_path / "sdf.npz").write_bytes(b"old")
-    about = write_static(tmp_path, [], None, {})
-    assert about["file"] is None
-    assert "0 points" in about["remark"]
-    assert not (tmp_path / "sdf.npz").exists()
-
-
-def test_the_scene_folder_gets_the_static_scene(views: list[TrainingView], tmp_path: Path) -> None:
-    about = write_static(tmp_path, views, TASK, POSES, COARSE)
-    assert about["file"] == "sdf.npz"
-    again = StaticSdf.load(tmp_path / "sdf.npz")
-    assert again.conservative.distance(POSES["cube"][:3, 3]) > 0
-    nameless = write_static(tmp_path, views, None, {}, COARSE)
-    assert nameless["table_z_m"] is None
 
 
 def test_a_basket_takes_its_handles_its_rim_and_its_cavity_out_of_the_scene() -> None:
