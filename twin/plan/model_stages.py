@@ -62,7 +62,6 @@ class Asked:
     understood: UnderstoodTask | None
     """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
     model: str
-    """The server's name for it."""
     address: str
     images_sent: bool
     remarks: tuple[str, ...]
@@ -98,7 +97,6 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
     """Ask the model of the settings for constraints; the grammar's stages are the fallback.
 
     Args:
-        run: Its scene says what the objects look like; replies that were taken are kept in it.
         episode: Shows the start; None: no image of it is there, and what came of asking is kept
             even where every reply was refused.
     """
@@ -228,11 +226,7 @@ def _asked(
 
 
 def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
-    """Whom the settings ask.
-
-    Raises:
-        UsageError: The address is none.
-    """
+    """Whom the settings ask."""
     return ModelConfig(
         url=config.model,
         model=config.model_name,
@@ -283,11 +277,7 @@ def stages_in(task: Task) -> tuple[Stage, ...]:
 
 
 def with_added(problem: Problem, stages: tuple[Stage, ...]) -> tuple[Problem, tuple[str, ...]]:
-    """Add the constraints of a model's stages to those of the task's.
-
-    Returns:
-        The problem with them, and what was left out.
-    """
+    """Add the constraints of a model's stages to those of the task's."""
     task, remarks = problem.scene.task, list[str]()
     added: dict[str, list[dict[str, Any]]] = {}
     held: str | None = None

@@ -111,12 +111,6 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
     Args:
         robot: Robot file that takes the place of the recorded description; none: that one.
-
-    Raises:
-        UsageError: No episode is called as asked, or there is none.
-        NoPlanError: No episode shows all of them; says what is missing in the newest. Or nothing
-            can be planned from what was found.
-        EpisodeError: The robot was not described.
     """
     run.refuse_empty()
     paths = run.episodes()
@@ -201,9 +195,6 @@ def cameras_at(
 
     Left out are a camera that is not posed in the robot's base, one in the hand where nobody knows
     the arm's posture, and one that stands still in a recording in which the arm does, too.
-
-    Args:
-        T_base_tcp: Of the tool then; None: not known.
     """
     try:
         calibration = read_calibration(run)
@@ -265,12 +256,7 @@ class Begun:
 
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
-    """Find out what is to be done and from where; a model is asked first where one is given.
-
-    Raises:
-        GroundingError: When neither a model nor the grammar understands the instruction.
-        NoPlanError: See ``start_of``.
-    """
+    """Find out what is to be done and from where; a model is asked first where one is given."""
     proposer_of(config.policy)
     if config.model:
         client_of(run, config)
@@ -365,9 +351,6 @@ def plan_once(
 
     Args:
         run: The accepted plan goes into its ``plans/``, those refused before beside it.
-
-    Raises:
-        NoPlanError: There is no candidate at all, not even without what a model added.
     """
     understood, start, asked = begun.understood, begun.start, begun.asked
     try:
@@ -448,11 +431,7 @@ def _attempts(
 
 
 def proposer_of(policy: str) -> Proposer:
-    """Who plans by a policy.
-
-    Raises:
-        UsageError: Nobody does.
-    """
+    """Who plans by a policy."""
     if policy not in PROPOSERS:
         known = ", ".join(sorted(PROPOSERS))
         message = f"no policy {policy!r}. There are: {known}.{nearest(policy, PROPOSERS)}"

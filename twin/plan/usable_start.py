@@ -34,11 +34,7 @@ _LIMIT_RAD = 0.01
 
 
 def refuse_unusable(problem: Problem) -> None:
-    """Refuse poses and postures that nothing can be planned from.
-
-    Raises:
-        NoPlanError: What was found, where, and what to do.
-    """
+    """Refuse poses and postures that nothing can be planned from."""
     _refuse_posture(problem)
     scene = problem.scene
     for name, T in scene.Ts_base_object.items():
@@ -68,9 +64,6 @@ def start_posture(
 ) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
     """Where the arm was recorded to stand at the start [rad], or why nobody knows.
 
-    Args:
-        joints: The arm's, base to hand.
-
     Returns:
         None with the reason in words, or the joints and nothing.
 
@@ -95,14 +88,7 @@ def start_posture(
 
 
 def refuse_other_robot(run: RunFolder, robot: Robot) -> None:
-    """Refuse a rebuilt scene that another robot recorded: it stands where that one was calibrated.
-
-    Args:
-        run: Its ``scene.json`` names the episodes that it was made of.
-
-    Raises:
-        NoPlanError: They differ.
-    """
+    """Refuse a rebuilt scene that another robot recorded: it stands where that one stood."""
     if other := scene_of_other_robot(run, robot.name):
         _refuse(
             f"{other}, and the start with {robot.name}",

@@ -53,7 +53,6 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
 
     Raises:
-        ConstraintError: When it does not fit, or names what is not there.
         UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
             an object that was not localised.
     """
@@ -470,4 +469,3 @@ _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "visible": _visible,
 }
 KINDS = tuple(_KINDS)
-"""What can be asked; the schema lists the same."""

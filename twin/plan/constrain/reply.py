@@ -50,7 +50,6 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
     """Read the stages of a reply, if nothing in it is wrong.
 
     Args:
-        text: The whole reply: one JSON object, see ``reply`` in the schema of constraints.
         task: The instruction that was asked about; a reply to another one is refused.
 
     Returns:
@@ -69,14 +68,7 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
 
 
 def parse_strictly(text: str | bytes) -> Any:
-    """Parse JSON that is short and flat; odd numbers and repeated keys are kept to be named.
-
-    Args:
-        text: At most ``MAX_BYTES`` in UTF-8.
-
-    Raises:
-        ReplyError: When it is too long, too deep, or not JSON.
-    """
+    """Parse JSON that is short and flat; odd numbers and repeated keys are kept to be named."""
     try:
         data = text.encode() if isinstance(text, str) else text
         if len(data) > MAX_BYTES:

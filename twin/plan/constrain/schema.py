@@ -112,11 +112,7 @@ class ConstraintError(UsageError):
 
 
 def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:
-    """Refuse a constraint that does not fit the schema or names what is not there.
-
-    Raises:
-        ConstraintError: With everything that is wrong, each with its place.
-    """
+    """Refuse a constraint that does not fit the schema or names what is not there."""
     found = find_problems(record, "constraint", vocabulary.schema())
     if not found:
         found = told(meaning_problems(record, ()))
@@ -126,9 +122,6 @@ def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:
 
 def find_problems(value: Any, name: str, schema: Schema) -> tuple[str, ...]:
     """List what does not fit a part of the schema, at most ``MOST_PROBLEMS``.
-
-    Args:
-        name: Of the part in ``$defs``, such as ``constraint`` or ``reply``.
 
     Returns:
         One line each: the place, what was found, what is allowed.

@@ -34,7 +34,6 @@ from twin.plan.constrain.reply import MAX_BYTES, ReplyError, printable, read_rep
 from twin.plan.constrain.schema import Vocabulary, portable_schema
 
 Messages = list[dict[str, Any]]
-"""Of a chat."""
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
 """Who answered."""
 READ_INSTEAD = "the grammar read the instruction instead"
@@ -53,11 +52,9 @@ class ModelConfig:
     url: str
     """Base address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1."""
     model: str
-    """Its name for the model."""
     key_variable: str = "GST_MODEL_KEY"
     """Environment variable with the key; not set: none is sent."""
     send_images: bool = False
-    """Let recorded images leave for that address."""
     connect_timeout_s: float = 5.0
     total_timeout_s: float = 60.0
     """Of one request, from connecting to the last byte."""
@@ -101,14 +98,12 @@ class Question:
     """What a model is asked."""
 
     task: str
-    """The instruction."""
     vocabulary: Vocabulary
     labels: Mapping[str, str] = field(default_factory=dict)
     """What each object looks like, from the scene: data, whoever wrote it."""
     image_u8: UInt8[np.ndarray, "height width 3"] | None = None
     """With the marks of ``draw_marks``."""
     marks: Mapping[str, int] = field(default_factory=dict)
-    """The number on each object."""
     keypoints: Sequence[tuple[str | None, str]] = ()
     """Of each keypoint, by its number, the object it moves with and its name in the scene."""
 
@@ -139,11 +134,7 @@ class EndpointError(TwinError):
 def ask_model(
     question: Question, config: ModelConfig, fallback: Callable[[], tuple[Stage, ...]]
 ) -> Answer:
-    """Get stages from a model, from its second try, or else from the grammar.
-
-    Args:
-        fallback: Plans without a model; its errors are not caught.
-    """
+    """Get stages from a model, from its second try, or else from the grammar."""
     remarks = [_told(question, config)]
     with _alone(config):
         found = _judged(question, config, remarks)

@@ -133,11 +133,7 @@ KNOWN = (
 
 
 def tokens_of(text: str) -> list[Token]:
-    """Cut an instruction into tokens.
-
-    Raises:
-        GroundingError: When it is too long to be an instruction.
-    """
+    """Cut an instruction into tokens."""
     if len(text) > MAX_CHARACTERS:
         message = f"the instruction has {len(text)} characters; {MAX_CHARACTERS} is the most."
         raise GroundingError("too_long", message)

@@ -101,7 +101,6 @@ class Policy:
     release: ReleaseConfig = field(default_factory=ReleaseConfig)
     path: PathConfig = field(default_factory=PathConfig)
     grasps: int = GRASPS
-    """Grasps of one object that are looked at."""
     ways: tuple[Way, ...] = _WAYS
 
 
@@ -157,11 +156,7 @@ class PlanProposer:
     def propose(
         self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
     ) -> list[Candidate]:
-        """Offer plans, the surest grasps first; see ``Proposer``.
-
-        Raises:
-            NoPlanError: There is none; the message says what is in the way.
-        """
+        """Offer plans, the surest grasps first; see ``Proposer``."""
         task = problem.scene.task
         refuse_lost(problem.scene)
         refuse_without_stages(task)
@@ -478,11 +473,7 @@ class _Options:
 
 
 def _part_points(problem: Problem, key: str) -> Float[np.ndarray, "num_points 3"] | None:
-    """Points of the part that the task grasps an object by; None: it names none.
-
-    Raises:
-        NoPlanError: The scene has no such part.
-    """
+    """Points of the part that the task grasps an object by; None: it names none."""
     tables = (table for table in problem.scene.task.stages if table.get("grasp") == key)
     part = next((str(table["part"]) for table in tables if "part" in table), None)
     if part is None:
@@ -511,11 +502,7 @@ def _subgoals(problem: Problem, key: str, verb: str) -> list[Constraint]:
 
 
 def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]:
-    """Those that satisfy what was added for the end of the grasp.
-
-    Raises:
-        NoPlanError: None does; says what the surest one has.
-    """
+    """Those that satisfy what was added for the end of the grasp."""
     asked = _subgoals(problem, grasps[0].object_id, "grasp")
     if not asked:
         return list(grasps)

@@ -80,11 +80,7 @@ class GeometricProposer:
     def propose(
         self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
     ) -> list[Candidate]:
-        """Offer plans, the least turned and shifted first; see ``Proposer``.
-
-        Raises:
-            NoPlanError: When the arm can follow none.
-        """
+        """Offer plans, the least turned and shifted first; see ``Proposer``."""
         found: list[Candidate] = []
         why = "no candidate is left that was not refused"
         for choice in _choices(problem.scene.task, steer):

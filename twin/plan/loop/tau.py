@@ -97,11 +97,7 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
 
 
 def refuse_without_stages(task: Task) -> None:
-    """Refuse a task that moves something without saying in which stages.
-
-    Raises:
-        NoPlanError: Naming the object and what is missing.
-    """
+    """Refuse a task that moves something without saying in which stages."""
     for key in task.manipulated:
         verbs = stages_of(task, key).keys()
         lacking = [verb for verb in ("grasp", "release") if verb not in verbs]
@@ -118,11 +114,7 @@ def plan_stage(
     bounds: Bounds,
     there: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> Stage:
-    """What a plan says of one stage of its task: when it is, what may touch, where it leads.
-
-    Args:
-        task: What counts as success is its own.
-    """
+    """What a plan says of one stage of its task: when it is, what may touch, where it leads."""
     stage_id = str(table["id"])
     start_ns, end_ns = bounds.get(stage_id, (0, 0))
     release = table.get("release", table.get("push"))

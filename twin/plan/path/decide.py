@@ -83,7 +83,6 @@ def decide(
     """Check a movement exactly.
 
     Args:
-        width_m: Distance between the finger pads.
         audited: Ask python-fcl too, where the monitor refuses nothing.
     """
     robot, scene = problem.robot, problem.scene

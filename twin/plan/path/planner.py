@@ -73,9 +73,7 @@ class PathConfig:
     audited: bool = True
     """Ask python-fcl too before a path is handed out."""
     seed: int = 0
-    """Of the search."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    """The exact clearance."""
 
 
 class NoPathError(TwinError):
@@ -195,11 +193,7 @@ def plan_move(
 
 
 def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
-    """Refuse postures that are no numbers.
-
-    Raises:
-        NoPathError: One of them is not finite.
-    """
+    """Refuse postures that are no numbers."""
     if not all(np.isfinite(rows).all() for rows in postures):
         raise NoPathError(reason="not a posture", detail="joints that are not finite")
 
@@ -265,9 +259,6 @@ def timed_path(
 
     What is handed out is followed straight between its own knots, so it is that which is looked at
     again; where a chord is not free the corners stay sharp and the arm stops at them.
-
-    Args:
-        world: What must stay clear.
     """
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
     wanted = [value for value in (limit_m_s, tool_m_s) if value]
@@ -321,10 +312,6 @@ def plan_straight(
 
     For the last centimetres, where contact is wanted: pairs in ``allowed`` are left to the exact
     check, which lets them touch but not lie in each other.
-
-    Args:
-        start_rad: Where the arm stands; the line begins at its tool.
-        width_m: Distance between the finger pads.
 
     Raises:
         NoPathError: A pose is out of reach, the arm would have to change its branch, or something
