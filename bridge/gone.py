@@ -43,6 +43,8 @@ GONE: dict[str, str] = {
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
+    "publish standin --real-time": "Play the episode, which keeps its pace.",
+    "publish standin --execute-unverified": "Without a verdict nothing is executed.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
         "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."

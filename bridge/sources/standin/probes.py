@@ -107,13 +107,7 @@ def plan_probe(
     """Plan one probe of the task's first manipulated object; the quickest of the ways there are.
 
     Args:
-        kind: One of ``PROBES``.
-        seen: Poses ``T_base_object`` as perceived.
         turn: 1 or -1: to which side a squeeze is askew.
-
-    Raises:
-        UsageError: The object is soft: the probes are made for rigid boxes.
-        NoSpaceForProbeError: The object lies where the probe cannot be carried out.
     """
     object_id = task.manipulated[0]
     if task.objects[object_id].soft is not None:
