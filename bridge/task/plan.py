@@ -70,21 +70,6 @@ class SteeredBy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CandidateGrasp:
-    """One grasp that the planner looked at."""
-
-    object: str
-    p_m: tuple[float, float, float]
-    """Tool at the grasp, in the object's frame."""
-    q_wxyz: tuple[float, float, float, float]
-    width_m: float
-    """Distance between the two surfaces it closes on."""
-    margin: float
-    """Standard deviations of the object's pose that it bears."""
-    chosen: bool
-
-
-@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What will be commanded, and why; the authority over the viewers' trajectory topics."""
 
@@ -113,8 +98,6 @@ class Plan:
     steered_by: SteeredBy | None = None
     study_arm: str = ""
     """One of ``STUDY_ARMS``; empty outside a study."""
-    grasps: tuple[CandidateGrasp, ...] = ()
-    """Those that were looked at, of each object in the order they were tried in."""
 
     def to_json(self) -> bytes:
         """Serialise, refusing what the schema refuses."""
@@ -158,7 +141,6 @@ class Plan:
         if known.get("steered_by") is not None:
             clause, bodies = known["steered_by"]["clause"], known["steered_by"].get("bodies", [])
             known["steered_by"] = SteeredBy(clause=clause, bodies=tuple(bodies))
-        known["grasps"] = tuple(_candidate_grasp(each) for each in record.get("grasps", []))
         return Plan(**known)
 
     def times_ns(self) -> Int[np.ndarray, " num_waypoints"]:
@@ -181,7 +163,7 @@ class Plan:
         return self.stages[-1] if self.stages and t_ns >= self.stages[-1].t_end_ns else None
 
 
-LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm", "grasps")
+LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm")
 """Written only where they say something: plans without them keep their bytes."""
 
 
@@ -193,13 +175,6 @@ def _stage(record: dict[str, Any]) -> Stage:
         (pair[0], pair[1]) for pair in record.get("allowed_contacts", [])
     )
     return Stage(**known)
-
-
-def _candidate_grasp(record: dict[str, Any]) -> CandidateGrasp:
-    known = {name: record[name] for name in CandidateGrasp.__dataclass_fields__}
-    return CandidateGrasp(
-        **{**known, "p_m": tuple(record["p_m"]), "q_wxyz": tuple(record["q_wxyz"])}
-    )
 
 
 def _waypoint(record: dict[str, Any]) -> Waypoint:

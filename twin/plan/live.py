@@ -28,7 +28,6 @@ from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.plan.config import LivePlanConfig, PlanConfig
-from twin.plan.loop import straight
 from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
 from twin.plan.model_stages import Asked, ask_about, client_of
@@ -39,8 +38,7 @@ from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
 
 PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
-    straight.POLICY: straight.GeometricProposer,
-    **{name: partial(PlanProposer, policy) for name, policy in POLICIES.items()},
+    name: partial(PlanProposer, policy) for name, policy in POLICIES.items()
 }
 GROUNDING = "gst localisation v1 of the request"
 ALIVE = "/alive"

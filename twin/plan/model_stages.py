@@ -48,8 +48,6 @@ from twin.scene.store.folder import read_record
 
 REPLIES = "model_replies"
 """Folder of the run's ``derived/`` with replies that were taken."""
-LOG = "log.jsonl"
-"""In it: every request with what came of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +99,7 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
             even where every reply was refused.
     """
     task = problem.scene.task
-    vocabulary = Vocabulary.of_task(
-        task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
-    )
+    vocabulary = Vocabulary.of_task(task, num_keypoints=len(problem.keypoints))
     question = _question(run, episode, problem, vocabulary, task.instruction)
     client = replace(client_of(run, config), keep_refused=episode is None)
     answer = ask_model(question, client, lambda: stages_in(task))
@@ -124,7 +120,6 @@ def ask_for_goals(
     vocabulary = Vocabulary.of_task(
         problem.scene.task,
         num_keypoints=len(problem.keypoints),
-        cameras=problem.cameras,
         objects_alone=True,
     )
     question = _question(run, episode, problem, vocabulary, words)
@@ -232,7 +227,6 @@ def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
         model=config.model_name,
         send_images=config.send_images,
         cache=run.derived_dir / REPLIES,
-        log=run.derived_dir / REPLIES / LOG,
     )
 
 

@@ -113,20 +113,3 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
         gaps.append(np.where(flat, norm(from_middle - t[..., None] * along), _FAR_M))
     clear = np.amin(np.concatenate(gaps, axis=1), axis=-1)
     return np.where(overlap <= 0, overlap, clear)
-
-
-def blocked_length(starts_m: Array, ends_m: Array, T_box: Array, half_m: Array) -> Array:
-    """How long straight lines run inside a box; negative where they miss it [m].
-
-    Slabs: a line is inside between the last plane it enters by and the first it leaves by.
-
-    Args:
-        starts_m: The point all lines of a state start from, ``(num_states, 1, 3)``.
-    """
-    start = seen_from(T_box, starts_m)
-    way = seen_from(T_box, ends_m) - start
-    steep = np.where(abs(way) < _PARALLEL_M, _PARALLEL_M, way)
-    first, last = (-half_m - start) / steep, (half_m - start) / steep
-    enter = np.clip(np.amax(np.minimum(first, last), axis=-1), 0.0, None)
-    leave = np.clip(np.amin(np.maximum(first, last), axis=-1), None, 1.0)
-    return (leave - enter) * norm(way)

@@ -84,7 +84,7 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
         if frame == BASE:
             return lambda state: p[None], f"the point {millimetres(p)}"
         return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
-    ids = [spec["kp"]] if "kp" in spec else list(spec["mean"])
+    ids = [int(k) for k in ([spec["kp"]] if "kp" in spec else spec["mean"])]
     points = [problem.keypoints[index] for index in ids]
 
     def mean(state: State) -> Array:

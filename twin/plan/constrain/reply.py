@@ -20,6 +20,7 @@ from twin.plan.constrain.schema import (
     Vocabulary,
     find_problems,
     meaning_problems,
+    printable,
     shown,
     told,
 )
@@ -59,7 +60,7 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
         ReplyError: Everything that is wrong, each with its place, at most ``MOST_PROBLEMS``.
     """
     record = parse_strictly(text)
-    problems = find_problems(record, "reply", vocabulary.schema())
+    problems = find_problems(record, "reply", vocabulary)
     if not problems:
         problems = told(_contradictions(record, vocabulary, task))
     if problems:
@@ -228,11 +229,4 @@ def _stage(record: Mapping[str, Any]) -> Stage:
         grasp=record.get("grasp"),
         release=record.get("release"),
         allowed_contacts=tuple((a, b) for a, b in record["allowed_contacts"]),
-    )
-
-
-def printable(text: str) -> str:
-    """Text with everything escaped that a terminal or a log would not show as it is."""
-    return "".join(
-        char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
     )

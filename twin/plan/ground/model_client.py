@@ -31,7 +31,7 @@ from bridge.task.plan import Stage
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.plan.constrain.reply import MAX_BYTES, ReplyError, printable, read_reply
-from twin.plan.constrain.schema import Vocabulary, portable_schema
+from twin.plan.constrain.schema import Vocabulary
 
 Messages = list[dict[str, Any]]
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
@@ -64,8 +64,6 @@ class ModelConfig:
     """Folder of replies that were taken, by the content of their request."""
     keep_refused: bool = False
     """Keep there, too, that both replies were refused: a question has one answer for good."""
-    log: Path | None = None
-    """File to which requests and replies are appended, one JSON record each, without secrets."""
 
     def __post_init__(self) -> None:
         """Refuse addresses and limits that make no sense."""
@@ -156,7 +154,7 @@ def _judged(
     reply = ""
     for who in (BY_MODEL, BY_REPAIR):
         try:
-            reply = kept[0] if kept else _reply(messages, question, config, remarks)
+            reply = kept[0] if kept else _reply(messages, config, remarks)
         except EndpointError as error:
             remarks.append(f"no reply: the server {error.found}")
             return None
@@ -164,7 +162,6 @@ def _judged(
             stages = read_reply(reply, question.vocabulary, question.task)
         except ReplyError as error:
             remarks.append(f"refused the reply ({who}): {'; '.join(error.problems)}")
-            _log(config, {"refused": list(error.problems)})
             messages, kept = _repair(first, reply, error), None
             continue
         if kept:
@@ -221,8 +218,6 @@ def _messages(question: Question, config: ModelConfig) -> Messages:
             {"kp": number, "object": key, "name": printable(name)[:MOST_LABEL]}
             for number, (key, name) in enumerate(question.keypoints)
         ]
-    if question.vocabulary.cameras:
-        scene["cameras"] = list(question.vocabulary.cameras)
     asked = json.dumps({"instruction": question.task, "scene": scene})
     content: list[dict[str, Any]] = [{"type": "text", "text": asked}]
     if config.send_images and question.image_u8 is not None:
@@ -258,32 +253,24 @@ def _told(question: Question, config: ModelConfig) -> str:
     return f"asked {config.model} at {config.url}; {sent}"
 
 
-def _body(messages: Messages, question: Question, config: ModelConfig) -> dict[str, Any]:
-    form = portable_schema(question.vocabulary.schema(), "reply")
-    return {
+# What comes back
+
+
+def _reply(messages: Messages, config: ModelConfig, remarks: list[str]) -> str:
+    """The model's text."""
+    body = {
         "model": config.model,
         "messages": messages,
         "temperature": 0,
         "seed": 0,
-        "response_format": {
-            "type": "json_schema",
-            "json_schema": {"name": "plan", "strict": False, "schema": form},
-        },
+        "response_format": {"type": "json_object"},
     }
-
-
-# What comes back
-
-
-def _reply(messages: Messages, question: Question, config: ModelConfig, remarks: list[str]) -> str:
-    """The model's text."""
-    body = _body(messages, question, config)
     try:
         record = _post(body, config)
     except EndpointError as error:
         if error.status not in _REFUSES_FORMAT:
             raise
-        remarks.append(f"the server {error.found}; asked again without a schema")
+        remarks.append(f"the server {error.found}; asked again in plain words")
         record = _post({key: body[key] for key in ("model", "messages")}, config)
     return _text_of(record, config)
 
@@ -337,16 +324,13 @@ def _post(body: Mapping[str, Any], config: ModelConfig) -> Any:
     except EndpointError:
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        found = _failure(error, config)
-        _log(config, {"request": body, "failed": found})
-        raise EndpointError(address=config.url, found=found) from error
-    told = answer[:MAX_BYTES].decode(errors="replace")
-    _log(config, {"request": body, "status": status, "answer": told})
+        raise EndpointError(address=config.url, found=_failure(error, config)) from error
     if 300 <= status < 400:
         found = f"redirects to {printable(onward[:200])}, which is not followed"
         raise EndpointError(address=config.url, found=found, status=status)
     if status != http.client.OK:
-        found = _redacted(f"answers with status {status}: {printable(told[:200])}", config)
+        told = printable(answer[:200].decode(errors="replace"))
+        found = _redacted(f"answers with status {status}: {told}", config)
         raise EndpointError(address=config.url, found=found, status=status)
     if kind != "application/json":
         found = f"answers with {printable(kind)[:80]}, not application/json"
@@ -475,25 +459,3 @@ def _redacted(text: str, config: ModelConfig) -> str:
     for form in {config.key, json.dumps(config.key)[1:-1]} - {""}:
         text = text.replace(form, "[redacted]")
     return text
-
-
-def _log(config: ModelConfig, record: Mapping[str, Any]) -> None:
-    """Append a record; images by their hash, the key nowhere."""
-    if config.log is None:
-        return
-    text = json.dumps(_without_images(record))
-    config.log.parent.mkdir(parents=True, exist_ok=True)
-    with config.log.open("a") as stream:
-        stream.write(_redacted(text, config) + "\n")
-
-
-def _without_images(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _without_images(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_images(inner) for inner in value]
-    if isinstance(value, str) and value.startswith("data:image/"):
-        return (
-            f"image of {len(value)} characters, sha256 {hashlib.sha256(value.encode()).hexdigest()}"
-        )
-    return value

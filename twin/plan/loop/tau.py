@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.plan import CandidateGrasp, Stage, Waypoint
+from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.kinds import names_keypoint
 from twin.plan.constrain.relations import constraint_of
@@ -157,16 +157,3 @@ def goals_of(task: Task, key: str) -> list[dict[str, Any]]:
     """The success predicates about where an object is, as constraints."""
     mine = (spec for spec in task.success if spec.get("object") == key)
     return [record for spec in mine if (record := constraint_of(spec, task)) is not None]
-
-
-def candidate_grasp(grasp: Grasp, *, chosen: bool) -> CandidateGrasp:
-    """What a plan says of a grasp that was looked at."""
-    (qw, qx, qy, qz), (x, y, z) = (part.tolist() for part in se3.split(grasp.T_object_tcp))
-    return CandidateGrasp(
-        object=grasp.object_id,
-        p_m=(x, y, z),
-        q_wxyz=(qw, qx, qy, qz),
-        width_m=float(grasp.width_m),
-        margin=float(grasp.margin),
-        chosen=chosen,
-    )

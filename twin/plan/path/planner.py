@@ -1,9 +1,9 @@
 """Plan one movement: around what is in the way, made short, timed, and checked exactly.
 
 The search (RRT-Connect and shortcuts, native) knows spheres and hulls and misses nothing between
-two postures; what it finds is timed, and the exact clearance and, where it is asked, python-fcl
-decide. What they refuse is searched again with the refused pair kept farther apart. Everything
-follows from the seed; work is counted, never timed.
+two postures; what it finds is timed, and the exact clearance decides. What that refuses is searched
+again with the refused pair kept farther apart. Everything follows from the seed; work is counted,
+never timed.
 """
 
 from collections.abc import Mapping
@@ -70,8 +70,6 @@ class PathConfig:
     """Share of the limits of joint and tool speed that is used."""
     acceleration_share: float = 0.33
     """Share of the limits of acceleration; a third of the UR5's is what MoveIt assumes of it."""
-    audited: bool = True
-    """Ask python-fcl too before a path is handed out."""
     seed: int = 0
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
@@ -142,7 +140,6 @@ class _Asked:
             config=self.config.replay,
             carried=self.carried,
             allowed=self.allowed,
-            audited=self.config.audited,
         )
         return Movement(
             path=path, decision=decision, width_m=self.width_m, carried=self.carried, goal=goal
