@@ -25,6 +25,10 @@ GONE: dict[str, str] = {
     "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
     "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
     "ls --no-flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    "dashboard --console": (
+        "Go through the design's order.csv with robot-gst ctl start and stop, and label on the "
+        "dashboard's page label."
+    ),
     "prune": (
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."
@@ -51,6 +55,8 @@ GONE: dict[str, str] = {
     "recover --in-place": (
         "Free some space, or move the file to another disk: a copy is made beside it."
     ),
+    "publish standin --real-time": "Play the episode, which keeps its pace.",
+    "publish standin --execute-unverified": "Without a verdict nothing is executed.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
         "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote, urlencode
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -23,18 +23,14 @@ from dashboards import wording
 from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
-from dashboards.console_door import ConsoleDoor
 from dashboards.errors import NotHereError
 from dashboards.guard import Admission, Guard, is_loopback
 from dashboards.library import Library, derived_path, episode_path, scene_stamps
-from dashboards.loading import LOADING, late
+from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview, neighbours
 from dashboards.review_routes import review_routes
 from dashboards.study_routes import StudyPages
 from evaluator.review_index import SHOW, Selection
-
-if TYPE_CHECKING:  # reads episodes
-    from dashboards.console_page import ConsolePages
 
 HERE = Path(__file__).parent
 PICTURES = "scene_pictures"
@@ -47,18 +43,16 @@ def create_app(
     library: Library,
     admission: Admission | None = None,
     live: DashboardConfig | None = None,
-    door: ConsoleDoor | None = None,
 ) -> Starlette:
     """Build the application over some run folders.
 
     Args:
         admission: Which host and token are answered; None answers only on the loopback address.
         live: Where the page Live finds the recorder; None asks at the usual place.
-        door: Lets phones in at the operator's console; None leaves it closed.
     """
     admission = admission or Admission()
     live = live or DashboardConfig()
-    pages = Pages(library, live, door, looks_beside=is_loopback(admission.host))
+    pages = Pages(library, live, looks_beside=is_loopback(admission.host))
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -71,7 +65,6 @@ def create_app(
         Route("/derived/{name}/file", pages.derived_file),
         *pages.reviews(),
         *pages.studies.routes(),
-        *(() if door is None else pages.console()),
         Route("/twin", pages.twin, middleware=SMALL),
         Route("/twin/{name}/{side}/{camera}", pages.twin_image),
         Route("/static/colours.css", colours, middleware=SMALL),
@@ -86,7 +79,6 @@ def create_app(
         },
     )
     app.state.studies = pages.studies
-    app.state.end_console = pages.end_console
     return app
 
 
@@ -160,13 +152,10 @@ class Pages:
         self,
         library: Library,
         live: DashboardConfig,
-        door: ConsoleDoor | None = None,
         *,
         looks_beside: bool = True,
     ) -> None:
         """Remember the runs and load the templates."""
-        self._live, self._door = live, door
-        self._console: ConsolePages | None = None
         self._library = library
         self._environment = _environment()
         self.studies = StudyPages(
@@ -178,7 +167,7 @@ class Pages:
         )
 
     def _part(self, name: str, state: object) -> str:
-        return self._rendered(f"live_{name}.html", state=state)
+        return self._environment.get_template(f"live_{name}.html").render(state=state)
 
     def _page(self, template: str, request: Request, status: int = 200, **values: Any) -> Response:
         name = request.query_params.get("run", "")
@@ -291,39 +280,6 @@ class Pages:
     def reviews(self) -> list[Route]:
         """``/queue``, ``/label`` and ``/reviews``: which trial first, labels, what raters said."""
         return review_routes(self._run, self._page)
-
-    def console(self) -> list[Route]:
-        """``/console``: starts, stops and answers trials from a phone, where it is open."""
-        load = self._console_pages
-        return [
-            Route("/console", late(load, "page")),
-            Route("/console/enter", late(load, "enter"), methods=["POST"]),
-            Route("/console/state", late(load, "state")),
-            Route("/console/act", late(load, "act"), methods=["POST"]),
-            Route("/console/start/{number:int}", late(load, "start_picture")),
-            Route("/console/now/{camera}", late(load, "live_picture")),
-        ]
-
-    def _console_pages(self) -> "ConsolePages":
-        if self._door is None:
-            message = "The console is closed. To open it: robot-gst dashboard RUN --console"
-            raise NotHereError(message)
-        with LOADING:
-            from dashboards.console_page import ConsolePages  # noqa: PLC0415  # loads zenoh
-
-            run = self._library.pick(None)
-            self._console = self._console or ConsolePages(
-                run, self._door, self._live, self._rendered
-            )
-            return self._console
-
-    def _rendered(self, name: str, **values: object) -> str:
-        return self._environment.get_template(name).render(values)
-
-    def end_console(self) -> None:
-        """Close what the console holds open."""
-        if self._console is not None:
-            self._console.end()
 
     def twin(self, request: Request) -> Response:
         """``/twin``: held-out views, recorded beside rendered."""

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from cyclopts import Parameter
 
-from bridge.errors import UsageError, refuse_outside
+from bridge.errors import refuse_outside
 from bridge.wire.config import DEFAULT_ENDPOINT
 
 PORTS = {"port": (0, 65_535)}
-EVERY_ADDRESS = ("0.0.0.0", "::", "", "*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,19 +25,10 @@ class DashboardConfig:
     """Where that recorder is; nothing is opened before somebody looks at the page."""
     live_config: Path | None = None
     """zenoh configuration (JSON5) for that, for example with access control."""
-    console: Annotated[bool, Parameter(negative=())] = False
-    """Open the operator's console of the first run's protocol, at /console: it starts and stops the
-    recorder. A code shown in the terminal lets one phone in; name the address with --host."""
 
     def __post_init__(self) -> None:
-        """Refuse a port that no machine has, and a console on every address of the machine."""
+        """Refuse a port that no machine has."""
         refuse_outside(self, PORTS)
-        if self.console and self.host in EVERY_ADDRESS:
-            message = (
-                f"--console starts and stops a recorder, and --host {self.host} would offer it on "
-                "every network of this machine. Name one address, such as --host 192.0.2.10."
-            )
-            raise UsageError(message)
 
 
 SHARE_LIMITS = {"max_mb": (0.01, 20.0), "before_s": (0.0, 30.0), "after_s": (0.0, 30.0)}

@@ -117,11 +117,7 @@ class Trial:
 
 
 def groups_of(config: DemoConfig) -> list[Group]:
-    """What a demo tries: every task by every policy, with replanning by the cell's own planner.
-
-    Args:
-        config: Its tasks and policies.
-    """
+    """What a demo tries: every task by every policy, with replanning by the cell's own planner."""
     policies = {BUILT_IN_POLICY: CONDITIONS} | dict.fromkeys(config.other_policies, (WITHOUT,))
     return [
         Group(chosen=task, policy=policy, conditions=conditions)
@@ -136,21 +132,14 @@ class Recorded:
 
     has_scan: bool = False
     missing: list[Trial] = field(default_factory=list)
-    """Trials that are not there."""
     unusable: dict[Path, str] = field(default_factory=dict)
-    """Files that were cut short, and why."""
     void: dict[Path, str] = field(default_factory=dict)
     """Trials that were recorded to their end and have no outcome, and why."""
     num_known: int = 0
-    """Trials with an outcome."""
 
 
 def look(run: RunFolder, config: DemoConfig) -> Recorded:
     """Say what of the demo is recorded, and what of it is of no use.
-
-    Args:
-        run: The run folder of the demo, perhaps filled in part by an earlier start.
-        config: Which tasks, policies, seed and number of trials the demo is to have.
 
     Raises:
         UsageError: When the folder holds episodes of anything else, or is being recorded into.
@@ -233,16 +222,7 @@ def set_aside(run: RunFolder, path: Path, why: str, output: Output) -> None:
 
 
 def run_demo(path: Path, config: DemoConfig, output: Output) -> int:
-    """Record, rebuild, replay, evaluate, and say what to look at next.
-
-    Args:
-        path: The run folder; made, or continued.
-        config: What the demo does.
-        output: Told of each step and of the result.
-
-    Raises:
-        DashboardError: When a step failed, or nothing could be measured.
-    """
+    """Record, rebuild, replay, evaluate, and say what to look at next."""
     started = time.monotonic()
     for each in config.tasks:
         chosen_task_file(each).task()  # refuse an unknown one before anything is made
@@ -432,12 +412,7 @@ def running(arguments: list[str], log: Path) -> Iterator[Background]:
 
 
 def answers(endpoint: str, key: str) -> bool:
-    """Whether somebody answers a question at an endpoint.
-
-    Args:
-        endpoint: Where to connect.
-        key: What is asked.
-    """
+    """Whether somebody answers a question at an endpoint."""
     from bridge.wire.config import WireConfig  # noqa: PLC0415  # zenoh only when recording
     from bridge.wire.session import open_session  # noqa: PLC0415
 

@@ -13,10 +13,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 COOKIE = "robot_gst_token"
-CONSOLE_COOKIE = "robot_gst_console"
-OPEN_TO_CONSOLE = ("/console", "/static")
-"""What a phone without the token may ask for where the console is open; /console asks for its own
-session."""
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -60,8 +56,6 @@ class Admission:
     """The address listened on."""
     token: str | None = None
     """Required when the address can be reached from outside."""
-    has_console: bool = False
-    """Whether the operator's console is open, which asks for a code in the token's place."""
 
     def admits_host(self, name: str) -> bool:
         """Refuse names that a foreign page could have pointed at us (DNS rebinding)."""
@@ -121,9 +115,6 @@ class Guard:
             )
         token = self._admission.token
         if token is None or _same(_cookie(headers), token):
-            return None
-        folder = "/" + scope["path"].split("/")[1] if scope["path"].startswith("/") else ""
-        if self._admission.has_console and folder in OPEN_TO_CONSOLE:
             return None
         query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
         if _same(dict(query).get("token", ""), token):

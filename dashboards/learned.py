@@ -22,7 +22,6 @@ class Learned:
     """A calibration that a study may use."""
 
     content: bytes
-    """Of its file."""
     words: str
 
     @property
@@ -35,11 +34,7 @@ class Learned:
         return replace(protocol, calibration_sha256=self.sha256, calibration_from=self.words)
 
     def put_into(self, run: RunFolder) -> None:
-        """Put it where the gate and the replays of a study look.
-
-        Raises:
-            UsageError: When the study has a calibration of its own.
-        """
+        """Put it where the gate and the replays of a study look."""
         path = run.scene_dir / CALIBRATION_FILE
         if path.is_file():
             if path.read_bytes() != self.content:

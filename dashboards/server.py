@@ -19,7 +19,6 @@ from bridge.terminal import Output
 from dashboards.app import create_app
 from dashboards.comparison import judge, stop_updates
 from dashboards.config import DashboardConfig
-from dashboards.console_door import ConsoleDoor, claim_console, spaced
 from dashboards.errors import AddressTakenError
 from dashboards.guard import Admission, is_loopback
 from dashboards.library import Library
@@ -40,18 +39,9 @@ class Address:
     def url(self) -> str:
         """The address to open."""
         query = f"?token={self.token}" if self.token else ""
-        return f"{self._origin}/{query}"
-
-    @property
-    def console_url(self) -> str:
-        """The address to open on a phone; it asks for a code."""
-        return f"{self._origin}/console"
-
-    @property
-    def _origin(self) -> str:
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         shown = f"[{host}]" if ":" in host else host
-        return f"http://{shown}:{self.port}"
+        return f"http://{shown}:{self.port}/{query}"
 
     @property
     def ssh_line(self) -> str:
@@ -95,14 +85,10 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         runs: Run folders; those of the same name get a number.
     """
     library = Library.open(runs)
-    if config.console:
-        claim_console(library.pick(None).path)
     listener = listen(config)
     token = None if is_loopback(config.host) else secrets.token_urlsafe(24)
     address = Address(host=config.host, port=listener.getsockname()[1], token=token)
-    door = ConsoleDoor(output.say) if config.console else None
-    admission = Admission(host=config.host, token=token, has_console=config.console)
-    app = create_app(library, admission, config, door)
+    app = create_app(library, Admission(host=config.host, token=token), config)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
@@ -114,9 +100,6 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
     )
     text = f"Dashboard: {address.url}\nFrom another computer: {address.ssh_line}\nStop with Ctrl-C."
     record = {"url": address.url, "ssh": address.ssh_line, "runs": [*library.runs]}
-    if door is not None:
-        record |= {"console": address.console_url, "code": door.code}
-        text += f"\nConsole: {address.console_url} code {spaced(door.code)}, for one phone."
     others = set(threading.enumerate())
     threading.Thread(target=_ask_ahead, args=(library,), daemon=True).start()
     app.state.studies.is_ending = lambda: server.should_exit
@@ -124,7 +107,6 @@ def serve(runs: Sequence[Path], config: DashboardConfig, output: Output) -> int:
         output.result(record, text)
         server.run(sockets=[listener])
     app.state.studies.end()
-    app.state.end_console()
     stop_updates()
     if _are_at_work(set(threading.enumerate()) - others):
         # Python waits for threads that make a page, a minute for a large run, and ends others by

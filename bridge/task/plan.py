@@ -70,21 +70,6 @@ class SteeredBy:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CandidateGrasp:
-    """One grasp that the planner looked at."""
-
-    object: str
-    p_m: tuple[float, float, float]
-    """Tool at the grasp, in the object's frame."""
-    q_wxyz: tuple[float, float, float, float]
-    width_m: float
-    """Distance between the two surfaces it closes on."""
-    margin: float
-    """Standard deviations of the object's pose that it bears."""
-    chosen: bool
-
-
-@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What will be commanded, and why; the authority over the viewers' trajectory topics."""
 
@@ -113,8 +98,6 @@ class Plan:
     steered_by: SteeredBy | None = None
     study_arm: str = ""
     """One of ``STUDY_ARMS``; empty outside a study."""
-    grasps: tuple[CandidateGrasp, ...] = ()
-    """Those that were looked at, of each object in the order they were tried in."""
 
     def to_json(self) -> bytes:
         """Serialise, refusing what the schema refuses."""
@@ -164,5 +147,5 @@ class Plan:
         return self.stages[-1] if self.stages and t_ns >= self.stages[-1].t_end_ns else None
 
 
-LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm", "grasps")
+LATER_FIELDS = ("task_sha256", "scene_hash", "candidate", "steered_by", "study_arm")
 """Written only where they say something: plans without them keep their bytes."""

@@ -39,9 +39,8 @@ class PlanConfig:
     """How an instruction is planned."""
 
     policy: str = "nominal"
-    """nominal, single (the first candidate alone), loose (no distances), geometric (nothing is
-    optimised), model (nominal with what a model adds: --model). With --live each request names
-    its own."""
+    """nominal, single (the first candidate alone), loose (no distances), model (nominal with what
+    a model adds: --model). With --live each request names its own."""
     rounds: int = 5
     """Candidates that the twin may judge; each is steered by what it said of the one before."""
     seed: int = 0

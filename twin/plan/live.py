@@ -28,7 +28,6 @@ from bridge.terminal import Output, printable, stop_signals
 from bridge.wire.config import WireConfig
 from twin.errors import TwinError
 from twin.plan.config import LivePlanConfig, PlanConfig
-from twin.plan.loop import straight
 from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
 from twin.plan.model_stages import Asked, ask_about, client_of
@@ -39,10 +38,8 @@ from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
 
 PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
-    straight.POLICY: straight.GeometricProposer,
-    **{name: partial(PlanProposer, policy) for name, policy in POLICIES.items()},
+    name: partial(PlanProposer, policy) for name, policy in POLICIES.items()
 }
-"""How a plan is made, by the policy it is called."""
 GROUNDING = "gst localisation v1 of the request"
 ALIVE = "/alive"
 """Behind the service's key: the liveliness token of the planner that answers there."""
@@ -200,14 +197,7 @@ class LivePlanner:
 
 
 def claim_planner(session: Any, cell: str) -> None:
-    """Let other planners of this cell see that there is one.
-
-    Args:
-        session: An open ``bridge.wire.session``; the claim lasts as long as it.
-
-    Raises:
-        PlannerError: When there is one already.
-    """
+    """Let other planners of this cell see that there is one."""
     key = cell_topic(cell, PLAN)[1:] + ALIVE
     if session.query_alive(key):
         raise PlannerError(
@@ -241,14 +231,7 @@ def serve_planner(session: Any, planner: LivePlanner, cell: str, output: Output)
 def run_planner(
     path: Path, config: LivePlanConfig, output: Output, words: PlanConfig | None = None
 ) -> int:
-    """Answer a cell's requests until SIGINT or SIGTERM; both end with exit code 0.
-
-    Args:
-        words: May name the model that is asked for policy ``model``.
-
-    Raises:
-        UsageError: Its address is none.
-    """
+    """Answer a cell's requests until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 
     refuse_bad_name("cell", config.cell)

@@ -48,8 +48,6 @@ from twin.scene.store.folder import read_record
 
 REPLIES = "model_replies"
 """Folder of the run's ``derived/`` with replies that were taken."""
-LOG = "log.jsonl"
-"""In it: every request with what came of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +60,6 @@ class Asked:
     understood: UnderstoodTask | None
     """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
     model: str
-    """The server's name for it."""
     address: str
     images_sent: bool
     remarks: tuple[str, ...]
@@ -98,14 +95,11 @@ def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: Pla
     """Ask the model of the settings for constraints; the grammar's stages are the fallback.
 
     Args:
-        run: Its scene says what the objects look like; replies that were taken are kept in it.
         episode: Shows the start; None: no image of it is there, and what came of asking is kept
             even where every reply was refused.
     """
     task = problem.scene.task
-    vocabulary = Vocabulary.of_task(
-        task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
-    )
+    vocabulary = Vocabulary.of_task(task, num_keypoints=len(problem.keypoints))
     question = _question(run, episode, problem, vocabulary, task.instruction)
     client = replace(client_of(run, config), keep_refused=episode is None)
     answer = ask_model(question, client, lambda: stages_in(task))
@@ -126,7 +120,6 @@ def ask_for_goals(
     vocabulary = Vocabulary.of_task(
         problem.scene.task,
         num_keypoints=len(problem.keypoints),
-        cameras=problem.cameras,
         objects_alone=True,
     )
     question = _question(run, episode, problem, vocabulary, words)
@@ -228,17 +221,12 @@ def _asked(
 
 
 def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
-    """Whom the settings ask.
-
-    Raises:
-        UsageError: The address is none.
-    """
+    """Whom the settings ask."""
     return ModelConfig(
         url=config.model,
         model=config.model_name,
         send_images=config.send_images,
         cache=run.derived_dir / REPLIES,
-        log=run.derived_dir / REPLIES / LOG,
     )
 
 
@@ -283,11 +271,7 @@ def stages_in(task: Task) -> tuple[Stage, ...]:
 
 
 def with_added(problem: Problem, stages: tuple[Stage, ...]) -> tuple[Problem, tuple[str, ...]]:
-    """Add the constraints of a model's stages to those of the task's.
-
-    Returns:
-        The problem with them, and what was left out.
-    """
+    """Add the constraints of a model's stages to those of the task's."""
     task, remarks = problem.scene.task, list[str]()
     added: dict[str, list[dict[str, Any]]] = {}
     held: str | None = None

@@ -14,8 +14,7 @@ from bridge.episode.metadata import Derived
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import PLAN_REPLAY, REFUSED_PLAN, RunFolder
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.episode.transforms import TransformTree
-from bridge.errors import EpisodeError, GstError, UsageError
+from bridge.errors import EpisodeError, UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.check import nearest
@@ -31,7 +30,7 @@ from twin.plan.ground.vocabulary import GroundingError
 from twin.plan.live import PROPOSERS
 from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
 from twin.plan.model_stages import Asked, ask_about, ask_for_goals, client_of, retasked
-from twin.plan.problem import CameraView, Problem, State
+from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
 from twin.replay.config import ReplayConfig
@@ -39,8 +38,7 @@ from twin.replay.output import ReplayOrigin, write_replay
 from twin.replay.rebuilt_scene import for_task
 from twin.replay.run_job import cell_of, planned_grips
 from twin.replay.verdict import replay_plan
-from twin.scene.frames.camera_poses import base_tree, never_moves
-from twin.scene.localise.episode import first_execution_ns, localise_episode
+from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.mesh_fit import scanned_surfaces
 from twin.scene.localise.objects import LocaliseConfig
 from twin.scene.localise.result import LocalisedObject
@@ -88,12 +86,6 @@ class Start:
         if self.problem.keypoints:
             listed = (f"{k} {each.words}" for k, each in enumerate(self.problem.keypoints))
             found.append(f"  keypoints: {', '.join(listed)}")
-        if self.problem.cameras:
-            listed = (
-                f"{name} ({'fixed' if view.T_tcp_camera is None else 'in the hand'})"
-                for name, view in self.problem.cameras.items()
-            )
-            found.append(f"  cameras: {', '.join(listed)}")
         return found
 
     def to_json(self) -> dict[str, Any]:
@@ -102,7 +94,6 @@ class Start:
             "episode": self.episode.path.stem,
             "arm": self.arm,
             "keypoints": [each.words for each in self.problem.keypoints],
-            "cameras": sorted(self.problem.cameras),
         }
 
 
@@ -111,12 +102,6 @@ def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") ->
 
     Args:
         robot: Robot file that takes the place of the recorded description; none: that one.
-
-    Raises:
-        UsageError: No episode is called as asked, or there is none.
-        NoPlanError: No episode shows all of them; says what is missing in the newest. Or nothing
-            can be planned from what was found.
-        EpisodeError: The robot was not described.
     """
     run.refuse_empty()
     paths = run.episodes()
@@ -179,8 +164,6 @@ def _start(
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
-    T_base_tcp = None if start_rad is None else problem.robot.T_base_tcp(start_rad)
-    problem = replace(problem, cameras=cameras_at(run, episode, seen_ns, T_base_tcp))
     return Start(
         episode=episode,
         seen_ns=seen_ns,
@@ -189,56 +172,6 @@ def _start(
         urdf=urdf,
         from_home=unknown,
     )
-
-
-def cameras_at(
-    run: RunFolder,
-    episode: Episode,
-    stamp_ns: int,
-    T_base_tcp: Float[np.ndarray, "4 4"] | None,
-) -> dict[str, CameraView]:
-    """The cameras whose place at an instant is known; what moves is taken to be in the hand.
-
-    Left out are a camera that is not posed in the robot's base, one in the hand where nobody knows
-    the arm's posture, and one that stands still in a recording in which the arm does, too.
-
-    Args:
-        T_base_tcp: Of the tool then; None: not known.
-    """
-    try:
-        calibration = read_calibration(run)
-        recorded = base_tree(episode)
-        calibrated = calibrated_cameras(episode, calibration)
-        base_frame = streams.recorded_robot(episode).base_frame
-    except GstError:
-        return {}
-    moved = first_execution_ns(episode) is not None
-    found: dict[str, CameraView] = {}
-    for camera_id in streams.camera_ids(episode):
-        known = calibrated.get(camera_id)
-        tree = recorded if known is None else known.tree
-        mount = None if calibration is None else calibration.cameras.get(camera_id)
-        try:
-            info = streams.camera_info(episode, camera_id)
-            if tree.root_of(info.frame_id) != base_frame:
-                continue
-            T = tree.T_root_frame(info.frame_id, stamp_ns)
-            fixed = _is_stationary(tree, info.frame_id, moved) if mount is None else mount.fixed
-        except GstError:
-            continue
-        if not np.isfinite(T).all() or fixed is None or not (fixed or T_base_tcp is not None):
-            continue
-        in_hand = None if fixed or T_base_tcp is None else se3.invert(T_base_tcp) @ T
-        found[camera_id] = CameraView(camera=info.camera, T_base_camera=T, T_tcp_camera=in_hand)
-    return found
-
-
-def _is_stationary(tree: TransformTree, frame: str, moved: bool) -> bool | None:
-    """Whether a camera never moves; None: the arm does not either, so nobody knows."""
-    stamps = tree.stamps_ns(frame)
-    if len(stamps) <= 1:
-        return True
-    return (True if moved else None) if never_moves(tree, frame, stamps) else False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,12 +198,7 @@ class Begun:
 
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
-    """Find out what is to be done and from where; a model is asked first where one is given.
-
-    Raises:
-        GroundingError: When neither a model nor the grammar understands the instruction.
-        NoPlanError: See ``start_of``.
-    """
+    """Find out what is to be done and from where; a model is asked first where one is given."""
     proposer_of(config.policy)
     if config.model:
         client_of(run, config)
@@ -365,9 +293,6 @@ def plan_once(
 
     Args:
         run: The accepted plan goes into its ``plans/``, those refused before beside it.
-
-    Raises:
-        NoPlanError: There is no candidate at all, not even without what a model added.
     """
     understood, start, asked = begun.understood, begun.start, begun.asked
     try:
@@ -448,11 +373,7 @@ def _attempts(
 
 
 def proposer_of(policy: str) -> Proposer:
-    """Who plans by a policy.
-
-    Raises:
-        UsageError: Nobody does.
-    """
+    """Who plans by a policy."""
     if policy not in PROPOSERS:
         known = ", ".join(sorted(PROPOSERS))
         message = f"no policy {policy!r}. There are: {known}.{nearest(policy, PROPOSERS)}"

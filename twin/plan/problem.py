@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bridge.geometry.camera import Camera
 from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
@@ -53,17 +52,6 @@ class Keypoint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraView:
-    """A camera, and where it is."""
-
-    camera: Camera
-    T_base_camera: Float[np.ndarray, "4 4"]
-    """At the start."""
-    T_tcp_camera: Float[np.ndarray, "4 4"] | None = None
-    """Of a camera in the hand, which moves with it; None: it stands still."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Problem:
     """What the planner knows when it plans."""
 
@@ -74,8 +62,6 @@ class Problem:
     """By object id; every object of the task has one."""
     keypoints: tuple[Keypoint, ...] = ()
     """What constraints may name as ``kp``."""
-    cameras: Mapping[str, CameraView] = field(default_factory=dict)
-    """By name; what constraints of kind ``visible`` may name."""
 
     def model(self, object_id: str) -> ObjectModel:
         """The task file's nominal shape of an object."""

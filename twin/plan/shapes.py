@@ -48,10 +48,6 @@ def problem_of(
         run: Its scene and calibration are used; None: there is none, the task file says all.
         localised: Where they were found; those that were not keep the reason.
         start_rad: Where the arm stands, base to hand; None: not known.
-
-    Raises:
-        RobotDescriptionError: The robot cannot be used.
-        UnreadableSceneError: The run's scene cannot be understood.
     """
     found = {
         key: item
@@ -122,11 +118,7 @@ def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
 def _keypoints_of(
     scene_dir: Path, record: Mapping[str, Any], key: str
 ) -> dict[str, Float[np.ndarray, "3"]]:
-    """Named points that the scene has of an object, in the frame it was scanned in.
-
-    Raises:
-        UnreadableSceneError: What the scene says of them makes no sense.
-    """
+    """Named points that the scene has of an object, in the frame it was scanned in."""
     try:
         instances = (record.get("semantics") or {}).get("instances", ())
         mine = [item for item in instances if item.get("object") == key]
@@ -146,12 +138,7 @@ def _keypoints_of(
 
 
 def _parts_of(scene_dir: Path, key: str) -> dict[str, Float[np.ndarray, "num_points 3"]]:
-    """Middles of the Gaussians of each part, in the object's frame; none where there are none.
-
-    Raises:
-        UnreadableSemanticsError: Parts that are there cannot be read.
-        UnreadablePlyError: Likewise the Gaussians.
-    """
+    """Middles of the Gaussians of each part, in the object's frame; none where there are none."""
     if not (scene_dir / SEMANTICS_FILE).is_file():
         return {}
     record = read_record(RunFolder(path=scene_dir.parent))

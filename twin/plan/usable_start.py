@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull
+from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
-from bridge.geometry import se3
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
 from twin.plan.constrain.kinds import outer_reach
@@ -25,20 +23,12 @@ _RIGID = 1e-3
 """By how much a rotation may differ from one."""
 MOST_UNCERTAIN_M = 0.010
 """Standard deviation of a position beyond which nothing is planned."""
-_ON_TOP_M = 0.006
-"""What lies on something begins so little under its top, or higher."""
-_PLACES = 25
-"""On a top, along each side, where it is asked whether there is room."""
 _LIMIT_RAD = 0.01
 """Beyond a joint's limit by so much an encoder may read."""
 
 
 def refuse_unusable(problem: Problem) -> None:
-    """Refuse poses and postures that nothing can be planned from.
-
-    Raises:
-        NoPlanError: What was found, where, and what to do.
-    """
+    """Refuse poses and postures that nothing can be planned from."""
     _refuse_posture(problem)
     scene = problem.scene
     for name, T in scene.Ts_base_object.items():
@@ -60,16 +50,12 @@ def refuse_unusable(problem: Problem) -> None:
         _refuse_far(problem, name)
     for name in scene.task.manipulated:
         _refuse_far_mark(problem, name)
-        _refuse_covered(problem, name)
 
 
 def start_posture(
     episode: Episode, stamp_ns: int, joints: Sequence[str]
 ) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
     """Where the arm was recorded to stand at the start [rad], or why nobody knows.
-
-    Args:
-        joints: The arm's, base to hand.
 
     Returns:
         None with the reason in words, or the joints and nothing.
@@ -95,14 +81,7 @@ def start_posture(
 
 
 def refuse_other_robot(run: RunFolder, robot: Robot) -> None:
-    """Refuse a rebuilt scene that another robot recorded: it stands where that one was calibrated.
-
-    Args:
-        run: Its ``scene.json`` names the episodes that it was made of.
-
-    Raises:
-        NoPlanError: They differ.
-    """
+    """Refuse a rebuilt scene that another robot recorded: it stands where that one stood."""
     if other := scene_of_other_robot(run, robot.name):
         _refuse(
             f"{other}, and the start with {robot.name}",
@@ -174,58 +153,3 @@ def _refuse_far_place(
             f"first joint of {problem.robot.record.name}, which reaches {length_m:.2f} m",
             hint,
         )
-
-
-def _refuse_covered(problem: Problem, key: str) -> None:
-    """What an object is to be put onto is under others that leave no room, however it is turned."""
-    scene = problem.scene
-    task, goal = scene.task, scene.task.goal_of(key)
-    moved_before = task.manipulated[: task.manipulated.index(key)]
-    if goal is None or goal[0] != "on" or goal[1] in moved_before:
-        return
-    support = goal[1]
-    if support not in scene.Ts_base_object:  # the table
-        return
-    others = set(scene.movable()) - {key, support, *moved_before}
-    places, step_m = _places_on(problem, support)
-    least_m = min(problem.model(key).size_m) / 2 - step_m
-    highest_m = places[0, 2] + max(problem.model(key).size_m)
-    is_taken: Bool[np.ndarray, " num_places"] = np.zeros(len(places), dtype=np.bool_)
-    lying = []
-    for name in sorted(others):
-        points = se3.apply(scene.Ts_base_object[name], problem.shapes[name].vertices_m)
-        if places[0, 2] - _ON_TOP_M <= points[:, 2].min() <= highest_m:
-            near = _gaps_m(places[:, :2], points[:, :2]) < least_m
-            is_taken |= near
-            lying += [name] if near.any() else []
-    if is_taken.all():
-        _refuse(
-            f"{', '.join(lying)} on {support} leaves no room for {key}, which is to be put there",
-            f"Move it away first. {_AGAIN}",
-        )
-
-
-def _places_on(problem: Problem, name: str) -> tuple[Float[np.ndarray, "num_places 3"], float]:
-    """Points all over the top of an object, and how far the nearest may be from any place there."""
-    model = problem.model(name)
-    x_m, y_m, z_m = model.size_m
-    top_m = z_m / 2 if model.origin_at_centre else z_m
-    sides = [np.linspace(-half, half, _PLACES) for half in (x_m / 2, y_m / 2)]
-    x, y = (grid.ravel() for grid in np.meshgrid(*sides))
-    local = np.stack([x, y, np.full_like(x, top_m)], axis=1)
-    step_m = float(np.hypot(x_m, y_m)) / (_PLACES - 1) / 2
-    return se3.apply(problem.scene.Ts_base_object[name], local), step_m
-
-
-def _gaps_m(
-    places_m: Float[np.ndarray, "num_places 2"], points_m: Float[np.ndarray, "num_points 2"]
-) -> Float[np.ndarray, " num_places"]:
-    """How far places are from the outline around points, seen from above; 0 inside."""
-    hull = ConvexHull(points_m)
-    begin = points_m[hull.vertices]
-    way = np.roll(begin, -1, axis=0) - begin
-    off = places_m[:, None] - begin
-    share = np.clip((off * way).sum(axis=-1) / (way * way).sum(axis=-1), 0.0, 1.0)
-    gaps = np.linalg.norm(off - share[..., None] * way, axis=-1).min(axis=1)
-    beyond = (places_m @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
-    return np.where(beyond <= 0, 0.0, gaps)

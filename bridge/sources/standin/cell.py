@@ -1,6 +1,5 @@
 """The cell at work: physics, sensors and clock together, publishing as they go."""
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -54,8 +53,6 @@ class CellConfig:
     """Frames per second of each camera during trials; 0 takes none."""
     scale: float = 1.0
     """Resize the images of the cell file (320 x 240)."""
-    real_time: bool = False
-    """Keep pace with the wall clock instead of running as fast as possible."""
 
 
 @dataclass
@@ -100,8 +97,6 @@ class StandinCell:
         start_ns: int,
         first_start: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
-        sleep: Callable[[float], None] = time.sleep,
-        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         """Build the laboratory and wait at home."""
         self.file, self.task, self.hidden, self.streams = cell, task, hidden, streams
@@ -113,7 +108,6 @@ class StandinCell:
         self.home_rad = self.kinematics.joints_for(home, np.array(HOME_SEED_RAD))
         self.truth = TruthLog()
         self.now_ns = start_ns
-        self._start_ns = start_ns
         self._cameras = {
             key: mount.camera.scaled(config.scale) for key, mount in cell.cameras.items()
         }
@@ -128,8 +122,6 @@ class StandinCell:
         begins = [first_start] if first_start else []
         self._rng = np.random.default_rng([SENSOR_STREAM, seed, *begins])
         self._should_stop = should_stop
-        self._sleep, self._monotonic = sleep, monotonic
-        self._wall_start_s = monotonic()
         self._target_rad, self._width_m = self.home_rad, MAX_WIDTH_M
         self._width_target_m = MAX_WIDTH_M
         self._due = dict.fromkeys(("gripper", "truth", "camera", "frames"), start_ns)
@@ -185,11 +177,7 @@ class StandinCell:
         times_ns: Int[np.ndarray, " num_waypoints"],
         joints_rad: Float[np.ndarray, "num_waypoints 6"],
     ) -> None:
-        """Send joint targets, interpolated between waypoints; times count from now.
-
-        Args:
-            times_ns: Of each waypoint, ascending; the last says how long the motion takes.
-        """
+        """Send joint targets, interpolated between waypoints; times count from now."""
         count = round(int(times_ns[-1]) / TICK_NS)
         ticks_ns = np.arange(1, count + 1) * TICK_NS
         columns = [np.interp(ticks_ns, times_ns, joints_rad[:, joint]) for joint in range(6)]
@@ -218,9 +206,6 @@ class StandinCell:
         rate = self.config.rate_hz
         if self.cameras_running and rate > 0 and self._is_due("camera", ns_from_s(1 / rate)):
             self.capture()
-        if self.config.real_time:
-            ahead_s = (self.now_ns - self._start_ns) * 1e-9
-            self._sleep(max(ahead_s - (self._monotonic() - self._wall_start_s), 0.0))
 
     def _is_due(self, name: str, period_ns: int) -> bool:
         if self.now_ns < self._due[name]:

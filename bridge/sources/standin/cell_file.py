@@ -288,7 +288,6 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
     """Draw one laboratory; the same cell file and seed give the same one.
 
     Args:
-        cell: Ranges and standard deviations to draw from.
         task: Whose objects are in it; a cell may have other ranges for a task. Not needed for a
             cell without deviations.
     """

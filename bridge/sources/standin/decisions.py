@@ -115,9 +115,6 @@ class Decider:
     ) -> None:
         """Prepare; nothing is asked before ``decide``.
 
-        Args:
-            task_sha256: Of the task file; "" where it is not known.
-
         Raises:
             UsageError: When the built-in planner is asked for another policy than its own.
         """
@@ -238,13 +235,8 @@ class Decider:
         self._cell.streams.event("note", self._cell.now_ns, text=text)
 
     def _unverified(self, plan: Plan, reason: str) -> Decision:
-        streams, now_ns = self._cell.streams, self._cell.now_ns
-        if self._config.execute_unverified:
-            remark = f"executed without a verdict ({reason})"
-            streams.event("note", now_ns, plan_id=plan.id, text=remark)
-            return Decision(plan=plan, void=False, remark=remark)
         remark = f"{NOTHING_EXECUTED}, no verdict ({reason})"
-        streams.event("note", now_ns, plan_id=plan.id, text=remark)
+        self._cell.streams.event("note", self._cell.now_ns, plan_id=plan.id, text=remark)
         return Decision(plan=None, void=True, remark=remark)
 
     def _note_refusal(self, plan: Plan, reason: str, *, last: bool) -> None:

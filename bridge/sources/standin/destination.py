@@ -87,9 +87,6 @@ def destination_of(
 ) -> Destination:
     """Find where an object belongs by the success predicates, and where that is.
 
-    Args:
-        seen: Poses ``T_base_object`` when the object is put there.
-
     Raises:
         UsageError: When no predicate says it, and there is neither mark nor container.
     """

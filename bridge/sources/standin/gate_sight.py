@@ -40,22 +40,14 @@ class GateSight:
         return f"object not found: {self.reason}"
 
     def needed(self) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """The poses of all objects.
-
-        Raises:
-            NotSeenError: When there are none, saying why.
-        """
+        """The poses of all objects."""
         if not self.found:
             raise NotSeenError(self.problem)
         return dict(self.Ts_base_object)
 
     @staticmethod
     def from_json(data: bytes, task: Task) -> "GateSight":
-        """Read an answer; one that cannot be read, or lacks an object, is none.
-
-        Args:
-            task: All of whose objects must be in it.
-        """
+        """Read an answer; one that cannot be read, or lacks an object, is none."""
         try:
             record = json.loads(data)
             found, reason = record["found"], str(record["reason"] or "")
@@ -79,12 +71,7 @@ class GateSight:
 def ask_where(
     session: Session, cell: str, task: Task, task_sha256: str, *, timeout_s: float
 ) -> GateSight:
-    """Ask a cell's gate where a task's objects are.
-
-    Args:
-        task: All of whose objects must be found.
-        task_sha256: Of its file; "" where it is not known.
-    """
+    """Ask a cell's gate where a task's objects are."""
     key = cell_topic(cell, LOCALISE)[1:]
     payload = json.dumps({"task": task.name, "task_sha256": task_sha256}).encode()
     try:

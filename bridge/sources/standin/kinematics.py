@@ -63,11 +63,7 @@ class Kinematics:
     def T_base_frame(
         self, joints_rad: Float[np.ndarray, "6"], frame: str
     ) -> Float[np.ndarray, "4 4"]:
-        """Return where a link is at these joints, gripper closed.
-
-        Args:
-            frame: A frame of the URDF, such as ``tool0``.
-        """
+        """Return where a link is at these joints, gripper closed."""
         pinocchio.framesForwardKinematics(self._model, self._data, self._full(joints_rad))
         placement = self._data.oMf[self._model.getFrameId(frame)]
         return np.array(placement.homogeneous)
@@ -134,12 +130,7 @@ def arm_kinematics() -> Kinematics:
 
 
 def tool_down(p_m: Float[np.ndarray, "3"], yaw_rad: float) -> Float[np.ndarray, "4 4"]:
-    """Pose ``T_base_tcp`` with the tool pointing down; yaw 0 closes the fingers along base y.
-
-    Args:
-        p_m: Tool centre point in the base frame [m].
-        yaw_rad: Turn about the base's z axis.
-    """
+    """Pose ``T_base_tcp`` with the tool pointing down; yaw 0 closes the fingers along base y."""
     T = np.eye(4)
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     # Columns: tool x is -x of the base at yaw 0, tool y is y, tool z is down.
@@ -173,13 +164,7 @@ def slerp_poses(
     T_end: Float[np.ndarray, "4 4"],
     fractions: Float[np.ndarray, " num_poses"],
 ) -> Float[np.ndarray, "num_poses 4 4"]:
-    """Straight line in position, constant axis in rotation.
-
-    Args:
-        T_start: Pose at fraction 0.
-        T_end: Pose at fraction 1, in the same frame.
-        fractions: Shares of the way, 0 to 1.
-    """
+    """Straight line in position, constant axis in rotation."""
     q_start, p_start = se3.split(T_start)
     q_end, p_end = se3.split(T_end)
     count = len(fractions)
@@ -240,16 +225,7 @@ class Track:
 def follow_legs(
     before: Track, legs: Sequence[Leg], kinematics: Kinematics, max_joint_speed_rad_s: float
 ) -> Track:
-    """Go on along straight lines at 20 Hz with smooth speed, slower where a joint would race.
-
-    Args:
-        before: What has been planned; the legs begin where it ends.
-        legs: Movements of the tool, one after the other.
-        max_joint_speed_rad_s: A leg takes longer than it asks for where a joint would be faster.
-
-    Raises:
-        UnreachablePoseError: When the arm cannot follow.
-    """
+    """Go on along straight lines at 20 Hz with smooth speed, slower where a joint would race."""
     tau, bounds = list(before.tau), dict(before.bounds)
     T_from, t_ns = before.T_base_tcp, tau[-1].t_ns
     joints = np.array(tau[-1].joints_rad, dtype=np.float64)

@@ -49,9 +49,6 @@ def label_trial(task: Task, truth: TruthLog, *, executed: bool, remark: str = ""
     """Say how a trial ended, as a person would from looking.
 
     A task with several objects is counted by object: k of n are where they belong.
-
-    Args:
-        executed: Whether anything was executed.
     """
     rollout = truth.rollout()
     findings = evaluate_success(task, rollout)
@@ -129,11 +126,7 @@ def wait_s(least_s: float, rate_hz: float) -> float:
     """How long the arm waits: each camera sees all that lies still at least once.
 
     An image counts only with some rest before and after it. A gate that has none waits for one,
-    and the cell's clock stands still meanwhile, so none would come.
-
-    Args:
-        least_s: At least this long.
-        rate_hz: Images per second of each camera; 0: none, and nobody looks.
+    and the cell's clock stands still meanwhile, so none would come. At 0 Hz nobody looks.
     """
     return least_s if rate_hz <= 0 else max(least_s, 1 / rate_hz + 2 * STILL_S)
 
@@ -310,11 +303,7 @@ class Operator:
     ) -> dict[str, Float[np.ndarray, "4 4"]]:
         """The declared start as a person puts it down: a little off, differently each time.
 
-        Args:
-            start_seed: Number of the start; the same one declares the same poses.
-            treatment: Which trial of that start it is, by its condition or study arm; the
-                deviations differ between them.
-            retry: Whether they are put back after a failure; the deviations differ again.
+        The deviations differ between treatments (conditions or study arms), and again in a retry.
         """
         noise = self._cell.file.noise_for(self._cell.task.name)
         poses = self._cell.task.draw_start(np.random.default_rng(start_seed))

@@ -36,21 +36,8 @@ from bridge.task.plan import Plan, Stage
 from bridge.task.task_file import ObjectModel, Task
 
 
-@dataclass(frozen=True, kw_only=True)
-class StageIds:
-    """The stages of a task that one object goes through."""
-
-    pick: str
-    carry: str
-    place: str
-
-
-def stage_ids(task: Task, object_id: str) -> StageIds:
-    """The stages that grasp, carry and release an object; placing may cover the carrying.
-
-    Raises:
-        UsageError: When none grasps or none releases it.
-    """
+def stage_ids(task: Task, object_id: str) -> tuple[str, str, str]:
+    """The stages that grasp, carry and release an object; placing may cover the carrying."""
 
     def of(verb: str) -> str | None:
         return next((stage["id"] for stage in task.stages if stage.get(verb) == object_id), None)
@@ -62,7 +49,7 @@ def stage_ids(task: Task, object_id: str) -> StageIds:
             "the scripted planner needs both. See docs/tasks.md."
         )
         raise UsageError(message)
-    return StageIds(pick=pick, carry=carry or place, place=place)
+    return pick, carry or place, place
 
 
 def planned_stages(
@@ -76,11 +63,7 @@ def planned_stages(
 
     Args:
         bounds: When each stage begins and ends, from the start of the plan [ns].
-        seen: Poses ``T_base_object`` as perceived.
         places: Where each object belongs; None for one that is pushed to its mark.
-
-    Raises:
-        UsageError: When a stage handles no object.
     """
     stages = []
     for index, table in enumerate(task.stages):
@@ -174,7 +157,6 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
     """Draw how a candidate is wrong; the same start, round and object give the same error.
 
     Args:
-        noise: Standard deviations.
         round_: Number of the attempt, from 0: one more for each plan that was refused.
         index: Number of the object among those manipulated, from 0.
     """
@@ -194,12 +176,7 @@ def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int 
 def draw_errors(
     noise: PlannerNoise, count: int, *, start_seed: int, round_: int
 ) -> tuple[GraspError, ...]:
-    """Draw an error for each of several objects.
-
-    Args:
-        noise: Standard deviations.
-        round_: Number of the attempt, from 0: one more for each plan that was refused.
-    """
+    """Draw an error for each of several objects."""
     return tuple(
         draw_error(noise, start_seed=start_seed, round_=round_, index=index)
         for index in range(count)
@@ -214,10 +191,7 @@ def perceive(
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Return the objects' poses as this planner sees them: shifted and turned a little.
 
-    Args:
-        Ts_base_object: True poses by object id; left as they are.
-        noise: Standard deviations.
-        start_seed: Number of the start; the same one is always seen with the same error.
+    The same start is always seen with the same error.
     """
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, 10_000])
     seen = {}
@@ -242,20 +216,10 @@ def plan_pick_and_place(
     plan_id: str,
     condition: str,
     start_id: str,
-    parent_id: str | None = None,
     round_: int = 0,
     grounding: str = GROUNDING,
 ) -> Plan:
-    """Plan one attempt: each object in turn is put into its slot or pushed to its mark; then home.
-
-    Args:
-        seen: Poses ``T_base_object`` as perceived.
-        parent_id: The plan that was refused before.
-        round_: How many were refused before.
-
-    Raises:
-        UnreachablePoseError: When the arm cannot follow.
-    """
+    """Plan one attempt: each object in turn into its slot or to its mark; then home."""
     count = len(task.manipulated)
     errors = [error] * count if isinstance(error, GraspError) else list(error)
     follow = partial(
@@ -270,7 +234,6 @@ def plan_pick_and_place(
     track = follow(track, [Leg(name="home", stage=last, T_base_tcp=T_home, duration_s=1.4, g=0)])
     return Plan(
         id=plan_id,
-        parent_id=parent_id,
         round=round_,
         planner=PLANNER_NAME,
         policy=POLICY_NAME,
@@ -388,19 +351,19 @@ def _legs(
     over[2] = carry_m
     low = over.copy()
     low[2] = release_m
-    ids = stage_ids(task, object_id)
+    pick, carry, place = stage_ids(task, object_id)
     there = destination.turned_to(yaw)
     moves = (
-        ("pregrasp", ids.pick, above, yaw, 1.5, 0),
-        ("grasp", ids.pick, p, yaw, 0.9, 0),
-        ("settle", ids.pick, p, yaw, 0.2, 0),
-        ("close", ids.pick, p, yaw, 0.7, 1),
-        ("lift", ids.pick, carried, yaw, 0.9, 1),
-        ("carry", ids.carry, over, there, 1.6, 1),
-        ("lower", ids.place, low, there, 0.8, 1),
-        ("settle", ids.place, low, there, 0.2, 1),
-        ("open", ids.place, low, there, 0.5, 0),
-        ("retreat", ids.place, over, there, 0.7, 0),
+        ("pregrasp", pick, above, yaw, 1.5, 0),
+        ("grasp", pick, p, yaw, 0.9, 0),
+        ("settle", pick, p, yaw, 0.2, 0),
+        ("close", pick, p, yaw, 0.7, 1),
+        ("lift", pick, carried, yaw, 0.9, 1),
+        ("carry", carry, over, there, 1.6, 1),
+        ("lower", place, low, there, 0.8, 1),
+        ("settle", place, low, there, 0.2, 1),
+        ("open", place, low, there, 0.5, 0),
+        ("retreat", place, over, there, 0.7, 0),
     )
     return [
         Leg(name=name, stage=stage, T_base_tcp=tool_down(to, turned), duration_s=seconds, g=g)

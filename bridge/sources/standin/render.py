@@ -77,11 +77,7 @@ class Renderer:
         self._painted = [k for k, item in enumerate(surfaces) if item.paint is not None]
 
     def backdrop(self, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> Layer:
-        """See the laboratory without the bodies in it, for ``render`` from the same place.
-
-        Args:
-            T_base_camera: Where the camera stands, with OpenCV axes.
-        """
+        """See the laboratory without the bodies in it, for ``render`` from the same place."""
         posed = self._pose(T_base_camera, {}, self._unmoving, {})
         seen = self._look(posed, _rays(camera, T_base_camera))
         return replace(seen, colors=self._smooth_edges(posed, seen, camera, T_base_camera))
@@ -97,10 +93,7 @@ class Renderer:
         """Take a picture of the bodies where they are, the soft ones by their skins.
 
         Args:
-            T_base_camera: Where the camera is, with OpenCV axes.
-            Ts_base_body: Poses of the moving bodies, by name.
             backdrop: What ``backdrop`` returned for the same place; None draws the laboratory too.
-            skins_m: Vertices of soft bodies by name, in the base frame; None when there is none.
         """
         which = self._moving if backdrop is not None else [*self._unmoving, *self._moving]
         posed = self._pose(T_base_camera, Ts_base_body, which, skins_m or {})
@@ -253,12 +246,7 @@ def _nearer(front: Layer, back: Layer) -> Layer:
 
 def _repeat(layer: Layer, where: Int[np.ndarray, " num_pixels"], times: int) -> Layer:
     index = np.tile(where, times)
-    return Layer(
-        colors=layer.colors[index],
-        depth_m=layer.depth_m[index],
-        cosine=layer.cosine[index],
-        surface_ids=layer.surface_ids[index],
-    )
+    return Layer(**{name: values[index] for name, values in vars(layer).items()})
 
 
 def _tensor(array: np.ndarray) -> Any:

@@ -124,11 +124,7 @@ def joint_move(
     end_rad: Float[np.ndarray, "6"],
     max_speed_rad_s: float,
 ) -> tuple[np.ndarray, Float[np.ndarray, "num_waypoints 6"]]:
-    """A smooth move in joint space, as fast as the slowest joint allows: times [ns] and joints.
-
-    Args:
-        start_rad: At rest at the first time, 0.
-    """
+    """A smooth move in joint space, as fast as the slowest joint allows: times [ns] and joints."""
     largest = float(np.max(np.abs(end_rad - start_rad)))
     # The minimum-jerk law peaks at 15/8 of its mean speed.
     duration_s = max(1.875 * largest / max_speed_rad_s, 0.1)

@@ -36,9 +36,6 @@ def run_session(
     Args:
         should_stop: Asked every 8 ms of the cell's time; the open episode is then finished.
         start_ns: The cell's time at the start; the wall clock's when not given.
-
-    Returns:
-        Per condition how many trials had which outcome, and whether the session was stopped.
     """
     task_file = chosen_task_file(config.task)
     task = task_file.task()
@@ -48,9 +45,7 @@ def run_session(
         task,
         draw_hidden(file, config.seed, task),
         Streams(session, config.cell),
-        config=CellConfig(
-            rate_hz=config.rate_hz, scale=config.image_scale, real_time=config.real_time
-        ),
+        config=CellConfig(rate_hz=config.rate_hz, scale=config.image_scale),
         seed=config.seed,
         first_start=config.first_start,
         start_ns=AnchoredClock().now_ns() if start_ns is None else start_ns,
@@ -115,11 +110,7 @@ class StandinSource:
         )
 
     def run(self, session: "WireSession", stop: threading.Event, output: Output) -> dict[str, Any]:
-        """Record as the configuration says, or until stopped; see ``run_session``.
-
-        Args:
-            stop: Looked at every 8 ms of the cell's time; the open episode is then finished.
-        """
+        """Record as the configuration says, or until stopped; see ``run_session``."""
         # Without an answer to @clock: the stamps are simulated time, not that of this host.
         session.declare_alive(f"{self.config.cell}/alive")
         return run_session(session, self.config, output, should_stop=stop.is_set)

@@ -73,16 +73,12 @@ class SessionConfig:
     ask_always: Annotated[bool, RARE] = False
     """Ask the gate without replanning too; its verdict is recorded and not obeyed, so that the
     gate's refusals meet an outcome as well."""
-    execute_unverified: Annotated[bool, RARE] = False
-    """With replanning, execute also when no verdict comes; the record says so."""
     recorder: Annotated[str, RARE] = "main"
     """Name of the recorder to start and stop."""
     rate_hz: float = 5.0
     """Frames per second of each camera during trials."""
     image_scale: Annotated[float, RARE] = 1.0
     """Resize the images of the cell file (320 x 240)."""
-    real_time: bool = False
-    """Keep pace with the wall clock instead of running as fast as possible."""
 
     def __post_init__(self) -> None:
         """Refuse numbers and words that no session can have."""

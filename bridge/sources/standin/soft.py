@@ -22,11 +22,7 @@ FLEX_SOLREF = (0.008, 1.0)
 
 
 def soft_model_xml(task: Task, hidden: HiddenParameters) -> str:
-    """Return a MuJoCo model with nothing but the task's soft objects, each at its own origin.
-
-    Args:
-        task: Its soft objects become flexes named by their ids.
-    """
+    """Return a MuJoCo model with nothing but the task's soft objects, each at its own origin."""
     bodies = "".join(
         _flex_xml(model, hidden) for model in task.objects.values() if model.soft is not None
     )
@@ -80,12 +76,7 @@ class SoftBody:
     def extents_m(
         self, nodes_m: Float[np.ndarray, "8 3"], T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of the deformed surface along the axes of its pose.
-
-        Args:
-            nodes_m: Corners of the cage, in the base frame.
-            T_base_object: Pose of the object, whose axes are measured along.
-        """
+        """Outer extents of the deformed surface along the axes of its pose."""
         local = (self.skin_weights @ nodes_m - T_base_object[:3, 3]) @ T_base_object[:3, :3]
         return np.asarray(np.ptp(local, axis=0))
 

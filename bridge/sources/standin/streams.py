@@ -171,13 +171,7 @@ class Streams:
         effort: Float[np.ndarray, "6"],
         stamp_ns: int,
     ) -> None:
-        """Publish what the encoders say.
-
-        Args:
-            position: Measured angles [rad].
-            velocity: Measured [rad/s].
-            effort: Torques [N m].
-        """
+        """Publish what the encoders say."""
         sample = JointSample(
             stamp_ns=stamp_ns,
             names=ARM_JOINTS,
@@ -240,11 +234,7 @@ class Streams:
         self._put(cell_topic(self._cell, PLAN_PATH), _path_json(plan, stamp_ns), stamp_ns)
 
     def event(self, kind: str, stamp_ns: int, **fields: Any) -> None:
-        """Publish one event; the schema lists the kinds and the fields.
-
-        Args:
-            **fields: Further fields of the event, such as ``plan_id``; checked against the schema.
-        """
+        """Publish one event; the schema lists the kinds and the fields."""
         record = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind, **fields}
         check_record(record, name="event", package="bridge.episode")
         self._put(cell_topic(self._cell, EVENT), json.dumps(record).encode(), stamp_ns)

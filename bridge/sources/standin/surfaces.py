@@ -113,11 +113,7 @@ def _add_patches(
 def lab_texture(
     size_m: tuple[float, float], base: tuple[float, float, float], seed: int
 ) -> Texture:
-    """Floor or wall: large soft blotches and tile lines, low contrast.
-
-    Args:
-        base: Mean colour, sRGB in 0..1.
-    """
+    """Floor or wall: large soft blotches and tile lines, low contrast."""
     rng = np.random.default_rng([8, seed])
     columns, rows = (round(extent / ROOM_RESOLUTION_M) for extent in size_m)
     coarse = rng.normal(0, 1, (rows // 12 + 2, columns // 12 + 2))
@@ -169,8 +165,6 @@ def box_surface(
 
     Args:
         body: Name of the body it moves with; "" for the laboratory.
-        centre_m: Of the box, in the frame of the body [m].
-        color: sRGB in 0..1.
     """
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = np.array(
@@ -186,13 +180,7 @@ def make_surface(
     triangles: Int[np.ndarray, "num_triangles 3"],
     color: tuple[float, float, float],
 ) -> Surface:
-    """Attach normals that are smooth within a crease and broken across it.
-
-    Args:
-        body: Name of the body it moves with; "" for the laboratory.
-        vertices_m: In the frame of the body.
-        color: sRGB in 0..1.
-    """
+    """Attach normals that are smooth within a crease and broken across it."""
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     length = np.linalg.norm(weighted, axis=1, keepdims=True)
@@ -254,11 +242,7 @@ def _shape_surface(body: str, shape: LinkShape, color: tuple[float, float, float
 
 
 def object_surfaces(task: Task, deviations: Deviations | None = None) -> list[Surface]:
-    """The task's objects in their declared colours.
-
-    Args:
-        deviations: Steps and lips of their shapes; None where they are as declared.
-    """
+    """The task's objects in their declared colours."""
     surfaces = []
     own = {} if deviations is None else deviations.objects
     for object_id, model in task.objects.items():
@@ -293,11 +277,7 @@ def _mesh_surface(body: str, mesh: ToyMesh) -> Surface:
 def smooth_normals(
     vertices_m: Float[np.ndarray, "num_vertices 3"], triangles: np.ndarray
 ) -> Float[np.ndarray, "num_triangles 3 3"]:
-    """Normals at the corners of triangles, weighted by area, without creases.
-
-    Args:
-        vertices_m: In any frame; the normals are in the same.
-    """
+    """Normals at the corners of triangles, weighted by area, without creases."""
     a, b, c = (vertices_m[triangles[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     total = np.stack(
@@ -339,11 +319,7 @@ def _placed(surface: Surface, T_base_body: Float[np.ndarray, "4 4"]) -> Surface:
 
 
 def lab_surfaces(seed: int, deviations: Deviations | None = None) -> list[Surface]:
-    """Table top with its texture, floor and four walls.
-
-    Args:
-        deviations: Where the table really stands; None for where it is published.
-    """
+    """Table top with its texture, floor and four walls."""
     x, y, z = TABLE_SIZE_M
     texture = table_texture((x, y), TABLE_CENTRE_M, seed)
     top = box_surface(
@@ -380,13 +356,5 @@ def _walls(seed: int) -> list[Surface]:
 def _textured(
     surface: Surface, texture: Texture, axes: tuple[int, int], shift_m: tuple[float, float]
 ) -> Surface:
-    return Surface(
-        body=surface.body,
-        vertices_m=surface.vertices_m,
-        triangles=surface.triangles,
-        corner_normals=surface.corner_normals,
-        color=surface.color,
-        texture=texture,
-        texture_axes=axes,
-        texture_shift_m=(float(shift_m[0]), float(shift_m[1])),
-    )
+    shift = (float(shift_m[0]), float(shift_m[1]))
+    return replace(surface, texture=texture, texture_axes=axes, texture_shift_m=shift)

@@ -446,11 +446,7 @@ class World:
         joints_rad: Float[np.ndarray, "6"],
         Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
     ) -> None:
-        """Put the arm and the objects somewhere, at rest, gripper open.
-
-        Args:
-            Ts_base_object: Pose of each object by id.
-        """
+        """Put the arm and the objects somewhere, at rest, gripper open."""
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[self._arm] = joints_rad
         self._data.qpos[self._fingers] = MAX_WIDTH_M / 2
@@ -550,11 +546,7 @@ class World:
     def extents_m(
         self, object_id: str, T_base_object: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "3"]:
-        """Outer extents of a soft object along the axes of its pose.
-
-        Args:
-            T_base_object: Its pose, whose axes are measured along.
-        """
+        """Outer extents of a soft object along the axes of its pose."""
         return self._soft[object_id].extents_m(self.nodes_m(object_id), T_base_object)
 
     def finger_contact(self) -> dict[str, bool]:

@@ -37,8 +37,8 @@ from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
 from twin.plan.config import LivePlanConfig, PlanConfig
 from twin.plan.live import LivePlanner, PlannerError, claim_planner, serve_planner
+from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import NoPlanError
-from twin.plan.loop.straight import GeometricProposer
 from twin.plan.problem import Problem
 
 FILE = chosen_task_file("cube_into_box")
@@ -62,7 +62,7 @@ def request(**changes: Any) -> PlanRequest:
     made = PlanRequest(
         task="cube_into_box",
         task_sha256=FILE.sha256,
-        policy="geometric",
+        policy="nominal",
         start_id="cube_into_box/7",
         seed=7,
         round=0,
@@ -85,7 +85,7 @@ def test_a_request_is_answered_with_a_plan_that_fits_it(planner: LivePlanner) ->
     answer = planner.answer(asked.to_json())
     assert answer.plan is not None, answer.reason
     assert asked.why_unfit(answer.plan) == ""
-    assert (answer.plan.planner, answer.plan.policy) == ("gst_geometric", "geometric")
+    assert (answer.plan.planner, answer.plan.policy) == ("gst_planner", "nominal")
     assert answer.plan.candidate is not None
     assert answer.plan.candidate.rank == 0
     assert answer.plan.tau[0].joints_rad == pytest.approx(HOME)
@@ -117,7 +117,7 @@ def test_it_remembers_nothing(planner: LivePlanner) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"policy": "best"}, "policy 'best' is unknown. There are: geometric"),
+        ({"policy": "best"}, "policy 'best' is unknown. There are: loose"),
         ({"task_sha256": "0" * 64}, "no task named 'cube_into_box' with sha256 000000000000"),
         ({"robot": "panda"}, "for robot 'panda'; the cell describes"),
         ({"objects": request().objects[:1]}, "differ in objects"),
@@ -214,7 +214,7 @@ def test_two_refused_replies_leave_the_plan_of_nominal_for_good(tmp_path: Path) 
 
 
 def test_live_what_no_plan_keeps_is_left_out_in_every_round(tmp_path: Path) -> None:
-    class KeepsNothing(GeometricProposer):
+    class KeepsNothing(PlanProposer):
         def propose(self, problem: Problem, **more: Any) -> Any:
             if any(stage.get("path") for stage in problem.scene.task.stages):
                 raise NoPlanError("no path keeps that.")
@@ -257,12 +257,12 @@ def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path: Path) -> None:
-    class Few(GeometricProposer):
+    class Few(PlanProposer):
         def propose(self, problem: Any, *, count: int, **more: Any) -> Any:
             return super().propose(problem, count=1, **more)
 
     run = RunFolder.create(tmp_path / "run")
-    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"geometric": Few})
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"nominal": Few})
     reason = planner.answer(request(round=2).to_json()).reason
     assert "there are 1 candidates, and 2 were tried" in reason
 
@@ -281,7 +281,7 @@ def test_a_bug_is_a_reason_and_no_silence(
             raise ZeroDivisionError("oops")
 
     run = RunFolder.create(tmp_path / "run")
-    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"geometric": Broken})
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"nominal": Broken})
     assert "ZeroDivisionError: oops" in planner.answer(request().to_json()).reason
     assert "Traceback" in capsys.readouterr().err
 

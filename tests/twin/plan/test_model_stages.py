@@ -23,7 +23,6 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
@@ -34,8 +33,7 @@ from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.relations import constraint_of, predicate_of
 from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
-from twin.plan.loop.nominal import SINGLE, PlanProposer
-from twin.plan.problem import CameraView, Keypoint, Problem
+from twin.plan.problem import Keypoint, Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
 
@@ -129,10 +127,9 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
     assert [{frozenset(pair) for pair in stage.allowed_contacts} for stage in plan.stages] == [
         {frozenset(pair) for pair in table["allowed_contacts"]} for table in task.stages
     ]
-    log = (run.derived_dir / model_stages.REPLIES / model_stages.LOG).read_text()
-    (sent,) = (json.loads(line) for line in log.splitlines())
-    assert (sent["status"], sent["request"]) == (200, server.asked[0])
-    assert SECRET not in log
+    kept = [path.read_text() for path in run.derived_dir.rglob("*") if path.is_file()]
+    assert kept
+    assert not any(SECRET in text for text in kept)
     assert images_in(server.asked[0]) == []
     assert "image" not in json.dumps(server.asked[0]["messages"][1])
 
@@ -320,19 +317,6 @@ def test_a_plan_keeps_what_is_asked_of_a_keypoint_where_it_lets_go(
     assert constraint.violation(once._state(problem, plan, None))[0] > 0
     assert constraint.violation(once._state(problem, plan, release))[0] <= 0
     assert any("keypoint 0 (cube's top)" in line for line in data["constraints"])
-
-
-def test_keypoints_and_cameras_change_no_plan_that_names_none() -> None:
-    bare = problem_of_test()
-    view = CameraView(
-        camera=Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0), T_base_camera=np.eye(4)
-    )
-    full = replace(bare, keypoints=(TOP_CORNER,), cameras={"side": view})
-    one, other = (
-        PlanProposer(SINGLE).propose(each, plan_id="p", seed=3, count=1, steer=None)[0].plan
-        for each in (bare, full)
-    )
-    assert one.to_json() == other.to_json()
 
 
 @pytest.mark.parametrize(

@@ -2,27 +2,18 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scripted_plans import scene_of_test
 
 from bridge.data_files import datasets_folder
-from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import (
-    CameraInfo,
-    CompressedColor,
-    FrameTransform,
-    transforms_to_cdr,
-)
+from bridge.episode import streams
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
@@ -31,7 +22,7 @@ from dashboards.rerun_view import export_rrd, run_of
 from dashboards.rerun_viewer import episode_of
 from twin.plan.config import PlanConfig
 from twin.plan.ground.run_tasks import UnderstoodTask
-from twin.plan.once import Begun, Planned, Start, cameras_at, plan_once, start_of
+from twin.plan.once import Begun, Planned, Start, plan_once, start_of
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
@@ -52,7 +43,7 @@ def verdict(plan: Plan, accepted: bool) -> Verdict:
 
 
 def planned(run: RunFolder, answers: list[bool]) -> Planned:
-    """Two rounds of the geometric policy, judged as told."""
+    """Rounds of planning, judged as told."""
     path = run.episodes_dir / "trial_0001.mcap"
     with EpisodeWriter(path) as writer:
         info = EpisodeInfo(
@@ -66,7 +57,7 @@ def planned(run: RunFolder, answers: list[bool]) -> Planned:
     start = Start(episode=episode, seen_ns=SEEN_NS, localised={}, problem=problem, urdf=scene.urdf)
     left = iter(answers)
     understood = UnderstoodTask(file=FILE, grounding=None)
-    config = PlanConfig(policy="geometric", rounds=len(answers))
+    config = PlanConfig(policy="nominal", rounds=len(answers))
     begun = Begun(understood=understood, start=start)
     return plan_once(run, begun, lambda plan: verdict(plan, next(left)), config)
 
@@ -127,56 +118,6 @@ def test_where_plans_begin_is_said(steered: tuple[RunFolder, Planned]) -> None:
     start = replace(done.begun.start, from_home="no joint states were recorded")
     home = replace(done, begun=replace(done.begun, start=start))
     assert "  arm: its home posture, for no joint states were recorded" in home.lines()
-
-
-def test_cameras_are_where_they_stand_or_in_the_hand(run_of_cameras: RunFolder) -> None:
-    episode = Episode.open(run_of_cameras.episodes()[0])
-    T_base_tcp = se3.transform_from(np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.4, 0.0, 0.3]))
-    found = cameras_at(run_of_cameras, episode, 2, T_base_tcp)
-    assert found.keys() == {"side", "wrist"}
-    np.testing.assert_allclose(found["side"].T_base_camera, seen_from(1.2), atol=1e-9)
-    assert found["side"].T_tcp_camera is None
-    in_hand = found["wrist"].T_tcp_camera
-    assert in_hand is not None
-    np.testing.assert_allclose(T_base_tcp @ in_hand, seen_from(0.6), atol=1e-9)
-    assert cameras_at(run_of_cameras, episode, 2, None).keys() == {"side"}
-
-
-def seen_from(x_m: float) -> np.ndarray:
-    return se3.look_at(np.array([x_m, -0.5, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-
-
-@pytest.fixture
-def run_of_cameras(tmp_path: Path) -> RunFolder:
-    """One that stands still, one that moves, and one whose place nobody knows."""
-    run = RunFolder.create(tmp_path / "run")
-    places = [("side", 1, 1.2), ("wrist", 1, 1.0), ("wrist", 2, 0.6)]
-    data = transforms_to_cdr(
-        [
-            FrameTransform(
-                stamp_ns=ns,
-                parent="base_link",
-                child=f"{name}_optical",
-                T_parent_child=seen_from(x_m),
-            )
-            for name, ns, x_m in places
-        ]
-    )
-    camera = Camera(width=4, height=4, fx=4.0, fy=4.0, cx=2.0, cy=2.0)
-    with EpisodeWriter(run.episodes_dir / "c.mcap") as writer:
-        writer.describe(EpisodeInfo(id="c", kind="trial"))
-        writer.write("/tf", data, type_name=schema.TF_MESSAGE, log_time_ns=1)
-        for name in ("side", "wrist", "lost"):
-            frame = f"{name}_optical"
-            seen = CameraInfo(stamp_ns=1, frame_id=frame, camera=camera)
-            image = CompressedColor(stamp_ns=1, frame_id=frame, format="jpeg", data=b"none")
-            for tail, type_name, record in (
-                ("info", schema.CAMERA_INFO, seen),
-                ("image", schema.COMPRESSED_IMAGE, image),
-            ):
-                topic = f"/standin/cam/{name}/color/{tail}"
-                writer.write(topic, record.to_cdr(), type_name=type_name, log_time_ns=1)
-    return run
 
 
 def test_an_episode_of_an_empty_run_is_not_looked_up_in_an_empty_list(

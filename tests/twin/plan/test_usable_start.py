@@ -20,13 +20,11 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
-from bridge.task.task_file import load_task
 from twin.plan.loop.nominal import SINGLE, PlanProposer
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
-from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
@@ -118,27 +116,6 @@ def test_a_start_that_cannot_be_used_is_refused_in_one_sentence(
 
 def test_a_good_start_is_not_refused(problem: Problem) -> None:
     refuse_unusable(scene_with(covariances={"cube": SURE, "box": SURE})(problem))
-
-
-def cubes(x_blue_m: float, *order: str) -> Problem:
-    """Red is to go onto green; blue stands on green, so far from its middle."""
-    task = load_task("stack_and_pack")
-    places = {"red": (0.45, -0.2, 0.0175), "green": (0.5, 0.0, 0.0225),
-              "blue": (0.5 + x_blue_m, 0.0, 0.0625), "box": (0.5, 0.25, 0.0)}  # fmt: skip
-    q = np.array([1.0, 0, 0, 0])
-    Ts = {name: se3.transform_from(q, np.array(p)) for name, p in places.items()}
-    task = replace(task, manipulated=order or task.manipulated)
-    scene = ReplayScene(task=task, Ts_base_object=Ts, urdf=ROBOT.urdf_text(), start_rad=HOME)
-    return Problem(scene=scene, robot=load_robot(scene.urdf), shapes=shapes_of(None, task))
-
-
-def test_a_top_on_which_something_leaves_no_room_is_refused() -> None:
-    with pytest.raises(NoPlanError, match=r"blue on green leaves no room for red.*\. Move it away"):
-        refuse_unusable(cubes(0.0))
-    with pytest.raises(NoPlanError, match="blue on green leaves no room"):
-        refuse_unusable(cubes(0.008))
-    refuse_unusable(cubes(0.035))  # beside it there is
-    refuse_unusable(cubes(0.0, "blue", "red"))  # it goes away first
 
 
 def recorded(path: Path, names: tuple[str, ...], *values_rad: float) -> Episode:

@@ -34,7 +34,6 @@ def angle(a: Array, b: Array, *, undirected: bool = False) -> Array:
     """Angles between directions, with a derivative wherever they are not parallel [rad].
 
     Args:
-        a: Directions along the last axis, of any length but 0.
         undirected: Directions that are opposite count as the same.
     """
     along = (a * b).sum(-1)
@@ -52,7 +51,6 @@ def carried(T: Array, points_m: Array) -> Array:
     """Points of a body in the frame of its pose, ``(num_states, num_points, 3)``.
 
     Args:
-        T: ``(num_states, 4, 4)``.
         points_m: ``(num_points, 3)``, the same in all states, or one list for each state.
     """
     return points_m @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
@@ -64,25 +62,13 @@ def seen_from(T: Array, points_m: Array) -> Array:
 
 
 def box_distance(points_m: Array, half_m: Array, centre_m: Array | None = None) -> Array:
-    """Signed distances of points to the surface of a box along the axes, negative inside [m].
-
-    Args:
-        points_m: ``(..., 3)``, or seen from above ``(..., 2)``.
-        half_m: Half its extents.
-        centre_m: Its middle; None: the origin.
-    """
+    """Signed distances of points to the surface of a box along the axes, negative inside [m]."""
     middles = [((0.0,) * len(half_m)) if centre_m is None else centre_m]
     return boxes_distance(points_m, middles, [half_m])
 
 
 def boxes_distance(points_m: Array, centres_m: Sequence[Array], halves_m: Sequence[Array]) -> Array:
-    """Signed distances of points to the nearest of several boxes; inside one, its own depth [m].
-
-    Args:
-        points_m: ``(..., num_axes)``.
-        centres_m: Middles of the boxes, each ``(num_axes,)``.
-        halves_m: Half their extents.
-    """
+    """Signed distances of points to the nearest of several boxes; inside one, its own depth [m]."""
     axes = [points_m[..., k] for k in range(points_m.shape[-1])]
     outside2: Array = None
     inside: Array = 0.0
@@ -104,11 +90,6 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
     The difference of two projected boxes is a polygon with a pair of parallel edges for each edge
     direction (a zonotope, see Ziegler, Lectures on Polytopes, 7.3): the gap is the distance of the
     origin from it.
-
-    Args:
-        T_a: Poses of the one box's middle, ``(num_states, 4, 4)``.
-        half_a: Half its extents, ``(3,)``.
-        half_b: Half its extents.
     """
     T_a, T_b = np.broadcast_arrays(T_a, T_b)
     centre = (T_a[:, :2, 3] - T_b[:, :2, 3])[:, None]
@@ -132,23 +113,3 @@ def footprint_gap(T_a: Array, half_a: Array, T_b: Array, half_b: Array) -> Array
         gaps.append(np.where(flat, norm(from_middle - t[..., None] * along), _FAR_M))
     clear = np.amin(np.concatenate(gaps, axis=1), axis=-1)
     return np.where(overlap <= 0, overlap, clear)
-
-
-def blocked_length(starts_m: Array, ends_m: Array, T_box: Array, half_m: Array) -> Array:
-    """How long straight lines run inside a box; negative where they miss it [m].
-
-    Slabs: a line is inside between the last plane it enters by and the first it leaves by.
-
-    Args:
-        starts_m: The point all lines of a state start from, ``(num_states, 1, 3)``.
-        ends_m: ``(num_states, num_points, 3)``.
-        T_box: Poses of the box's middle, ``(num_states, 4, 4)``.
-        half_m: Half its extents, ``(3,)``.
-    """
-    start = seen_from(T_box, starts_m)
-    way = seen_from(T_box, ends_m) - start
-    steep = np.where(abs(way) < _PARALLEL_M, _PARALLEL_M, way)
-    first, last = (-half_m - start) / steep, (half_m - start) / steep
-    enter = np.clip(np.amax(np.minimum(first, last), axis=-1), 0.0, None)
-    leave = np.clip(np.amin(np.maximum(first, last), axis=-1), None, 1.0)
-    return (leave - enter) * norm(way)

@@ -84,7 +84,7 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
         if frame == BASE:
             return lambda state: p[None], f"the point {millimetres(p)}"
         return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
-    ids = [spec["kp"]] if "kp" in spec else list(spec["mean"])
+    ids = [int(k) for k in ([spec["kp"]] if "kp" in spec else spec["mean"])]
     points = [problem.keypoints[index] for index in ids]
 
     def mean(state: State) -> Array:
@@ -148,12 +148,7 @@ def directions_of(spec: Record, problem: Problem) -> tuple[Point, str]:
 def surface_points(
     problem: Problem, object_id: str, count: int = NUM_POINTS
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points of an object's surface in its frame: corners, and more spread evenly over it [m].
-
-    Args:
-        problem: With the object's shape.
-        count: How many points; at most half of them are corners.
-    """
+    """Points of an object's surface in its frame: corners, and more spread evenly over it [m]."""
     shape = problem.shapes[object_id]
     corners = shape.vertices_m[np.unique(shape.triangles)]
     corners = corners[:: max(1, -(-2 * len(corners) // count))]

@@ -112,7 +112,6 @@ def worst_along(constraint: Constraint, states: State, *, times_s: Array | None 
     """Return f at its worst along each of many paths, ``(num_states,)``.
 
     Args:
-        constraint: Of any kind. Those about a path alone (``hold``, ``speed``) are asked here only.
         states: Poses along the paths, ``(num_states, num_steps, 4, 4)``, of what stands still
             ``(1, 1, 4, 4)``; widths ``(num_states, num_steps)``.
         times_s: Of the steps, ``(num_steps,)``. Without them no speed is known, and a limit of it

@@ -27,7 +27,6 @@ from twin.plan.constrain.bodies import (
     millimetres,
     point_of,
     pose_of,
-    quantile,
     surface_points,
 )
 from twin.plan.constrain.constraint import SCALES, Constraint, Term, flattened
@@ -41,8 +40,6 @@ from twin.plan.constrain.schema import (
 )
 from twin.plan.problem import Problem, State
 
-NUM_SEEN = 50
-"""Points of a surface that are looked for."""
 HOLD_TOLERANCE_M, HOLD_TOLERANCE_DEG = 0.005, 5.0
 
 
@@ -53,13 +50,10 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
 
     Raises:
-        ConstraintError: When it does not fit, or names what is not there.
         UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
             an object that was not localised.
     """
-    vocabulary = Vocabulary.of_task(
-        problem.scene.task, num_keypoints=len(problem.keypoints), cameras=problem.cameras
-    )
+    vocabulary = Vocabulary.of_task(problem.scene.task, num_keypoints=len(problem.keypoints))
     _refuse_unknown_keypoints(record, problem)
     check_constraint(record, vocabulary)
     for name in _named(record):
@@ -410,51 +404,6 @@ def outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
     return np.array(model.jointPlacements[joint].translation), length
 
 
-def _visible(record: Record, problem: Problem) -> Constraint:
-    obj, name = record["obj"], record["camera"]
-    if name not in problem.cameras:
-        known = ", ".join(sorted(problem.cameras)) or "none"
-        message = f"visible {obj}: there is no camera {name!r} here. Cameras: {known}."
-        raise UsageError(message)
-    view = problem.cameras[name]
-    points = surface_points(problem, obj, NUM_SEEN)
-    share = record.get("frac", 0.5)
-    camera = view.camera
-    # Planes through the eye and the edges of the image, pointing outwards.
-    left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
-    top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
-    planes = np.array([[-1, 0, -left], [1, 0, -right], [0, -1, -top], [0, 1, -bottom]])
-    planes /= np.linalg.norm(planes, axis=1, keepdims=True)
-    others = [key for key in problem.scene.task.objects if key != obj]
-
-    def hidden(state: State) -> Array:
-        """Of each point: how far out of the picture or behind something; negative in view."""
-        T = pose_of(state, obj)
-        p = arrays.carried(T, points)
-        T_camera = view.T_base_camera[None]
-        if view.T_tcp_camera is not None:
-            T_camera = state.T_base_tcp @ view.T_tcp_camera
-        lens_m = T_camera[:, None, :3, 3]
-        each = 0.0 * state.T_base_tcp[:, :1, 0]  # of what stands still there is one
-        found = [np.amax(arrays.seen_from(T_camera, p) @ planes.T, axis=-1) + each]
-        for other in (key for key in others if key in state.Ts_base_object):
-            T_other = pose_of(state, other)
-            for centre, size in problem.model(other).panels():
-                shift = np.eye(4)
-                shift[:3, 3] = centre
-                half = np.array(size) / 2
-                T_panel = T_other @ shift
-                found.append(arrays.blocked_length(lens_m, p, T_panel, half) + each)
-        return quantile(np.amax(np.stack(found, axis=-1), axis=-1), share)
-
-    term = Term(
-        what=f"{share:.0%} of the surface of {obj} out of the view of {name}",
-        measure=hidden,
-        high=0.0,
-    )
-    return Constraint.of(record, term)
-
-
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     **RELATIONS,
     "distance": _distance,
@@ -467,7 +416,5 @@ _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "speed": _speed,
     "hold": _hold,
     "reach": _reach,
-    "visible": _visible,
 }
 KINDS = tuple(_KINDS)
-"""What can be asked; the schema lists the same."""

@@ -341,7 +341,6 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "stable": _stable,
     "moved": _moved,
 }
-"""By the name of the kind."""
 
 PLACES = ("inside", "on", "outside", "beside", "between", "moved")
 """Kinds that say where an object ends."""
@@ -357,11 +356,7 @@ _KEYS = {
 
 
 def constraint_of(predicate: Record, task: Task) -> dict[str, Any] | None:
-    """Write a success predicate as the constraint that decides the same; None: about no pose.
-
-    Args:
-        task: Says of which objects all axes are alike.
-    """
+    """Write a success predicate as the constraint that decides the same; None: about no pose."""
     kind = predicate["kind"]
     if kind == "aligned":
         return _aligned(predicate, task)

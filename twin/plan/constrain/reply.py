@@ -20,6 +20,7 @@ from twin.plan.constrain.schema import (
     Vocabulary,
     find_problems,
     meaning_problems,
+    printable,
     shown,
     told,
 )
@@ -50,7 +51,6 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
     """Read the stages of a reply, if nothing in it is wrong.
 
     Args:
-        text: The whole reply: one JSON object, see ``reply`` in the schema of constraints.
         task: The instruction that was asked about; a reply to another one is refused.
 
     Returns:
@@ -60,7 +60,7 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
         ReplyError: Everything that is wrong, each with its place, at most ``MOST_PROBLEMS``.
     """
     record = parse_strictly(text)
-    problems = find_problems(record, "reply", vocabulary.schema())
+    problems = find_problems(record, "reply", vocabulary)
     if not problems:
         problems = told(_contradictions(record, vocabulary, task))
     if problems:
@@ -69,14 +69,7 @@ def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[St
 
 
 def parse_strictly(text: str | bytes) -> Any:
-    """Parse JSON that is short and flat; odd numbers and repeated keys are kept to be named.
-
-    Args:
-        text: At most ``MAX_BYTES`` in UTF-8.
-
-    Raises:
-        ReplyError: When it is too long, too deep, or not JSON.
-    """
+    """Parse JSON that is short and flat; odd numbers and repeated keys are kept to be named."""
     try:
         data = text.encode() if isinstance(text, str) else text
         if len(data) > MAX_BYTES:
@@ -236,11 +229,4 @@ def _stage(record: Mapping[str, Any]) -> Stage:
         grasp=record.get("grasp"),
         release=record.get("release"),
         allowed_contacts=tuple((a, b) for a, b in record["allowed_contacts"]),
-    )
-
-
-def printable(text: str) -> str:
-    """Text with everything escaped that a terminal or a log would not show as it is."""
-    return "".join(
-        char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
     )

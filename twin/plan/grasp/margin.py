@@ -71,11 +71,7 @@ def reaches_along(
     sign: float,
     cone_rad: float,
 ) -> Float[np.ndarray, " num_grasps"]:
-    """How far a closing line may be shifted until the surface there leaves the friction cone [m].
-
-    Args:
-        axis: Of the tool frame, along which they are shifted.
-    """
+    """How far a closing line may be shifted until the surface leaves the friction cone [m]."""
     y = lines.Ts_object_tcp[:, :3, 1]
     along = sign * lines.Ts_object_tcp[:, :3, axis]
     num, count = len(y), len(SHIFTS_M)

@@ -59,12 +59,7 @@ class OpenHand:
     def passes(
         self, centres_m: Float[np.ndarray, "num_poses 3"], radius_m: float, margin_m: float
     ) -> Bool[np.ndarray, " num_poses"]:
-        """Which hands come near a ball; those that do not, ``hits`` nothing that is in it.
-
-        Args:
-            centres_m: Its middle, in the tool frame of each hand.
-            radius_m: And its radius.
-        """
+        """Which hands come near a ball; those that do not, ``hits`` nothing that is in it."""
         reach_m = radius_m + np.sqrt(3.0) * margin_m
         near: Bool[np.ndarray, " num_poses"] = np.zeros(len(centres_m), dtype=bool)
         for piece in self.pieces:

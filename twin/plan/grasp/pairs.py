@@ -104,12 +104,7 @@ class SampledSurface:
         points_m: Float[np.ndarray, "num_rays 3"],
         directions: Float[np.ndarray, "num_rays 3"],
     ) -> tuple[Float[np.ndarray, " num_rays"], Float[np.ndarray, "num_rays 3"]]:
-        """Where rays meet the surface next: how far, infinite where nowhere, and the normal there.
-
-        Args:
-            points_m: Where they start, in the object's frame.
-            directions: Unit vectors.
-        """
+        """Where rays meet the surface next: how far (infinite: nowhere), and the normal there."""
         rays = np.concatenate([points_m, directions], axis=1).astype("f4")
         found = self._rays.cast_rays(_tensor(rays), nthreads=1)
         away = found["t_hit"].numpy().astype(np.float64)
@@ -129,7 +124,6 @@ class Pairs:
     cosines: Float[np.ndarray, " num_pairs"]
     """Of the larger angle between the line and the two normals."""
     lowest_m: Float[np.ndarray, " num_pairs"]
-    """Of both points."""
     downward: Float[np.ndarray, " num_pairs"]
     """How far the normal that looks down more does so: the sine under the horizontal."""
 
@@ -203,11 +197,7 @@ def pairs_along(
     normals: Float[np.ndarray, "num_rays 3"],
     directions: Float[np.ndarray, "num_rays 3"],
 ) -> Pairs:
-    """Follow rays from points of the surface through the material to its other side.
-
-    Args:
-        directions: Unit vectors into the material.
-    """
+    """Follow rays from points of the surface through the material to its other side."""
     away, others = surface.leave(points_m + directions * _INSIDE_M, directions)
     there = np.isfinite(away) & (away > _LEAST_M)
     points_m, normals, directions = points_m[there], normals[there], directions[there]

@@ -50,11 +50,7 @@ class ArmReach:
         return _Reaches(self, Ts_base_tcp, hand, pregrasp_m)
 
     def is_clear(self, joints_rad: Float[np.ndarray, " num_joints"], open_m: float) -> bool:
-        """Whether arm and hand keep clear of the robot itself and of what stands still.
-
-        Args:
-            joints_rad: Base to hand.
-        """
+        """Whether arm and hand keep clear of the robot itself and of what stands still."""
         self.hulls.place(joints_rad, open_m)
         if self._links.touch():
             return False

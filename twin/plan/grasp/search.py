@@ -80,7 +80,6 @@ ROBOT_ERROR_M = 0.0015
 SAME_M, SAME_RAD = 0.01, 0.1745
 """Grasps nearer than this to a better one, and turned by less than ten degrees, are it."""
 SEED = 0
-"""Of all that is drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +93,6 @@ class GraspConfig:
     least_margin: float = 1.0
     """Standard deviations that a grasp must bear."""
     most: int = 100
-    """Grasps that are returned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +100,6 @@ class GraspSearch:
     """What a search found."""
 
     grasps: tuple[Grasp, ...]
-    """The surest first, no two alike."""
     rejected: Mapping[str, int]
     """Candidates by the cause for which they are none; see ``CAUSES``."""
     remarks: tuple[str, ...] = ()
@@ -160,9 +157,6 @@ class GraspSearcher:
     def __init__(self, problem: Problem, config: GraspConfig | None = None) -> None:
         """Lay out what all searches share.
 
-        Args:
-            config: How grasps are searched; the defaults when None.
-
         Raises:
             NoGraspError: The robot has nothing that closes.
         """
@@ -189,12 +183,6 @@ class GraspSearcher:
         Args:
             part_points_m: Points of a part, in the object's frame: both contacts are to be on it;
                 None: it may be taken anywhere.
-
-        Returns:
-            At least one grasp.
-
-        Raises:
-            NoGraspError: There is none; the error says why, and counts what was rejected.
         """
         self._refuse(object_id)
         hand, found, grasps = self._opened(object_id, part_points_m, self.max_width_m)

@@ -19,20 +19,13 @@ from twin.plan.ground.goals import Grounding
 RULES_VERSION = 1
 """Of the rules below; a file says which it was made by."""
 SETTLED = {"max_speed_m_s": 0.02, "for_s": 0.3}
-"""How still an object lies in the end."""
 SHAPE_TOLERANCE = 0.25
 """Of a soft object's extents, as in the tasks that ship."""
 NAME_CHARACTERS = 48
-"""Of the instruction, in the name of its task."""
 
 
 def derive_task(grounding: Grounding, base: Sequence[TaskFile], *, by: str = "grammar") -> TaskFile:
-    """Write the task file that an instruction asks for.
-
-    Raises:
-        UsageError: When two of the files define one object differently.
-        TaskFileError: When the result is no task; a bug here, or goals from elsewhere.
-    """
+    """Write the task file that an instruction asks for."""
     union_of(base)  # raises where the files disagree
     tables = [tomllib.loads(file.data.decode()) for file in base]
     objects = {key: about for table in tables for key, about in table["objects"].items()}
@@ -93,10 +86,6 @@ def stages_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str
     In every stage an object that is not handled may touch what it lies on: the table at first,
     later where it was put, with what lies there too. The grasp lets the object touch that as well,
     and the hand; the release what the object is put onto or into, and the hand a container's walls.
-
-    Args:
-        grounding: Objects in their order, and goals.
-        objects: Tables of the task file, by id.
     """
     lies_on = {key: TABLE for key, about in objects.items() if not about.get("fixed", False)}
     stages: list[dict[str, Any]] = []
@@ -180,11 +169,7 @@ def _where(goals: Sequence[Mapping[str, Any]]) -> str:
 
 
 def success_of(grounding: Grounding, objects: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The goals; and of each object that it lies still, let go, and as it was if it is soft.
-
-    Args:
-        objects: Tables of the task file, by id.
-    """
+    """The goals; and of each object that it lies still, let go, and as it was if it is soft."""
     specs: list[dict[str, Any]] = []
     for key in grounding.order:
         specs += [dict(goal) for goal in grounding.goals if goal["object"] == key]

@@ -69,11 +69,7 @@ class Goals:
         self.is_order_given = False
 
     def add_clause(self, goals: Sequence[dict[str, Any]]) -> None:
-        """Take the goals of one clause.
-
-        Raises:
-            GroundingError: When one of them can never hold.
-        """
+        """Take the goals of one clause."""
         for goal in goals:
             self._refuse(goal)
             if goal not in self.found:
@@ -105,11 +101,7 @@ class Goals:
         self.refuse_fixed([object_id])
 
     def refuse_fixed(self, ids: Iterable[str]) -> None:
-        """Refuse to move what cannot be.
-
-        Raises:
-            GroundingError: Naming it, and what can be moved.
-        """
+        """Refuse to move what cannot be."""
         for key in ids:
             if not self.vocabulary.things[key].movable:
                 told, movable = (
@@ -123,11 +115,7 @@ class Goals:
                 raise GroundingError("fixed_object", message, candidates=[key])
 
     def checked(self) -> list[dict[str, Any]]:
-        """All goals, none of which rules out another.
-
-        Raises:
-            GroundingError: When two do.
-        """
+        """All goals, none of which rules out another."""
         by_object: dict[str, list[dict[str, Any]]] = {}
         for goal in self.found:
             by_object.setdefault(goal["object"], []).append(goal)
@@ -163,9 +151,6 @@ def ordered(goals: Goals, found: Iterable[Mapping[str, Any]]) -> tuple[str, ...]
 
     What something is put on or beside is moved first; then what the instruction says; then the
     order in which the objects were named.
-
-    Raises:
-        GroundingError: When there is no such order.
     """
     names = list(dict.fromkeys(key for step in goals.steps for key in step))
     before: dict[str, set[str]] = {key: set() for key in names}

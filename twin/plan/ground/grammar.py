@@ -4,8 +4,8 @@ An instruction is cut into words, read from left to right once, clause by clause
 to be used: one that is not is an error that names it. Nothing is guessed.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from bridge.task.relations import SIDES
@@ -13,7 +13,6 @@ from twin.plan.ground.goals import PLACES, Goals, Grounding, ordered
 from twin.plan.ground.nouns import Memory, NounPhrase, Nouns, with_shared_noun
 from twin.plan.ground.vocabulary import GroundingError, Vocabulary
 from twin.plan.ground.words import (
-    BY_COLOUR,
     CARRIED,
     ENDS_THERE,
     GAP,
@@ -54,9 +53,6 @@ class _Clause:
     verb: str
     themes: tuple[str, ...]
     goals: list[dict[str, Any]] = field(default_factory=list)
-    by_colour: bool = False
-    into: tuple[str, ...] = ()
-    """Containers that are sorted into."""
 
     def add(self, kind: str, **about: Any) -> None:
         """Ask for one relation of everything that is moved."""
@@ -184,16 +180,13 @@ class _Reader:
 
     def _themes(self) -> tuple[str, ...]:
         """What is moved: one phrase, or several with "and" between."""
-        return tuple(dict.fromkeys(key for ids in self._list("theme") for key in ids))
-
-    def _list(self, slot: str, besides: Sequence[str] = ()) -> list[tuple[str, ...]]:
-        phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+        phrase, self.at = self.nouns.read(self.tokens, self.at, "theme")
         phrases = [phrase]
         while self._joins_noun():
-            phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
+            phrase, self.at = self.nouns.read(self.tokens, self.at, "theme")
             phrases.append(phrase)
-        shared = with_shared_noun(phrases)
-        return [self.nouns.resolve(each, slot, besides=besides) for each in shared]
+        meant = [self.nouns.resolve(each, "theme") for each in with_shared_noun(phrases)]
+        return tuple(dict.fromkeys(key for ids in meant for key in ids))
 
     def _joins_noun(self) -> bool:
         """Whether a comma or "and", and then another noun phrase, come next; skips the former."""
@@ -247,9 +240,6 @@ class _Reader:
             return self._relation(clause, relation)
         if self._match(("upright",)):
             return clause.add("upright")
-        if self._match(BY_COLOUR):
-            clause.by_colour = True
-            return None
         here = self.tokens[self.at].text
         if here == "to" and self.at + 1 < len(self.tokens):
             message = f"'{self._rest(self.at, 4)}': into, onto or next to it?"
@@ -281,23 +271,12 @@ class _Reader:
         return ids[0]
 
     def _relation(self, clause: _Clause, relation: str) -> None:
-        if relation == "between":
-            ids = [key for ids in self._list("reference", clause.themes) for key in ids]
-            if len(ids) != 2:
-                message = f"it takes two things to be between, not {len(ids)}."
-                raise GroundingError("too_few_objects", message, candidates=ids)
-            return clause.add("between", first=ids[0], second=ids[1])
         slot = _SLOTS[relation]
         source = self.tokens[self.at - 1].text
         phrase, self.at = self.nouns.read(self.tokens, self.at, slot)
-        is_by_colour = relation == "inside" and bool(self._match(BY_COLOUR))
-        if is_by_colour or (relation == "inside" and clause.verb == "sort"):
-            clause.by_colour |= is_by_colour
-            clause.into = self.nouns.resolve(replace(phrase, every=True), slot)
-            return None
         if source == "from" and self.nouns.is_table(phrase):
-            return None  # where it lies now
-        return clause.add(relation, **{slot: self._single(phrase, clause, slot)})
+            return  # where it lies now
+        clause.add(relation, **{slot: self._single(phrase, clause, slot)})
 
     def _beside(self, clause: _Clause, relation: str, length: tuple[float, float] | None) -> None:
         about: dict[str, Any] = {"reference": self._one(clause, "reference")}
@@ -334,14 +313,12 @@ class _Reader:
 
     def _close(self, clause: _Clause, start: int) -> None:
         """Take over the goals of a clause that is read to its end."""
-        if clause.by_colour:
-            self._by_colour(clause)
-        elif not clause.goals and clause.verb == "pack":
+        if not clause.goals and clause.verb == "pack":
             clause.add("inside", container=self._only_container(start))
         elif not clause.goals and clause.verb == "take":
             self.held |= dict.fromkeys(clause.themes, self._rest(start))
             return
-        elif not clause.goals or clause.verb == "sort":
+        elif not clause.goals:
             self.goals.refuse_fixed(clause.themes)
             raise self._unknown(start, "does not say where")
         if clause.verb == "stack" and len(clause.themes) > 1:
@@ -363,15 +340,3 @@ class _Reader:
         )
         self.memory.explanation.append(told)
         return where[0]
-
-    def _by_colour(self, clause: _Clause) -> None:
-        """Each object goes into the container of its colour."""
-        things, containers = self.vocabulary.things, clause.into or self.vocabulary.containers()
-        for key in clause.themes:
-            colour = things[key].colour
-            fitting = [name for name in containers if things[name].colour == colour]
-            if len(fitting) != 1:
-                kind = "ambiguous_object" if fitting else "unknown_object"
-                message = f"{key} is {colour}: there is {len(fitting) or 'no'} such container."
-                raise GroundingError(kind, message, candidates=containers)
-            clause.goals.append({"kind": "inside", "object": key, "container": fitting[0]})

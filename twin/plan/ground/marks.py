@@ -38,10 +38,6 @@ def draw_marks(
     Numbers count from 1 in the order of the things. A thing beside or behind the camera gets none.
     Marks that would cover each other are moved up.
 
-    Args:
-        image_u8: As it was recorded; it is not changed.
-        middles_m: Of the things, in the base frame.
-
     Returns:
         The image with marks, and the number of each thing that has one.
     """

@@ -31,10 +31,9 @@ from bridge.task.plan import Stage
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
 from twin.plan.constrain.reply import MAX_BYTES, ReplyError, printable, read_reply
-from twin.plan.constrain.schema import Vocabulary, portable_schema
+from twin.plan.constrain.schema import Vocabulary
 
 Messages = list[dict[str, Any]]
-"""Of a chat."""
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
 """Who answered."""
 READ_INSTEAD = "the grammar read the instruction instead"
@@ -53,11 +52,9 @@ class ModelConfig:
     url: str
     """Base address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1."""
     model: str
-    """Its name for the model."""
     key_variable: str = "GST_MODEL_KEY"
     """Environment variable with the key; not set: none is sent."""
     send_images: bool = False
-    """Let recorded images leave for that address."""
     connect_timeout_s: float = 5.0
     total_timeout_s: float = 60.0
     """Of one request, from connecting to the last byte."""
@@ -67,8 +64,6 @@ class ModelConfig:
     """Folder of replies that were taken, by the content of their request."""
     keep_refused: bool = False
     """Keep there, too, that both replies were refused: a question has one answer for good."""
-    log: Path | None = None
-    """File to which requests and replies are appended, one JSON record each, without secrets."""
 
     def __post_init__(self) -> None:
         """Refuse addresses and limits that make no sense."""
@@ -101,14 +96,12 @@ class Question:
     """What a model is asked."""
 
     task: str
-    """The instruction."""
     vocabulary: Vocabulary
     labels: Mapping[str, str] = field(default_factory=dict)
     """What each object looks like, from the scene: data, whoever wrote it."""
     image_u8: UInt8[np.ndarray, "height width 3"] | None = None
     """With the marks of ``draw_marks``."""
     marks: Mapping[str, int] = field(default_factory=dict)
-    """The number on each object."""
     keypoints: Sequence[tuple[str | None, str]] = ()
     """Of each keypoint, by its number, the object it moves with and its name in the scene."""
 
@@ -139,11 +132,7 @@ class EndpointError(TwinError):
 def ask_model(
     question: Question, config: ModelConfig, fallback: Callable[[], tuple[Stage, ...]]
 ) -> Answer:
-    """Get stages from a model, from its second try, or else from the grammar.
-
-    Args:
-        fallback: Plans without a model; its errors are not caught.
-    """
+    """Get stages from a model, from its second try, or else from the grammar."""
     remarks = [_told(question, config)]
     with _alone(config):
         found = _judged(question, config, remarks)
@@ -165,7 +154,7 @@ def _judged(
     reply = ""
     for who in (BY_MODEL, BY_REPAIR):
         try:
-            reply = kept[0] if kept else _reply(messages, question, config, remarks)
+            reply = kept[0] if kept else _reply(messages, config, remarks)
         except EndpointError as error:
             remarks.append(f"no reply: the server {error.found}")
             return None
@@ -173,7 +162,6 @@ def _judged(
             stages = read_reply(reply, question.vocabulary, question.task)
         except ReplyError as error:
             remarks.append(f"refused the reply ({who}): {'; '.join(error.problems)}")
-            _log(config, {"refused": list(error.problems)})
             messages, kept = _repair(first, reply, error), None
             continue
         if kept:
@@ -230,8 +218,6 @@ def _messages(question: Question, config: ModelConfig) -> Messages:
             {"kp": number, "object": key, "name": printable(name)[:MOST_LABEL]}
             for number, (key, name) in enumerate(question.keypoints)
         ]
-    if question.vocabulary.cameras:
-        scene["cameras"] = list(question.vocabulary.cameras)
     asked = json.dumps({"instruction": question.task, "scene": scene})
     content: list[dict[str, Any]] = [{"type": "text", "text": asked}]
     if config.send_images and question.image_u8 is not None:
@@ -267,32 +253,24 @@ def _told(question: Question, config: ModelConfig) -> str:
     return f"asked {config.model} at {config.url}; {sent}"
 
 
-def _body(messages: Messages, question: Question, config: ModelConfig) -> dict[str, Any]:
-    form = portable_schema(question.vocabulary.schema(), "reply")
-    return {
+# What comes back
+
+
+def _reply(messages: Messages, config: ModelConfig, remarks: list[str]) -> str:
+    """The model's text."""
+    body = {
         "model": config.model,
         "messages": messages,
         "temperature": 0,
         "seed": 0,
-        "response_format": {
-            "type": "json_schema",
-            "json_schema": {"name": "plan", "strict": False, "schema": form},
-        },
+        "response_format": {"type": "json_object"},
     }
-
-
-# What comes back
-
-
-def _reply(messages: Messages, question: Question, config: ModelConfig, remarks: list[str]) -> str:
-    """The model's text."""
-    body = _body(messages, question, config)
     try:
         record = _post(body, config)
     except EndpointError as error:
         if error.status not in _REFUSES_FORMAT:
             raise
-        remarks.append(f"the server {error.found}; asked again without a schema")
+        remarks.append(f"the server {error.found}; asked again in plain words")
         record = _post({key: body[key] for key in ("model", "messages")}, config)
     return _text_of(record, config)
 
@@ -346,16 +324,13 @@ def _post(body: Mapping[str, Any], config: ModelConfig) -> Any:
     except EndpointError:
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
-        found = _failure(error, config)
-        _log(config, {"request": body, "failed": found})
-        raise EndpointError(address=config.url, found=found) from error
-    told = answer[:MAX_BYTES].decode(errors="replace")
-    _log(config, {"request": body, "status": status, "answer": told})
+        raise EndpointError(address=config.url, found=_failure(error, config)) from error
     if 300 <= status < 400:
         found = f"redirects to {printable(onward[:200])}, which is not followed"
         raise EndpointError(address=config.url, found=found, status=status)
     if status != http.client.OK:
-        found = _redacted(f"answers with status {status}: {printable(told[:200])}", config)
+        told = printable(answer[:200].decode(errors="replace"))
+        found = _redacted(f"answers with status {status}: {told}", config)
         raise EndpointError(address=config.url, found=found, status=status)
     if kind != "application/json":
         found = f"answers with {printable(kind)[:80]}, not application/json"
@@ -484,25 +459,3 @@ def _redacted(text: str, config: ModelConfig) -> str:
     for form in {config.key, json.dumps(config.key)[1:-1]} - {""}:
         text = text.replace(form, "[redacted]")
     return text
-
-
-def _log(config: ModelConfig, record: Mapping[str, Any]) -> None:
-    """Append a record; images by their hash, the key nowhere."""
-    if config.log is None:
-        return
-    text = json.dumps(_without_images(record))
-    config.log.parent.mkdir(parents=True, exist_ok=True)
-    with config.log.open("a") as stream:
-        stream.write(_redacted(text, config) + "\n")
-
-
-def _without_images(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _without_images(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_images(inner) for inner in value]
-    if isinstance(value, str) and value.startswith("data:image/"):
-        return (
-            f"image of {len(value)} characters, sha256 {hashlib.sha256(value.encode()).hexdigest()}"
-        )
-    return value

@@ -56,7 +56,6 @@ class Memory:
     """What has been spoken of before."""
 
     themes: tuple[str, ...] = ()
-    """What the last clause moves."""
     nouns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Of the last phrase that had one, by its slot: what "one" stands for."""
     chosen: list[str] = field(default_factory=list)
@@ -91,11 +90,7 @@ class Nouns:
         return "noun" if is_noun else ""
 
     def read(self, tokens: Sequence[Token], at: int, slot: str) -> tuple[NounPhrase, int]:
-        """Read the noun phrase that begins here, and say where it ends.
-
-        Raises:
-            GroundingError: A word of it means nothing here, or there is none.
-        """
+        """Read the noun phrase that begins here, and say where it ends."""
         start = at
         if at < len(tokens) and tokens[at].text in PRONOUNS:
             return NounPhrase(text=tokens[at].text, pronoun=tokens[at].text), at + 1
@@ -198,9 +193,6 @@ class Nouns:
             slot: ``theme``, ``container``, ``support`` or ``reference``: what moves, what it goes
                 into or onto, or what is named beside it.
             besides: What moves, where the phrase says where to: meant only if nothing else is.
-
-        Raises:
-            GroundingError: When nothing fits, too little, or more than one thing.
         """
         if phrase.pronoun:
             return self._pronoun(phrase, slot)

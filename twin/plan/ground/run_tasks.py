@@ -21,7 +21,6 @@ from twin.plan.ground.vocabulary import Vocabulary, vocabulary_of
 from twin.scene.store.folder import read_record
 
 MAX_NAME = 400
-"""Characters of a task's name or path."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*|\S+\.toml")
 """What can only be a task's name or its file: an instruction has more than one word."""
 
@@ -59,12 +58,7 @@ def names_task(words: str) -> bool:
 
 
 def understand(run: RunFolder, words: str) -> UnderstoodTask:
-    """Find the task a person names, or make one of their instruction; nothing is written.
-
-    Raises:
-        GroundingError: When the instruction is not understood or cannot be done.
-        UsageError: When there is no such task, or nothing says what the scene holds.
-    """
+    """Find the task a person names, or make one of their instruction; nothing is written."""
     if names_task(words):
         file = chosen_task_file(words, tasks_dir=run.tasks_dir)
         file.task()
@@ -98,9 +92,6 @@ def task_files_of(run: RunFolder) -> list[TaskFile]:
 
     Files derived from an instruction count only where there is nothing else: their objects are
     those of others.
-
-    Raises:
-        UsageError: When no episode names a task that is there.
     """
     found: dict[str, TaskFile] = {}
     problems: list[str] = []
@@ -129,9 +120,6 @@ def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
 
     Args:
         episode: Its name; empty: the newest that was recorded with a task.
-
-    Raises:
-        UsageError: When no episode names a task that is there.
     """
     files = task_files_of(run)
     known = {file.sha256: file for file in files}
@@ -149,10 +137,6 @@ def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
 
     Args:
         run: Whose ``scene.json`` holds labels and colours; without one, the files' own.
-
-    Raises:
-        UsageError: When two files define one object differently.
-        UnreadableSceneError: When ``scene.json`` cannot be understood.
     """
     task = union_of(base)
     if task is None:

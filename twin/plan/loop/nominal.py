@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.check import TABLE, nearest
 from bridge.task.model_policy import MODEL_POLICY
-from bridge.task.plan import Plan
+from bridge.task.plan import Plan, Waypoint
 from twin.plan.constrain.constraint import (
     SHOWN,
     Constraint,
@@ -29,11 +29,11 @@ from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import lying_there, places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
+from twin.plan.loop.push import push_choices, pushed
 from twin.plan.loop.steer import Steer
-from twin.plan.loop.straight import GeometricProposer
 from twin.plan.loop.tau import (
+    Bounds,
     Trajectory,
-    candidate_grasp,
     goals_of,
     named_keypoints,
     plan_stage,
@@ -101,7 +101,6 @@ class Policy:
     release: ReleaseConfig = field(default_factory=ReleaseConfig)
     path: PathConfig = field(default_factory=PathConfig)
     grasps: int = GRASPS
-    """Grasps of one object that are looked at."""
     ways: tuple[Way, ...] = _WAYS
 
 
@@ -116,7 +115,7 @@ LOOSE = Policy(
     name="loose",
     grasp=GraspConfig(clearance_m=0.0, least_margin=-5.0),
     release=ReleaseConfig(eps_col_m=0.0, sigmas=0.0),
-    path=PathConfig(audited=False, replay=ReplayConfig(eps_col_m=0.0)),
+    path=PathConfig(replay=ReplayConfig(eps_col_m=0.0)),
     ways=(Way(straight=True), Way()),
 )
 """Nothing has to keep a distance, and objects are carried along straight lines."""
@@ -137,8 +136,6 @@ class Transfer:
     """Where the object is predicted to come to lie."""
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
-    looked_at: tuple[Grasp, ...] = ()
-    """All grasps of the object that were to be tried, in that order."""
     remarks: tuple[str, ...] = ()
 
     @property
@@ -157,16 +154,12 @@ class PlanProposer:
     def propose(
         self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
     ) -> list[Candidate]:
-        """Offer plans, the surest grasps first; see ``Proposer``.
-
-        Raises:
-            NoPlanError: There is none; the message says what is in the way.
-        """
+        """Offer plans, the surest grasps first; see ``Proposer``."""
         task = problem.scene.task
         refuse_lost(problem.scene)
         refuse_without_stages(task)
         if any(table.get("push") for table in task.stages):
-            return self._pushed(problem, plan_id=plan_id, seed=seed, count=count, steer=steer)
+            return self._pushed(problem, plan_id, 1 if self._policy.grasps == 1 else count)
         search = _Search(problem, self._policy, seed, steer)
         found: list[Candidate] = []
         for transfers in search.sequences():
@@ -183,19 +176,22 @@ class PlanProposer:
             raise NoPlanError(search.why)
         return found
 
-    def _pushed(self, problem: Problem, **asked: Any) -> list[Candidate]:
-        """Tasks that push go the straight geometric way."""
-        found = GeometricProposer().propose(problem, **asked)
-        kept = found[:1] if self._policy.grasps == 1 else found
-        remark = "pushed straight, tool down; no distance was looked at"
-        return [
-            replace(
-                each,
-                plan=replace(each.plan, planner=PLANNER, policy=self._policy.name),
-                remarks=(remark,),
-            )
-            for each in kept
-        ]
+    def _pushed(self, problem: Problem, plan_id: str, count: int) -> list[Candidate]:
+        found: list[Candidate] = []
+        why, remarks = "", ("pushed straight, tool down; no distance was looked at",)
+        for choice in push_choices(problem):
+            if len(found) == count:
+                break
+            try:
+                plan = _written(problem, self._policy, plan_id, *pushed(problem, choice))
+            except NoPlanError as error:
+                why = str(error)
+                continue
+            rank = len(found)
+            found.append(Candidate(plan=plan, rank=rank, cost=choice.cost, remarks=remarks))
+        if not found:
+            raise NoPlanError(why)
+        return found
 
 
 class _Lazy:
@@ -315,7 +311,6 @@ class _Search:
                 legs=legs,
                 T_base_lies=lying_there(problem, release),
                 cost=release.cost + _miss_probability(grasp.margin),
-                looked_at=tuple(options.grasps),
                 remarks=options.remarks_of(grasp, release, legs),
             )
         if failure is None:
@@ -478,11 +473,7 @@ class _Options:
 
 
 def _part_points(problem: Problem, key: str) -> Float[np.ndarray, "num_points 3"] | None:
-    """Points of the part that the task grasps an object by; None: it names none.
-
-    Raises:
-        NoPlanError: The scene has no such part.
-    """
+    """Points of the part that the task grasps an object by; None: it names none."""
     tables = (table for table in problem.scene.task.stages if table.get("grasp") == key)
     part = next((str(table["part"]) for table in tables if "part" in table), None)
     if part is None:
@@ -511,11 +502,7 @@ def _subgoals(problem: Problem, key: str, verb: str) -> list[Constraint]:
 
 
 def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]:
-    """Those that satisfy what was added for the end of the grasp.
-
-    Raises:
-        NoPlanError: None does; says what the surest one has.
-    """
+    """Those that satisfy what was added for the end of the grasp."""
     asked = _subgoals(problem, grasps[0].object_id, "grasp")
     if not asked:
         return list(grasps)
@@ -596,7 +583,7 @@ def _plan_of(
     problem: Problem, transfers: list[Transfer], policy: Policy, plan_id: str, seed: int
 ) -> tuple[Plan, tuple[str, ...]]:
     """Write transfers as a plan; at the end the arm goes back to where it stood."""
-    task, record = problem.scene.task, problem.robot.record
+    task = problem.scene.task
     trajectory = Trajectory(robot=problem.robot)
     there = dict(problem.scene.Ts_base_object)
     last = problem
@@ -616,7 +603,21 @@ def _plan_of(
     else:
         leg = Leg(name="home", movement=home, g=0)
         trajectory.add(leg, str(task.stages[-1]["id"]), open_m)
-    plan = Plan(
+    tau = tuple(trajectory.tau)
+    return _written(problem, policy, plan_id, tau, trajectory.bounds, there), remarks
+
+
+def _written(
+    problem: Problem,
+    policy: Policy,
+    plan_id: str,
+    tau: tuple[Waypoint, ...],
+    bounds: Bounds,
+    there: Mapping[str, Float[np.ndarray, "4 4"]],
+) -> Plan:
+    """A plan of a trajectory that leaves its objects there."""
+    task, record = problem.scene.task, problem.robot.record
+    return Plan(
         id=plan_id,
         planner=PLANNER,
         policy=policy.name,
@@ -628,12 +629,6 @@ def _plan_of(
         entities={key: se3.pose_record(T) for key, T in problem.scene.Ts_base_object.items()},
         keypoints_m=named_keypoints(problem),
         joint_names=record.joints,
-        stages=tuple(plan_stage(task, table, trajectory.bounds, there) for table in task.stages),
-        tau=tuple(trajectory.tau),
-        grasps=tuple(
-            candidate_grasp(grasp, chosen=grasp is each.grasp)
-            for each in transfers
-            for grasp in each.looked_at
-        ),
+        stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
+        tau=tau,
     )
-    return plan, remarks

@@ -39,14 +39,7 @@ def _support_m(problem: Problem, key: str) -> float:
 def places_on_table(
     problem: Problem, key: str, goals: Sequence[Constraint], *, seed: int
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """Poses on the table, as the object lies now or turned by quarters, that satisfy goals.
-
-    Args:
-        problem: Everything else keeps its place.
-
-    Raises:
-        NoFinalStateError: No free place satisfies all goals; says which one is farthest off.
-    """
+    """Poses on the table, as the object lies now or turned by quarters, that satisfy goals."""
     T_now = problem.scene.Ts_base_object[key]
     points = se3.apply(T_now, surface_points(problem, key))
     Ts = _grid(problem, T_now, float(T_now[2, 3] - points[:, 2].min()), seed)

@@ -41,19 +41,11 @@ class Proposer(Protocol):
 
         Args:
             plan_id: Name of the plans; whoever publishes one gives it its own.
-            steer: What a refusal asks to change; None: nothing was refused.
-
-        Raises:
-            NoPlanError: When there is none.
         """
 
 
 def refuse_lost(scene: ReplayScene) -> None:
-    """Refuse to plan around objects that nobody knows the place of.
-
-    Raises:
-        NoPlanError: Naming them.
-    """
+    """Refuse to plan around objects that nobody knows the place of."""
     if lost := scene.missing():
         reasons = [f"{name}: {scene.reasons[name]}" for name in lost if name in scene.reasons]
         why = f" ({'; '.join(reasons)})" if reasons else ""
@@ -77,11 +69,7 @@ def choose(
 
     Args:
         seed: Of the start; rounds that are steered draw from their own.
-        refused: Those of them that were judged, with their verdicts; none: candidates go by rank.
         most: Candidates that are asked for at once where the first was refused before.
-
-    Raises:
-        NoPlanError: When there is none left.
     """
     if not refused:
         ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
@@ -124,11 +112,7 @@ def _fresh(candidates: Iterable[Candidate], known: Collection[object]) -> Candid
 def named(
     candidate: Candidate, problem: Problem, *, seed: int, steer: Steer | None = None
 ) -> Candidate:
-    """Write into a plan which candidate it is, what steered it and in which scene it was made.
-
-    Args:
-        steer: What changed it; None: nothing.
-    """
+    """Write into a plan which candidate it is, what steered it and in which scene it was made."""
     plan = replace(
         candidate.plan,
         candidate=Ranking(rank=candidate.rank, cost=candidate.cost, seed=seed),
@@ -171,9 +155,6 @@ def plan_and_verify(
     Args:
         task_sha256: Of the task file; empty: not known.
         grounding_source: Who said what is to be kept; empty: the task file alone.
-
-    Raises:
-        NoPlanError: When there is not even a first candidate.
     """
     attempts: list[Attempt] = []
     refused: list[Refusal] = []

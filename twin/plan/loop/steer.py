@@ -69,11 +69,7 @@ class Steer:
         return SteeredBy(clause=self.clause, bodies=self.bodies)
 
     def has_grasp_like(self, object_id: str, T_object_tcp: Float[np.ndarray, "4 4"]) -> bool:
-        """Whether a grasp was refused that is the same within 1 cm and 10 degrees.
-
-        Args:
-            T_object_tcp: Tool at the grasp, in the object's frame.
-        """
+        """Whether a grasp was refused that is the same within 1 cm and 10 degrees."""
         mine = [tried for tried in self.refused if tried.object_id == object_id]
         return any(alike(tried.T_object_tcp, T_object_tcp) for tried in mine)
 

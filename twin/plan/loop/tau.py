@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.plan import CandidateGrasp, Stage, Waypoint
+from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
 from twin.plan.constrain.kinds import names_keypoint
 from twin.plan.constrain.relations import constraint_of
@@ -97,11 +97,7 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
 
 
 def refuse_without_stages(task: Task) -> None:
-    """Refuse a task that moves something without saying in which stages.
-
-    Raises:
-        NoPlanError: Naming the object and what is missing.
-    """
+    """Refuse a task that moves something without saying in which stages."""
     for key in task.manipulated:
         verbs = stages_of(task, key).keys()
         lacking = [verb for verb in ("grasp", "release") if verb not in verbs]
@@ -118,11 +114,7 @@ def plan_stage(
     bounds: Bounds,
     there: Mapping[str, Float[np.ndarray, "4 4"]],
 ) -> Stage:
-    """What a plan says of one stage of its task: when it is, what may touch, where it leads.
-
-    Args:
-        task: What counts as success is its own.
-    """
+    """What a plan says of one stage of its task: when it is, what may touch, where it leads."""
     stage_id = str(table["id"])
     start_ns, end_ns = bounds.get(stage_id, (0, 0))
     release = table.get("release", table.get("push"))
@@ -165,16 +157,3 @@ def goals_of(task: Task, key: str) -> list[dict[str, Any]]:
     """The success predicates about where an object is, as constraints."""
     mine = (spec for spec in task.success if spec.get("object") == key)
     return [record for spec in mine if (record := constraint_of(spec, task)) is not None]
-
-
-def candidate_grasp(grasp: Grasp, *, chosen: bool) -> CandidateGrasp:
-    """What a plan says of a grasp that was looked at."""
-    (qw, qx, qy, qz), (x, y, z) = (part.tolist() for part in se3.split(grasp.T_object_tcp))
-    return CandidateGrasp(
-        object=grasp.object_id,
-        p_m=(x, y, z),
-        q_wxyz=(qw, qx, qy, qz),
-        width_m=float(grasp.width_m),
-        margin=float(grasp.margin),
-        chosen=chosen,
-    )

@@ -1,11 +1,11 @@
-"""The last word on a movement: the monitor's exact clearance, then python-fcl on real meshes.
+"""The last word on a movement: the monitor's exact clearance.
 
 What is asked is the movement as it will be followed, straight in joints between its knots. The
 monitor looks at as many postures in between as its bound wants; links are asked against each other
 at every knot. What they refuse comes back as pairs of bodies, for the search to keep farther apart.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,19 +13,14 @@ from jaxtyping import Float
 
 from bridge.task.causes import Cause
 from bridge.task.plan import Plan, Stage
-from bridge.task.verdict import Factor, Verdict
 from twin.plan.path.world import Carried
 from twin.plan.problem import Problem, TimedPath
-from twin.replay.audit import audit
 from twin.replay.clearance.bodies import own_links
 from twin.replay.clearance.monitor import MAX_CONTACT_DEPTH_M, Allowed, ClearanceMonitor
 from twin.replay.config import ReplayConfig
-from twin.replay.result import ReplayResult
 from twin.robot.collision import hulls_of
 
 _STAGE = "move"
-AUDIT_STEP_M = 0.001
-"""How much farther a pair is kept that python-fcl finds nearer than was said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +41,10 @@ class Decision:
     refusals: tuple[PathRefusal, ...]
     clearance_m: Float[np.ndarray, " num_points"]
     """Smallest distance over the pairs that may not touch, at and before each knot."""
-    audit: Factor | None = None
-    """None: python-fcl was not asked."""
 
     @property
     def accepted(self) -> bool:
-        """Whether nobody refused; an audit that could not be made refuses nothing."""
+        """Whether nothing was refused."""
         return not self.refusals
 
 
@@ -78,19 +71,11 @@ def decide(
     config: ReplayConfig,
     carried: Carried | None = None,
     allowed: Allowed = frozenset(),
-    audited: bool = False,
 ) -> Decision:
-    """Check a movement exactly.
-
-    Args:
-        width_m: Distance between the finger pads.
-        audited: Ask python-fcl too, where the monitor refuses nothing.
-    """
-    robot, scene = problem.robot, problem.scene
-    hulls, links = hulls_of(robot), own_links(hulls_of(robot))
+    """Check a movement exactly."""
+    hulls, links = hulls_of(problem.robot), own_links(hulls_of(problem.robot))
     contacts = tuple((min(pair), max(pair)) for pair in sorted(allowed, key=sorted))
-    plan = _plan(problem, contacts)
-    monitor = ClearanceMonitor(scene, plan, hulls, config)
+    monitor = ClearanceMonitor(problem.scene, _plan(problem, contacts), hulls, config)
     poses = object_poses(problem, timed.joints_rad, carried)
     stamps = np.round(timed.times_s * 1e9).astype(np.int64)
     refusals: list[PathRefusal] = []
@@ -119,12 +104,7 @@ def decide(
         )
         for failure in monitor.failures
     ]
-    factor = None
-    if audited and not refusals:
-        factor = audit(_result(problem, timed, width_m, poses, clearance), plan, scene, config)
-        if factor.bodies:
-            refusals.append(_by_audit(factor))
-    return Decision(refusals=tuple(refusals), clearance_m=clearance, audit=factor)
+    return Decision(refusals=tuple(refusals), clearance_m=clearance)
 
 
 def _least(monitor: ClearanceMonitor, bodies: Sequence[str]) -> float:
@@ -137,7 +117,7 @@ def _least(monitor: ClearanceMonitor, bodies: Sequence[str]) -> float:
 
 
 def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
-    """The one stage that a movement is, as monitor and audit read it."""
+    """The one stage that a movement is, as the monitor reads it."""
     stage = Stage(id=_STAGE, text="", allowed_contacts=contacts)
     return Plan(
         id=_STAGE,
@@ -149,43 +129,4 @@ def _plan(problem: Problem, contacts: tuple[tuple[str, str], ...]) -> Plan:
         instruction="",
         stages=(stage,),
         tau=(),
-    )
-
-
-def _by_audit(factor: Factor) -> PathRefusal:
-    """What python-fcl found nearer than the monitor said."""
-    first, second = factor.bodies[:2]
-    detail = factor.detail or ""
-    return PathRefusal(bodies=(first, second), lacking_m=AUDIT_STEP_M, t_ns=0, detail=detail)
-
-
-def _result(
-    problem: Problem,
-    timed: TimedPath,
-    width_m: float,
-    poses: Mapping[str, Float[np.ndarray, "num_points 4 4"]],
-    clearance_m: Float[np.ndarray, " num_points"],
-) -> ReplayResult:
-    """A movement as the audit reads one: nothing but arm and objects, and what was said of them."""
-    unknown = Factor(value=None)
-    verdict = Verdict(
-        plan_id=_STAGE,
-        trajectory="planned",
-        mode="kinematic",
-        ik=unknown,
-        clearance=unknown,
-        terminal=unknown,
-        engine="",
-        seed=0,
-    )
-    return ReplayResult(
-        verdict=verdict,
-        stamps_ns=np.round(timed.times_s * 1e9).astype(np.int64),
-        joints_rad=timed.joints_rad,
-        width_m=np.full(len(timed.times_s), width_m),
-        Ts_base_tcp=problem.robot.Ts_base_tcp(timed.joints_rad),
-        Ts_base_object=dict(poses),
-        finger_contact={},
-        clearance_m=clearance_m,
-        contacts=[],
     )

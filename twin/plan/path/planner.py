@@ -1,9 +1,9 @@
 """Plan one movement: around what is in the way, made short, timed, and checked exactly.
 
 The search (RRT-Connect and shortcuts, native) knows spheres and hulls and misses nothing between
-two postures; what it finds is timed, and the exact clearance and, where it is asked, python-fcl
-decide. What they refuse is searched again with the refused pair kept farther apart. Everything
-follows from the seed; work is counted, never timed.
+two postures; what it finds is timed, and the exact clearance decides. What that refuses is searched
+again with the refused pair kept farther apart. Everything follows from the seed; work is counted,
+never timed.
 """
 
 from collections.abc import Mapping
@@ -70,12 +70,8 @@ class PathConfig:
     """Share of the limits of joint and tool speed that is used."""
     acceleration_share: float = 0.33
     """Share of the limits of acceleration; a third of the UR5's is what MoveIt assumes of it."""
-    audited: bool = True
-    """Ask python-fcl too before a path is handed out."""
     seed: int = 0
-    """Of the search."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    """The exact clearance."""
 
 
 class NoPathError(TwinError):
@@ -144,7 +140,6 @@ class _Asked:
             config=self.config.replay,
             carried=self.carried,
             allowed=self.allowed,
-            audited=self.config.audited,
         )
         return Movement(
             path=path, decision=decision, width_m=self.width_m, carried=self.carried, goal=goal
@@ -195,11 +190,7 @@ def plan_move(
 
 
 def check_numbers(*postures: Float[np.ndarray, "..."]) -> None:
-    """Refuse postures that are no numbers.
-
-    Raises:
-        NoPathError: One of them is not finite.
-    """
+    """Refuse postures that are no numbers."""
     if not all(np.isfinite(rows).all() for rows in postures):
         raise NoPathError(reason="not a posture", detail="joints that are not finite")
 
@@ -265,9 +256,6 @@ def timed_path(
 
     What is handed out is followed straight between its own knots, so it is that which is looked at
     again; where a chord is not free the corners stay sharp and the arm stops at them.
-
-    Args:
-        world: What must stay clear.
     """
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
     wanted = [value for value in (limit_m_s, tool_m_s) if value]
@@ -321,10 +309,6 @@ def plan_straight(
 
     For the last centimetres, where contact is wanted: pairs in ``allowed`` are left to the exact
     check, which lets them touch but not lie in each other.
-
-    Args:
-        start_rad: Where the arm stands; the line begins at its tool.
-        width_m: Distance between the finger pads.
 
     Raises:
         NoPathError: A pose is out of reach, the arm would have to change its branch, or something

@@ -42,9 +42,6 @@ def covering_spheres(
 ) -> Float[np.ndarray, "num_spheres 4"]:
     """Cover the convex hull of points by spheres.
 
-    Args:
-        corners_m: The corners, in the frame the spheres are wanted in.
-
     Returns:
         Centre and radius of each [m].
     """

@@ -51,11 +51,7 @@ class Leg:
 
 
 def contacts_of(task: Task, object_id: str, *, grasp: bool) -> Allowed:
-    """Pairs that a task's stage allows which grasps, or releases, an object.
-
-    Args:
-        grasp: The grasp's; else the release's.
-    """
+    """Pairs that a task's stage allows which grasps, or releases, an object."""
     key = "grasp" if grasp else "release"
     return frozenset(
         frozenset(pair)
@@ -263,12 +259,7 @@ def nearest_solutions(
     near_rad: Float[np.ndarray, " num_joints"],
     config: IkConfig,
 ) -> list[Float[np.ndarray, " num_joints"]]:
-    """Joints that reach a pose, each turned as near as its limits let it, nearest first.
-
-    Args:
-        robot: Any arm; one with the geometry of a UR gives all its branches.
-        config: When a pose counts as reached.
-    """
+    """Joints that reach a pose, each turned as near as its limits let it, nearest first."""
     inverse = UrInverse.for_robot(robot)
     if inverse is not None:
         raw, valid, _ = inverse.solve(T_base_tcp[None])

@@ -63,12 +63,7 @@ class Chain:
 
 
 def chain_of(hulls: RobotHulls, width_m: float) -> Chain:
-    """Read an arm's joints off pinocchio, its fingers held at an opening.
-
-    Args:
-        hulls: The robot; its model is placed at zero joints.
-        width_m: Distance between the finger pads.
-    """
+    """Read an arm's joints off pinocchio, its fingers held at an opening."""
     robot = hulls.robot
     model, data = robot.model, robot.data
     zero = np.zeros(len(robot.joints))

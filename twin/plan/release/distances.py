@@ -22,11 +22,6 @@ def candidate_clearance(
 ) -> Float[np.ndarray, " num_candidates"]:
     """Smallest signed distance of a body's surface points, for each pose it might be released at.
 
-    Args:
-        lookup: The static scene in the base frame, or an object in its own.
-        points_m: Points of the body's surface, in its own frame.
-        Ts_grid_body: The poses that are proposed, in the frame of the grid.
-
     Returns:
         Distances [m], negative inside; a candidate is free when it is above ``eps_col_m``.
     """
@@ -60,9 +55,6 @@ class Boxes:
     ) -> Float[np.ndarray, "num_candidates num_boxes"]:
         """Smallest signed distance of a body's surface points to each box, for each pose.
 
-        Args:
-            points_m: Points of the body's surface, in its own frame.
-
         Returns:
             Distances [m], exact outside; inside minus the depth below the nearest face.
         """
@@ -82,7 +74,6 @@ class Boxes:
 
         Args:
             margins_m: Overwritten; one value everywhere at first, boxes beyond it do not count.
-            points_m: Points of the body's surface, in its own frame.
         """
         most = float(margins_m.max(initial=-np.inf))
         body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
@@ -96,13 +87,7 @@ def lower_by_grid(
     points_m: Float[np.ndarray, "num_points 3"],
     Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
 ) -> None:
-    """Lower each point's margin to its distance to a grid less what is to be kept.
-
-    Args:
-        margins_m: Overwritten.
-        points_m: Points of the body's surface, in its own frame.
-        Ts_grid_body: The poses that are proposed, in the frame of the grid.
-    """
+    """Lower each point's margin to its distance to a grid less what is to be kept."""
     grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
     body = *_poses(Ts_grid_body), np.ascontiguousarray(points_m)
     points_to_grid(*grid, keep_m, *body, margins_m)

@@ -47,7 +47,6 @@ TAU_P_M = 0.02
 TAU_R_RAD = ANGLE_RAD
 """Bound of the turns of Eq. 9."""
 HAND_POINTS = 200
-"""Of the open hand's surface."""
 DROP_M, MOST_DROP_M = 0.004, 0.03
 """Wanted between the underside and what the object will lie on; most of it, over a rim that the
 object may have to stay above."""
@@ -76,7 +75,6 @@ class ReleaseConfig:
     sigmas: float = 2.0
     """Standard deviations of localisation that the object stays away from the edge of the area."""
     max_releases: int = 16
-    """Most final states."""
 
     def solver(self) -> SolveConfig:
         """How the stage problem of one way to rest is solved: from above, hardly leaning."""
@@ -105,7 +103,6 @@ def final_states(
         constraints: What must hold there besides (Eq. 7).
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
             for; ``constraints`` then say what is wanted.
-        config: The defaults when None.
 
     Raises:
         NoFinalStateError: With its cause, and what is in the way.
@@ -252,11 +249,7 @@ class ReleaseSearch:
     def answer(
         self, stages: Sequence[StageProblem], seed: int, rng: np.random.Generator
     ) -> tuple[Release, ...]:
-        """Solve each way to rest, perturb the best, keep the distinct feasible ones.
-
-        Raises:
-            NoFinalStateError: None is feasible.
-        """
+        """Solve each way to rest, perturb the best, keep the distinct feasible ones."""
         config = self._config
         settings = config.solver()
         solved: list[tuple[StageProblem, StageCandidate]] = []
@@ -365,9 +358,6 @@ def perturbed(
     The position moves by a vector uniform in a box. The paper bounds the rotation vector and says
     neither how it is drawn nor in which frame; here its axis is uniform on the sphere, its angle
     uniform in [0, tau_r], and it turns the tool in the tool's own frame (errata, resolution 7).
-
-    Args:
-        tau_p_m: Most of the shift along each axis.
     """
     shift = rng.uniform(-tau_p_m, tau_p_m, (count, 3))
     axis = rng.normal(size=(count, 3))

@@ -50,11 +50,7 @@ class Obstacles:
     """All bodies around, asked together."""
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
-        """Lay their boxes out in one list.
-
-        Args:
-            obstacles: Any number; a name may come more than once.
-        """
+        """Lay their boxes out in one list."""
         self.all = tuple(obstacles)
         self.names = tuple(obstacle.name for obstacle in self.all)
         self._boxes = Boxes.of([box for obstacle in self.all for box in obstacle.boxes])
@@ -72,11 +68,7 @@ class Obstacles:
         points_m: Float[np.ndarray, "num_points 3"],
         Ts_base_body: Float[np.ndarray, "num_poses 4 4"],
     ) -> Float[np.ndarray, "num_poses num_obstacles"]:
-        """Least signed distance of a body's points to each obstacle, its error taken off [m].
-
-        Args:
-            points_m: Of the body's surface, in its own frame.
-        """
+        """Least signed distance of a body's points to each obstacle, its error taken off [m]."""
         found = np.empty((len(Ts_base_body), len(self.all)))
         to_boxes = self._boxes.candidate_clearance(points_m, Ts_base_body)
         for index, obstacle in enumerate(self.all):
@@ -95,11 +87,7 @@ class Obstacles:
         *,
         most_m: float = np.inf,
     ) -> Float[np.ndarray, "num_poses num_points"]:
-        """How much farther each point is from what is around than it must be [m].
-
-        Args:
-            points_m: Of the body's surface, in its own frame.
-        """
+        """How much farther each point is from what is around than it must be [m]."""
         found = np.full((len(Ts_base_body), len(points_m)), most_m)
         keep = keep_m + self._error_m
         self._boxes.lower(found, keep[self._owner], points_m, Ts_base_body)
@@ -157,11 +145,7 @@ def allowed_with(
 def hand_points(
     hulls: RobotHulls, width_m: float, num_points: int
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Points of the hand's hulls in the tool's frame, with this width between the pads [m].
-
-    Args:
-        num_points: At most; spread as evenly as corners and edges allow.
-    """
+    """Points of the hand's hulls in the tool's frame, with this width between the pads [m]."""
     robot = hulls.robot
     hulls.place(robot.home_rad, width_m)
     T_tcp_base = se3.invert(robot.T_base_link(robot.record.tool_frame, robot.home_rad, width_m))
@@ -188,7 +172,6 @@ def spread_points(
 
     Args:
         points_m: To choose from (Gonzalez 1985: at most twice as far as the best choice).
-        num_points: How many at most.
     """
     centre = points_m.mean(axis=0)
     index = int(np.argmax(np.linalg.norm(points_m - centre, axis=1)))

@@ -98,11 +98,7 @@ def sideways_sigma_m(problem: Problem, name: str) -> float:
 def upright_frame(
     T: Float[np.ndarray, "4 4"], p_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Frame at a point with z up and x along the heading of a pose.
-
-    Args:
-        T: Whose x axis, seen from above, is followed.
-    """
+    """Frame at a point with z up and x along the heading of a pose."""
     yaw = np.arctan2(T[1, 0], T[0, 0])
     frame = np.eye(4)
     frame[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
@@ -151,7 +147,6 @@ def resting_poses(
     """Poses ``T_base_object`` a little above where the object would lie, in the middle.
 
     Args:
-        problem: With the object's shape and how it lies.
         most_tilted_rad: Poses in which the tool leans farther from straight down are left out.
 
     Raises:

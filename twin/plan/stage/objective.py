@@ -101,7 +101,6 @@ class StageProblem:
     Ts_tcp_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Objects that move with the tool, as it took them (errata: at the grasp instant)."""
     max_width_m: float = 0.1
-    """Of the gripper."""
 
     def violations(self, zeta: Zeta) -> list[Float[np.ndarray, "num_states num_parts"]]:
         """Evaluate f of every term."""

@@ -39,7 +39,6 @@ SETTLED = 1e-7
 _DIFFERENCE = 1e-4
 """Step of numeric derivatives, in units: 1 um, 0.001 degrees."""
 _NOTHING = 1e-10
-"""Of J."""
 _NEXT_SEED = 7919
 """Between the seeds of one drawing of starts and the next."""
 _HOPELESS = 1e6
@@ -51,9 +50,7 @@ class SolveConfig:
     """How a stage is solved."""
 
     num_starts: int = 32
-    """Starts that are followed at once."""
     iterations: int = 30
-    """Most steps of each start."""
     redraws: int = 2
     """How often a start that ends where a constraint is violated is drawn anew."""
     only_above: bool = False
@@ -61,7 +58,6 @@ class SolveConfig:
     spread_rad: float = 0.6
     """Starts are tilted by up to this much."""
     max_candidates: int = 16
-    """Most answers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,11 +135,7 @@ def solve(
     *,
     seed: int = 0,
 ) -> StageSolution:
-    """Minimise J from all starts and keep the distinct feasible states.
-
-    Args:
-        config: The defaults when None.
-    """
+    """Minimise J from all starts and keep the distinct feasible states."""
     config = SolveConfig() if config is None else config
     zeta = draw_starts(problem, config, seed)
     ends = _descended(problem, config, zeta)
@@ -296,11 +288,7 @@ def _names(problem: StageProblem) -> list[str]:
 
 
 def distinct(Ts: Float[np.ndarray, "num 4 4"], order: np.ndarray, most: int) -> list[int]:
-    """Go through poses in an order and keep those that differ from all that are kept.
-
-    Args:
-        order: Indices, the best first; others are left out.
-    """
+    """Go through poses in an order and keep those that differ from all that are kept."""
     kept: list[int] = []
     rest = np.asarray(order, dtype=np.int64)
     while len(rest) and len(kept) < most:

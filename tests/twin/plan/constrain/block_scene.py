@@ -7,11 +7,10 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from bridge.geometry.mesh import box_corners
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import Task, TaskFile
-from twin.plan.problem import CameraView, Keypoint, Problem, Shape, State
+from twin.plan.problem import Keypoint, Problem, Shape, State
 from twin.replay.scene import ReplayScene
 from twin.robot.model import load_robot
 
@@ -103,11 +102,6 @@ def box_shape(size_m: tuple[float, float, float]) -> Shape:
 def blocks() -> Problem:
     task = blocks_task()
     scene = ReplayScene(task=task, Ts_base_object=dict(PLACES), urdf=ROBOT.urdf_text())
-    eye, target, up = np.array([1.1, 0.5, 0.6]), np.array([0.5, 0.0, 0.0]), np.array([0, 0, 1.0])
-    side = CameraView(
-        camera=Camera(width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0),
-        T_base_camera=se3.look_at(eye, target, up),
-    )
     return Problem(
         scene=scene,
         robot=load_robot(scene.urdf),
@@ -116,7 +110,6 @@ def blocks() -> Problem:
             Keypoint(p_m=np.array([0.02, 0.0, 0.02]), object_id="cube"),
             Keypoint(p_m=np.array([0.5, 0.1, 0.1])),
         ),
-        cameras={"side": side},
     )
 
 
@@ -278,11 +271,6 @@ EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
         {"kind": "reach", "margin": 0.1},
         START,
         state(tcp=pose(1.5, 0.5, 0.3) @ LOOKING_DOWN),
-    ),
-    "visible": (
-        {"kind": "visible", "obj": "cube", "camera": "side", "frac": 0.4},
-        OUT,
-        state(cube=pose(0.9, -0.9, 0.02)),
     ),
     "stable": (
         {"kind": "stable", "obj": "cube", "support": "brick", "margin": 0.005},

@@ -247,7 +247,6 @@ def _meanings() -> Iterator[tuple[str, str, str]]:
         "in a cube": ({"kind": "inside", "obj": "cube", "container": "cube"}, ".container"),
         "beside itself": ({"kind": "beside", "obj": "cube", "reference": "cube"}, ".reference"),
         "a speed to end with": ({"kind": "speed", "max": 0.1}, ""),
-        "no camera": ({"kind": "visible", "obj": "cube", "camera": "side"}, ".camera"),
         "moved by no way": ({"kind": "moved", "obj": "cube", "by": 0.1, "tol": 0.01}, ".by"),
         "a flat region": (
             {

@@ -50,20 +50,6 @@ def test_distances_to_several_boxes_are_to_the_nearest() -> None:
     np.testing.assert_allclose(found, np.min(each, axis=0), atol=1e-11)
 
 
-def test_a_line_is_blocked_for_as_long_as_it_runs_inside() -> None:
-    rng = np.random.default_rng(3)
-    T, half = random_poses(rng, 1, 0.05), np.array([0.05, 0.1, 0.15])
-    start = np.array([0.6, 0.1, 0.2])
-    ends = rng.uniform(-0.3, 0.3, size=(1, 200, 3))
-    found = arrays.blocked_length(start, ends, T, half)[0]
-    shares = (np.arange(4000) + 0.5) / 4000
-    for end, length in zip(ends[0], found, strict=True):
-        way = end - start
-        points = se3.apply(se3.invert(T[0]), start + shares[:, None] * way)
-        inside = (np.abs(points) < half).all(axis=1).mean() * np.linalg.norm(way)
-        assert max(length, 0.0) == pytest.approx(inside, abs=1e-3)
-
-
 def test_angles_are_exact_where_a_cosine_is_flat() -> None:
     a = np.array([[1.0, 0.0, 0.0]])
     for wanted in (1e-7, 1e-3, 1.0, np.pi - 1e-7):

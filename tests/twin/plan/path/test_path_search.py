@@ -13,7 +13,7 @@ from twin.plan.path.planner import Movement, NoPathError, PathConfig, plan_move,
 from twin.plan.path.world import Carried, build_world
 from twin.plan.problem import Problem, TimedPath
 
-CONFIG = PathConfig(audited=False)
+CONFIG = PathConfig()
 
 
 def moved(pairs: Pairs, index: int, config: PathConfig = CONFIG, **more: object) -> Movement:
@@ -44,13 +44,10 @@ def test_a_way_is_found_around_box_post_wall_and_the_arm_itself(pairs: Pairs) ->
 
 
 def test_where_going_straight_is_refused_the_planned_way_is_not(pairs: Pairs) -> None:
-    """By the monitor and by python-fcl."""
     index = pairs.kinds.index("post")
-    movement = moved(pairs, index, replace(CONFIG, audited=True))
+    movement = moved(pairs, index)
     assert movement.decision.accepted
     assert movement.decision.clearance_m.min() >= EPS_M
-    assert movement.decision.audit is not None
-    assert movement.decision.audit.value is True
     refused = decide(pairs.problem, straight(pairs, index), width_m=WIDTH_M, config=CONFIG.replay)
     assert not refused.accepted
     assert "post" in {body for refusal in refused.refusals for body in refusal.bodies}

@@ -10,7 +10,7 @@ from twin.plan.path.planner import PathConfig, limits_of, timed_path
 from twin.replay.checks import path_limit_failures
 from twin.replay.path import JointPath
 
-CONFIG = PathConfig(audited=False)
+CONFIG = PathConfig()
 FAST = replace(CONFIG, speed_share=1.0, acceleration_share=1.0)
 
 

@@ -18,7 +18,7 @@ from twin.plan.path.transfer import contacts_of, nearest_solutions, plan_transfe
 from twin.plan.problem import Grasp, Problem, Release
 from twin.robot.config import IkConfig
 
-CONFIG = PathConfig(audited=False)
+CONFIG = PathConfig()
 
 
 def grasp_of(problem: Problem) -> Grasp:
