@@ -52,6 +52,10 @@ GONE: dict[str, str] = {
         ("rebuild --generator", "rebuild --generator-timeout-s"),
         "Shapes are carved from what the cameras saw.",
     ),
+    **dict.fromkeys(
+        ("evaluate --live", "evaluate --recorder", "evaluate --connect"),
+        "robot-gst evaluate RUN --goal 0.8 says of all trials so far whether to stop or continue.",
+    ),
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(
         ("replay --grasp", "gate --grasp"), "A grasp holds by friction, as the robot's does."

@@ -21,7 +21,7 @@ from evaluator.review_index import FailureSelection, IndexedTrial
 if TYPE_CHECKING:
     from dashboards.live_page import LiveFeed
 
-PARTS = ("summary", "topics", "clocks", "verdicts", "advice")
+PARTS = ("summary", "topics", "clocks", "verdicts")
 """Of the page Live that change by themselves."""
 _SHARING = Lock()
 RunOf = Callable[[Request], RunFolder]

@@ -22,8 +22,8 @@ from evaluator.compare.gate import agreement, gate_scorecard, reliability
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
-from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
+from evaluator.compare.sequences import sequences, stopping_table
 from evaluator.compare.stages import divergence_table, failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -127,7 +127,6 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *stages,
         *decisions(groups),
         *model_results(usable_groups(groups)),
-        *assisted_rates(rows),
         *sequences(rows, pairs),
     )
     return _Found(
@@ -174,11 +173,6 @@ NO_DATA = (
         "no planned replay has varied ones; robot-gst replay RUN --samples 16 makes them",
     ),
     ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
-    (
-        "proxy.",
-        "recorded rate with the twin's help",
-        "every start in the twin has its robot trial, or none has",
-    ),
 )
 """Parts of the evaluation whose input a run may not have."""
 

@@ -51,7 +51,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("average.", "rate.", "proxy.recorded_rate", "sequence.recorded.")
+SHARES = ("average.", "rate.", "sequence.recorded.")
 UNSIGNED = (
     "agreement.mae_pp",
     "agreement.rmse_pp",

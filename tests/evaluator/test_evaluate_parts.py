@@ -47,7 +47,6 @@ def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
         "reliability of the success probability",
         "sim estimated again with fresh seeds",
         "stage funnel",
-        "recorded rate with",
         "final states",
         "label against localised predicate",
     )
@@ -104,29 +103,6 @@ def test_a_stated_probability_is_judged(write_table: Callable[[str], Path]) -> N
     assert results.get("reliability.brier").value == pytest.approx((0.01 + 0.04) / 2)
     assert results.get("reliability.brier_of_base_rate").value == 0.25
     assert not any("reliability" in text for text in comparison.missing)
-
-
-def test_starts_that_only_the_twin_has_help_the_real_rate(
-    write_table: Callable[[str], Path],
-) -> None:
-    lines = [line(i, i < 6, i < 6) for i in range(10)]
-    lines += [line(100 + i, None, i < 60) for i in range(100)]
-    results = trials(write_table, lines).results()
-    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
-    assert rate.value == pytest.approx(0.58, abs=0.03)
-    saved = results.get("proxy.trials_saved.cube.without_replanning.x")
-    assert saved.value is not None
-    assert saved.value > 0
-    assert results.get("proxy.random_starts_p.cube.without_replanning.x").value > 0.5
-
-
-def test_starts_that_were_picked_get_no_estimate(write_table: Callable[[str], Path]) -> None:
-    lines = [line(i, True, True) for i in range(12)]
-    lines += [line(100 + i, None, i < 5) for i in range(100)]
-    results = trials(write_table, lines).results()
-    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
-    assert rate.value is None
-    assert "no random part of the twin's" in str(rate.reason_if_undefined)
 
 
 def test_subtasks_make_a_funnel(write_table: Callable[[str], Path]) -> None:
