@@ -108,7 +108,7 @@ class StudyPages:
         return kept(data, "video/mp4")
 
     def compare(self, request: Request) -> Response:
-        """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
+        """``/compare?with=RUN``: only what differs."""
         with LOADING:
             from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
 
