@@ -151,8 +151,6 @@ class ImageOptions:
     """METHOD=FOLDER of renders named as the reference; once for each method to compare."""
     reference: Path | None = None
     """Folder of recorded images; the recorded side of the run's held-out views without it."""
-    masks: Path | None = None
-    """Folder of masks named as the reference, white inside; all is scored under them too."""
     split: str = UNSTATED
     """Which images were held out, for the stamp: "every 8th frame". A run says so itself."""
     lpips_vgg: Path | None = None
@@ -178,10 +176,10 @@ class ImageOptions:
         """Refuse settings that nothing would be compared with.
 
         Raises:
-            UsageError: When there is a reference, a mask or a split without any renders.
+            UsageError: When there is a reference or a split without any renders.
         """
-        if not self.renders and (self.reference or self.masks or self.split != UNSTATED):
-            message = "--reference, --masks and --split belong to --renders METHOD=FOLDER."
+        if not self.renders and (self.reference or self.split != UNSTATED):
+            message = "--reference and --split belong to --renders METHOD=FOLDER."
             raise UsageError(message)
 
     def methods(self) -> dict[str, Path]:

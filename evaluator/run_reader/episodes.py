@@ -541,14 +541,6 @@ class DerivedIndex:
         decided = _newest(alone).facts.verdict if alone else None
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 
-    def by_engine(self, *, source: str, source_sha256: str, plan_id: str) -> dict[str, DerivedFile]:
-        """Return the newest planned replay of a plan in each engine, those that never count too."""
-        found: dict[str, list[DerivedFile]] = {}
-        for file in _current(self._replays.get((source, plan_id, "planned"), []), source_sha256):
-            if file.derived.engine:
-                found.setdefault(file.derived.engine, []).append(file)
-        return {engine: _newest(files) for engine, files in found.items()}
-
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
         """Find the newest localisation of a recorded episode.
 
