@@ -52,11 +52,7 @@ class Quantity:
     better: Better
 
     def of(self, **words: object) -> Defined:
-        """Name one measurement.
-
-        Args:
-            words: The parts of its id, which are made fit for ids, and of its definition.
-        """
+        """Name one measurement."""
         parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
         return Defined(
             id=self.id.format(**parts),

@@ -24,14 +24,12 @@ def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Meas
     """Say what holds however often somebody looked: each group's rate, and whether pairs improve.
 
     Args:
-        rows: Trials of all groups; a group in which one row stands for several trials is left
-            out.
         pairs: The same starts without and with replanning; none leaves those out.
     """
     measurements = []
     for key, members in group_rows(rows).items():
         known = in_order([row for row in members if row.recorded is not None])
-        if known and all(row.count == 1 for row in known):
+        if known:
             measurements.append(_sequence(key, known))
     if pairs:
         measurements.append(_evidence(pairs))
@@ -64,7 +62,7 @@ def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table,
     lines: list[tuple[Cell, ...]] = []
     for (task, condition, policy), members in group_rows(rows).items():
         known = in_order([row for row in members if row.recorded is not None])
-        if not known or any(row.count > 1 for row in known):
+        if not known:
             continue
         try:
             sequence = sequence_of([bool(row.recorded) for row in known])

@@ -104,9 +104,6 @@ def common_text(stamps: Sequence[Stamp]) -> str:
     """Write what several stamps share once, and behind it what is each metric's own.
 
     Which code computed a value is left to the table of full stamps.
-
-    Raises:
-        ValueError: Without a stamp.
     """
     if not stamps:
         message = "a row of image numbers needs at least one protocol stamp"
@@ -183,11 +180,7 @@ class ImageOptions:
             raise UsageError(message)
 
     def methods(self) -> dict[str, Path]:
-        """Return the folders of renders by method; a folder alone is named after itself.
-
-        Raises:
-            UsageError: For a name twice, or none.
-        """
+        """Return the folders of renders by method; a folder alone is named after itself."""
         found: dict[str, Path] = {}
         for text in self.renders:
             name, equals, folder = text.partition("=")

@@ -64,11 +64,7 @@ HUGE = 1e7
 
 
 def number(value: float, unit: str) -> str:
-    """Write a value in the unit a reader thinks in.
-
-    Args:
-        unit: Unit of the measurement: one of ``SHOWN_UNITS``, or another, which is left out.
-    """
+    """Write a value in the unit a reader thinks in."""
     _, name, _ = SHOWN_UNITS.get(unit, PLAIN)
     return f"{_figure(value, unit)}{name}"
 

@@ -37,9 +37,6 @@ def capital_log(k: int, n: int, rate: float) -> float:
         n: Trials; without any the bettor still owns 1, so the log is 0.
         rate: The rate that is bet against, 0 to 1; one that excludes what has happened gives
             infinity.
-
-    Raises:
-        ImpossibleCountError: When k is not in 0..n.
     """
     if n == 0:
         return 0.0
@@ -55,15 +52,7 @@ def capital_log(k: int, n: int, rate: float) -> float:
 
 
 def betting_interval(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the rates a bettor has not yet refuted; valid however often one looked before.
-
-    Args:
-        level: Confidence level that is kept over all looks together, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
-    """
+    """Return the rates a bettor has not yet refuted; valid however often one looked before."""
     check_count(k, n)
     ruin = -math.log1p(-level)
     low = 0.0 if k == 0 else _end(k, n, ruin, 0.0)
@@ -115,10 +104,6 @@ class ConfidenceSequence:
 
 def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> ConfidenceSequence:
     """Return the sequence after all these trials; ``add`` one by one, but for all at once.
-
-    Args:
-        outcomes: Whether each trial succeeded, in the order in which they were run.
-        level: Confidence level that is kept over all looks together, 0 to 1.
 
     Raises:
         UndefinedStatisticError: When after some trial no constant rate was left.
@@ -174,14 +159,7 @@ class Advice:
 
 
 def stop_or_continue(sequence: ConfidenceSequence, goal: float) -> Advice:
-    """Say whether the rate is above or below a goal, or how many more trials it may take.
-
-    Args:
-        goal: The success rate that is asked about, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-    """
+    """Say whether the rate is above or below a goal, or how many more trials it may take."""
     if sequence.n == 0:
         raise UndefinedStatisticError(statistic="stop or continue", reason="there are no trials")
     if sequence.low > goal:

@@ -75,7 +75,6 @@ def folder_set(name: str, folder: Path) -> ImageSet:
         folder: Where its images are; a path below it without its ending names the view.
 
     Raises:
-        PathNotFoundError: When there is no such folder.
         EvaluatorError: When it holds no image, or two of one name.
     """
     if not folder.is_dir():
@@ -188,9 +187,6 @@ def compare_methods(
     reference: Reference, methods: Sequence[ImageSet], *, nets: Sequence[PerceptualNet] = ()
 ) -> MethodReport:
     """Score every method on every view of the reference.
-
-    Args:
-        nets: For LPIPS; none leaves it out.
 
     Raises:
         EvaluatorError: When no method has a single view that can be scored, or no view is common.

@@ -71,13 +71,7 @@ def _cell(found: Mapping[str, StampedMeasurement], metric: str) -> StampedValue:
 
 
 def compare_folders(options: ImageOptions) -> Comparison:
-    """Compare folders of renders with a folder of recorded images, without any run.
-
-    Raises:
-        UsageError: When the reference or the renders are not named.
-        PathNotFoundError: When a folder is not there.
-        EvaluatorError: When nothing in them can be compared.
-    """
+    """Compare folders of renders with a folder of recorded images, without any run."""
     if options.reference is None or not options.renders:
         message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
         raise UsageError(message)
@@ -114,11 +108,8 @@ def compare_renders(
 
     Args:
         options: Whose folders; without any the report is empty.
-        sources: Every recorded episode by its id.
-        nets: For LPIPS; none leaves it out.
 
     Raises:
-        PathNotFoundError: When a folder is not there.
         EvaluatorError: When the run has no views, or nothing can be compared.
     """
     if not options.renders:
