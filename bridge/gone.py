@@ -70,6 +70,11 @@ GONE: dict[str, str] = {
         ("rebuild --generator", "rebuild --generator-timeout-s"),
         "Shapes are carved from what the cameras saw.",
     ),
+    **dict.fromkeys(
+        ("evaluate --live", "evaluate --recorder", "evaluate --connect"),
+        "robot-gst evaluate RUN --goal 0.8 says of all trials so far whether to stop or continue.",
+    ),
+    "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(
         ("replay --grasp", "gate --grasp"), "A grasp holds by friction, as the robot's does."

@@ -1,4 +1,4 @@
-"""Two runs, or two conditions, policies or engines of one: what differs, as the evaluator says."""
+"""Two runs of the same recorded trials: what differs, as the evaluator says."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,30 +13,17 @@ from dashboards.comparison import WAITED_FOR, Judgement
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.against import against_tables
 from evaluator.compare.run import ReadRun, read_run
-from evaluator.compare.within import KINDS, choices, within_tables
 from evaluator.report.page import grid
 from evaluator.report.wording import cell_text
 from evaluator.result import Measurement, Table
 from evaluator.review_index import state_of
 
-DIFFERENCES = ("against", "within")
-"""Tables of paired differences; they are drawn, too."""
-KIND_WORDS = {"condition": "conditions", "policy": "policies", "engine": "engines"}
+DIFFERENCES = "against"
+"""The table of paired differences; it is drawn, too."""
 MOST_ROWS = 200
 MOST_NUMBERS = 40
 NUMBERS = ("agreement.", "rate.", "gain.pp.", "views.")
 """Numbers of two runs that are laid side by side where the trials are not the same."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Choice:
-    """Two things of the run that can be held against each other."""
-
-    kind: str
-    words: str
-    names: tuple[str, ...]
-    first: str
-    second: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +65,6 @@ class ComparePage:
 
     others: tuple[str, ...]
     """Runs to hold this one against."""
-    choices: tuple[Choice, ...]
     names: tuple[str, str] | None
     """What is compared; None while nothing is chosen."""
     sentences: tuple[str, ...]
@@ -107,36 +93,23 @@ def build_compare(
 
     Args:
         others: Runs that it can be held against, by name; None but for the chosen one.
-        query: ``with`` names another run; ``by``, ``a`` and ``b`` two things of this one.
+        query: ``with`` names another run.
     """
     is_small = judgement.index is not None and state_of(run).num_files <= WAITED_FOR
-    offered = _choices(run, judgement, query) if is_small else ()
     rows = judgement.rows if is_small else ()
     shared: dict[str, Any] = {
         "others": tuple(others),
-        "choices": offered,
         "has_replays": any(row.planned_replay for row in rows),
         "linked": frozenset(row.episode for row in rows if row.file),
     }
     theirs = others.get(query.get("with", ""))
-    kind, first, second = (query.get(name, "") for name in ("by", "a", "b"))
-    if not first and not second:  # an address that only says by what
-        offer = next((each for each in offered if each.kind == kind), None)
-        first, second = ("", "") if offer is None else (offer.first, offer.second)
+    if theirs is None:
+        return _page(shared, None, _stored(judgement))
+    name = query["with"]
     try:
-        if theirs is not None:
-            name = query["with"]
-            return _of_runs(run, judgement, name, theirs, shared)
-        if kind and kind not in KINDS:
-            why = f"{kind!r} cannot be compared; choose two conditions, policies or engines."
-            return _page(shared, None, (), why_not=why)
-        if kind and is_small:
-            tables = _within(run, _state(judgement), kind, first, second)
-            return _page(shared, (first, second), tables)
+        return _of_runs(run, judgement, name, theirs, shared)
     except GstError as error:
-        names = (first, second) if theirs is None else (run.path.resolve().name, query["with"])
-        return _page(shared, names, (), why_not=str(error))
-    return _page(shared, None, _stored(judgement))
+        return _page(shared, (run.path.resolve().name, name), (), why_not=str(error))
 
 
 def _stored(judgement: Judgement) -> list[Table]:
@@ -153,30 +126,10 @@ def _state(judgement: Judgement) -> str:
     return str(judgement.about.get("state", ""))
 
 
-def _choices(run: RunFolder, judgement: Judgement, query: Mapping[str, str]) -> tuple[Choice, ...]:
-    try:
-        found = choices(_read(run, _state(judgement)))
-    except GstError:  # the first page says what is wrong with the run
-        return ()
-    offered = []
-    for kind, names in found.items():
-        chosen = [query.get(name, "") for name in "ab"] if query.get("by") == kind else []
-        first, second = chosen if chosen and {*chosen} <= {*names} else names[:2]
-        offered.append(
-            Choice(kind=kind, words=KIND_WORDS[kind], names=names, first=first, second=second)
-        )
-    return tuple(offered)
-
-
 @lru_cache(maxsize=4)
 def _read(run: RunFolder, _state: str) -> ReadRun:
     with SummaryCache(run.results_dir / FOLDER) as cache:
         return read_run(run, cache)
-
-
-@lru_cache(maxsize=32)
-def _within(run: RunFolder, state: str, kind: Any, first: str, second: str) -> tuple[Table, ...]:
-    return within_tables(_read(run, state), kind, first, second)
 
 
 def _of_runs(
@@ -232,7 +185,7 @@ def _page(
     numbers: Sequence[NumberPair] = (),
     command: str = "",
 ) -> ComparePage:
-    bars = tuple(bar for table in tables if table.id in DIFFERENCES for bar in _bars(table))
+    bars = tuple(bar for table in tables if table.id == DIFFERENCES for bar in _bars(table))
     return ComparePage(
         **shared,
         names=names,

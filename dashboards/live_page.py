@@ -18,7 +18,6 @@ from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import CompressedColor
 from bridge.errors import GstError
 from bridge.record.status import describe_status
-from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import WireError
@@ -80,9 +79,6 @@ class LiveState:
     topics: tuple[TopicLine, ...]
     more_topics: int
     verdicts: tuple[VerdictLine, ...]
-    advice: Mapping[str, Any] | None
-    """What ``evaluate --live`` said last."""
-    advice_age_s: float
     previews: tuple[tuple[str, int], ...]
     """Camera, and a number that changes with its picture."""
     malformed: int
@@ -99,8 +95,6 @@ class _Heard:
     verdicts: deque[tuple[float, Verdict]] = field(
         default_factory=lambda: deque(maxlen=MOST_VERDICTS)
     )
-    advice: dict[str, Any] | None = None
-    advice_s: float = 0.0
     malformed: int = 0
 
 
@@ -184,8 +178,6 @@ class LiveFeed:
                 topics=tuple(topics[:MOST_TOPICS]),
                 more_topics=max(0, len(topics) - MOST_TOPICS),
                 verdicts=verdicts,
-                advice=heard.advice,
-                advice_age_s=now_s - heard.advice_s,
                 previews=tuple((name, n) for name, (n, _) in sorted(heard.previews.items())),
                 malformed=heard.malformed,
             )
@@ -208,7 +200,6 @@ class LiveFeed:
                     for key, hear, most in (
                         (f"rec/{self._recorder}/status", self._hear_status, STATUS_BYTES),
                         (f"rec/{self._recorder}/preview/*", self._hear_preview, PREVIEW_BYTES),
-                        (f"rec/{self._recorder}/advice", self._hear_advice, STATUS_BYTES),
                         ("**/verdict", self._hear_verdict, STATUS_BYTES),
                     ):
                         subscriber = session.subscribe(key, hear, max_bytes=most)
@@ -247,17 +238,6 @@ class LiveFeed:
             for topic, rate_hz in _numbers(record.get("rates_hz")).items():
                 kept = self._heard.rates.setdefault(topic, deque(maxlen=REMEMBERED_S))
                 kept.append(rate_hz)
-
-    def _hear_advice(self, sample: WireSample) -> None:
-        try:
-            record = dict(parse_record(sample.data, name="advice", package="bridge.episode"))
-        except GstError:
-            record = None
-        with self._lock:
-            if record is None:
-                self._heard.malformed += 1
-            else:
-                self._heard.advice, self._heard.advice_s = record, self._now_s()
 
     def _hear_verdict(self, sample: WireSample) -> None:
         if sample.type_name not in ("", schema.VERDICT):

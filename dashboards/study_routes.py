@@ -21,7 +21,7 @@ from evaluator.review_index import FailureSelection, IndexedTrial
 if TYPE_CHECKING:
     from dashboards.live_page import LiveFeed
 
-PARTS = ("summary", "topics", "clocks", "verdicts", "advice")
+PARTS = ("summary", "topics", "clocks", "verdicts")
 """Of the page Live that change by themselves."""
 _SHARING = Lock()
 RunOf = Callable[[Request], RunFolder]
@@ -108,7 +108,7 @@ class StudyPages:
         return kept(data, "video/mp4")
 
     def compare(self, request: Request) -> Response:
-        """``/compare?with=RUN`` or ``?by=condition&a=&b=``: only what differs."""
+        """``/compare?with=RUN``: only what differs."""
         with LOADING:
             from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
 

@@ -84,11 +84,7 @@ def _digest(body: bytes) -> bytes:
 
 
 def write_rows(path: Path, rows: Rows) -> None:
-    """Write summaries, whole or not at all; one that cannot be packed costs only its own place.
-
-    Raises:
-        OSError: When the disk refuses.
-    """
+    """Write summaries, whole or not at all; one that cannot be packed costs only its own place."""
     try:
         body = _encode(rows)
     except (TypeError, ValueError, OverflowError):
@@ -106,12 +102,7 @@ def _fits(found: tuple[Any, ...]) -> bool:
 
 
 def read_rows(path: Path, kind: type[Any]) -> Rows:
-    """Read the summaries of a file.
-
-    Raises:
-        ValueError: When it is damaged, or other code made it.
-        FileNotFoundError: When it is not there.
-    """
+    """Read the summaries of a file."""
     data = path.read_bytes()
     head, body = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
     if head != _digest(body):
@@ -199,7 +190,6 @@ class SummaryCache:
         """Keep summaries under a key; now and then everything new is written.
 
         Args:
-            key: Names what they were made from, so that a changed file has another key.
             made: The summaries; none is an answer too.
         """
         if self._folder is None:

@@ -12,7 +12,6 @@ from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import EvaluatorError
-from evaluator.live.config import LiveConfig
 from evaluator.memory import without_collecting
 from evaluator.metrics.image_protocol import ImageOptions
 from evaluator.review_index import RESULTS
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from evaluator.result import Results
     from evaluator.thresholds import Missed, Threshold
 
-LIVE = LiveConfig()
 STUDY, WANTED = StudyOptions(), Wanted()
 IMAGES = ImageOptions()
 THRESHOLD_NOT_MET = 3
@@ -43,7 +41,6 @@ def evaluate(
     latex: bool = False,
     tables: Annotated[TableOptions, Parameter(name="*")] = AS_SAVED,
     images: Annotated[ImageOptions, Parameter(name="*")] = IMAGES,
-    live: Annotated[LiveConfig, Parameter(name="*")] = LIVE,
     output: Output = Output(),  # noqa: B008  # frozen, and cyclopts reads the default
 ) -> int:
     """Say how far the twin can be trusted: agreement, tables, figures, report.html.
@@ -72,7 +69,6 @@ def evaluate(
         latex: Write the headline tables as LaTeX, too.
         tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
-        live: Follow a session instead of evaluating what is there.
         output: How to talk.
     """
     from evaluator.thresholds import parse_thresholds
@@ -82,8 +78,6 @@ def evaluate(
 
         message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
         raise UsageError(message)
-    if live.live:
-        return _follow(sources, live, goal, output)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
     asked = _Asked(
         interval=interval,
@@ -292,19 +286,6 @@ def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> 
         force=asked.force,
         output=output,
     )
-
-
-def _follow(sources: Sequence[Path], live: LiveConfig, goal: float | None, output: Output) -> int:
-    from bridge.errors import UsageError
-    from bridge.terminal import stop_signals
-    from evaluator.live.follow import follow
-
-    if len(sources) != 1:
-        message = "evaluate --live needs the one run folder that is recorded into."
-        raise UsageError(message)
-    with stop_signals() as stop:
-        follow(sources[0], live, goal=goal, stop=stop, output=output)
-    return 0
 
 
 def _compare_images(images: ImageOptions) -> "tuple[Comparison, Path]":

@@ -52,11 +52,7 @@ TRIAL_TYPES = {field.name: "string" for field in fields(TrialRecord)} | {
 
 
 def read_measurements(run: Path | str) -> pd.DataFrame:
-    """Return one row per measured number of a run that was evaluated.
-
-    Raises:
-        PathNotFoundError: When it was not evaluated yet.
-    """
+    """Return one row per measured number of a run that was evaluated."""
     return measurements_frame(load_results(Path(run)).measurements)
 
 
@@ -65,19 +61,12 @@ def read_groups(run: Path | str) -> pd.DataFrame:
 
     Sides are ``recorded``, ``sim_planned``, ``sim_executed`` and ``verdict``; ``rate`` is from 0
     to 1 and ``unit`` what was counted. Names are written as ids spell them.
-
-    Raises:
-        PathNotFoundError: When it was not evaluated yet.
     """
     return groups_frame(load_results(Path(run)).measurements)
 
 
 def read_trials(run: Path | str) -> pd.DataFrame:
-    """Return one row per trial of a run that was evaluated, as ``trials.csv`` holds them.
-
-    Raises:
-        PathNotFoundError: When it was not evaluated yet.
-    """
+    """Return one row per trial of a run that was evaluated, as ``trials.csv`` holds them."""
     path = Path(run)
     path = path / "results" / "trials.csv" if path.is_dir() else path
     if not path.is_file():

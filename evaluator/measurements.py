@@ -1,17 +1,14 @@
-"""Every measurement: its id, unit, definition, which way is better, and what computes it.
+"""Every measurement: its id, unit, definition, and which way is better.
 
 An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in the parts and gives
 what a ``Measurement`` is made with, so no other module spells an id.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image_protocol import ImageMetric
-from evaluator.metrics.image_scores import METRICS, score_image
+from evaluator.metrics.image_scores import METRICS
 from evaluator.quantity import REGISTRY as REGISTRY
 from evaluator.quantity import Better
 from evaluator.quantity import Defined as Defined
@@ -19,18 +16,7 @@ from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
 from evaluator.quantity import quantity_of as quantity_of
 from evaluator.quantity import slug as slug
-from evaluator.statistics import (
-    agreement,
-    calibration,
-    differences,
-    funnel,
-    gate,
-    hierarchical,
-    intervals,
-    power,
-    prediction_powered,
-    sequential,
-)
+from evaluator.statistics import gate
 
 # ruff: noqa: E501  # one line for each definition
 
@@ -44,9 +30,7 @@ _SIDES = {
     "verdict": "plans accepted / plans judged: the gate's verdict on the plan actually sent, before motion; without replanning it was recorded and not obeyed, with replanning it selected these plans",
 }
 RATES = {
-    side: _new(
-        f"rate.{side}.{{task}}.{{condition}}.{{policy}}", "1", "higher", intervals.wilson, words
-    )
+    side: _new(f"rate.{side}.{{task}}.{{condition}}.{{policy}}", "1", "higher", words)
     for side, words in _SIDES.items()
 }
 RATES_IN_COMMON = {
@@ -54,7 +38,6 @@ RATES_IN_COMMON = {
         f"rate_common.{side}.{{task}}.{{condition}}.{{policy}}",
         "1",
         "higher",
-        intervals.wilson,
         f"{_SIDES[side]}; over the trials where both sides are known",
     )
     for side in ("recorded", "sim_planned")
@@ -63,56 +46,48 @@ RATE_BY_UNIT = _new(
     "rate.recorded_{unit}.{task}.{condition}.{policy}",
     "1",
     "higher",
-    intervals.wilson,
     "successes / {unit}s as labelled; {unit}s of one trial are not independent, so the interval is narrower than the trials justify",
 )
 RATE_AS_GIVEN = _new(
     "rate.{side}.{task}.{condition}.{policy}",
     "1",
     "higher",
-    intervals.wilson,
     "successes / {unit}s, as given{where}",
 )
 RATE_VARIED = _new(
     "rate.sim_varied.{task}.{condition}.{policy}",
     "1",
     "higher",
-    None,
     "mean over trials of the share of varied planned replays of the plan actually sent that succeed: start, friction, forces, masses, stiffness and timing drawn anew, no draw that the gate used",
 )
 SELECTION_BIAS = _new(
     "bias.selection.{task}.{condition}.{policy}",
     "pp",
     "none",
-    None,
     "sim - sim estimated again, over the trials that have varied replays",
 )
 AVERAGE_MACRO = _new(
     "average.macro.{side}.{condition}",
     "1",
     "higher",
-    agreement.mean_rate,
     "mean of the unrounded {side} rates of {over} {condition}: every group counts the same",
 )
 AVERAGE_POOLED = _new(
     "average.pooled.{side}.{condition}",
     "1",
     "higher",
-    intervals.wilson,
     "successes / {unit}s over {over} {condition} ({side}): every trial counts the same",
 )
 NEVER_SENT = _new(
     "plans.never_sent",
     "count",
     "none",
-    None,
     "plans that were published and never executed, of all plans published; they are part of no rate",
 )
 STAGE = _new(
     "stage.{task}.{condition}.{stage}",
     "1",
     "higher",
-    funnel.funnel,
     "trials that passed stage {stage} of {task} / trials that reached it and whose ending is known",
 )
 
@@ -122,70 +97,60 @@ GAIN_POINTS = _new(
     "gain.pp.{side}.{task}.{policy}",
     "pp",
     "higher",
-    differences.newcombe_difference,
     "gain with replanning in percentage points ({side}): {words}",
 )
 GAIN_RELATIVE = _new(
     "gain.relative.{side}.{task}.{policy}",
     "1",
     "higher",
-    intervals.relative_gain,
     "relative gain with replanning ({side}), (with - without) / without: {words}; not percentage points",
 )
 GAIN_POINTS_AVERAGE = _new(
     "gain.pp.{side}.average",
     "pp",
     "higher",
-    agreement.mean_rate,
     "gain with replanning in percentage points of the unrounded mean rates of {count} tasks ({side})",
 )
 GAIN_RELATIVE_AVERAGE = _new(
     "gain.relative.{side}.average",
     "1",
     "higher",
-    intervals.relative_gain,
     "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
 )
 BOSCHLOO = _new(
     "unpaired.boschloo_p.{side}.{task}.{policy}",
     "1",
     "none",
-    differences.boschloo,
     "two-sided p of Boschloo's exact test, starts not paired: {about}",
 )
 BOSCHLOO_POOLED = _new(
     "unpaired.boschloo_p.{side}.pooled",
     "1",
     "none",
-    differences.boschloo,
     "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
 )
 TRIALS_NEEDED = _new(
     "power.trials_needed.{side}.{task}.{policy}",
     "count",
     "none",
-    power.trials_needed,
     "per condition, to show a gain as large as {about} with {power}",
 )
 PAIRED_GAIN = _new(
     "paired.gain_pp.{side}",
     "pp",
     "higher",
-    differences.tango_difference,
     "gain with replanning in percentage points over paired starts: {words}",
 )
 PAIRED_PROGRESS = _new(
     "paired.progress_pp",
     "pp",
     "higher",
-    differences.tango_difference,
     "share of paired starts that came further with replanning less that of those that came less far, by objects or sub-tasks done: {words}",
 )
 PAIRED_PROGRESS_P = _new(
     "paired.progress_p_mid",
     "1",
     "none",
-    differences.sign_test,
     "two-sided sign test with mid-p of the same: {words}",
 )
 MCNEMAR = {
@@ -193,7 +158,6 @@ MCNEMAR = {
         f"paired.mcnemar_p_{kind}.{{side}}",
         "1",
         "none",
-        differences.mcnemar,
         f"two-sided McNemar test, {test}: {{words}}",
     )
     for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
@@ -203,7 +167,6 @@ START_DISTANCE = {
         f"paired.start_distance_{kind}_m",
         "m",
         "lower",
-        None,
         f"{kind} over paired starts of the largest distance between the localised objects of both trials; pairs beyond {{limit_mm:.0f}} mm are excluded, {{unknown}} of {{count}} pairs were not localised and are kept",
     )
     for kind in ("mean", "max")
@@ -212,187 +175,157 @@ START_DISTANCE = {
 # Agreement over groups. ``{what}`` says over which.
 
 
-def _agreement(
-    name: str, unit: str, better: Better, computed_by: Callable[..., Any], definition: str
-) -> Quantity:
-    return _new(f"agreement.{name}", unit, better, computed_by, f"{definition}{{resampled}}")
+def _agreement(name: str, unit: str, better: Better, definition: str) -> Quantity:
+    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}")
 
 
 PEARSON_R = _agreement(
     "pearson_r",
     "1",
     "higher",
-    agreement.pearson,
     "Pearson r of the twin's and the recorded success rates {what}",
 )
 PEARSON_R_OF_CONDITION = _new(
-    "agreement.pearson_r.{condition}", "1", "higher", agreement.pearson, PEARSON_R.definition
+    "agreement.pearson_r.{condition}", "1", "higher", PEARSON_R.definition
 )
 PEARSON_R_REMEASURED = _new(
     "agreement.pearson_r_remeasured",
     "1",
     "higher",
-    agreement.pearson,
     "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
 )
 MODEL_R = _new(
     "agreement.model.r",
     "1",
     "higher",
-    hierarchical.estimate,
     "correlation of the true rates of these groups: the noise of counting is taken out",
 )
 MODEL_R_OTHERS = _new(
     "agreement.model.r_others",
     "1",
     "higher",
-    hierarchical.population,
     "the same over all groups of this kind; its interval is that of Pearson r",
 )
 MODEL_WITHIN = _new(
     "agreement.model.r_within",
     "1",
     "higher",
-    hierarchical.AgreementModel,
     "correlation of log-odds between groups of one task, noise of counting taken out",
 )
 MODEL_BETWEEN = _new(
     "agreement.model.r_between",
     "1",
     "higher",
-    hierarchical.AgreementModel,
     "correlation of the mean log-odds of tasks, noise of counting taken out",
 )
 MODEL_OPPOSED = _new(
     "agreement.model.opposed",
     "1",
     "none",
-    hierarchical.AgreementModel,
     "probability that the correlations within and between tasks have different signs",
 )
 MODEL_BIAS = _new(
     "agreement.model.bias_pp",
     "pp",
     "none",
-    hierarchical.estimate,
     "mean true sim rate - true recorded rate of these groups",
 )
 MODEL_BIAS_OF_GROUP = _new(
     "agreement.model.bias_pp.{task}.{condition}.{policy}",
     "pp",
     "none",
-    hierarchical.estimate,
     "true sim rate - true recorded rate of one group, drawn towards the others where it is small",
 )
 MODEL_GAIN = _new(
     "gain.model.pp.{side}.average",
     "pp",
     "higher",
-    hierarchical.estimate,
     "gain with replanning ({side}), mean of tasks, in the model of all groups",
 )
 MODEL_GAIN_OF_TASK = _new(
     "gain.model.pp.{side}.{task}.{policy}",
     "pp",
     "higher",
-    hierarchical.estimate,
     "gain with replanning ({side}) of one task in the model of all groups: drawn towards the others",
 )
 MODEL_BEST = _new(
     "decision.model.best",
     "1",
     "higher",
-    hierarchical.chosen_is_best,
     "probability that what the twin calls best ({words}) has the highest recorded rate",
 )
 SPEARMAN = _agreement(
     "spearman_rho",
     "1",
     "higher",
-    agreement.spearman,
     "Spearman rank correlation of the same rates {what}; average ranks",
 )
-KENDALL = _agreement(
-    "kendall_tau_b", "1", "higher", agreement.kendall, "Kendall's tau-b of the same rates {what}"
-)
+KENDALL = _agreement("kendall_tau_b", "1", "higher", "Kendall's tau-b of the same rates {what}")
 BIAS = _agreement(
     "bias_pp",
     "pp",
     "none",
-    agreement.bias,
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
-MAE = _agreement(
-    "mae_pp", "pp", "lower", agreement.mean_absolute_error, "mean |sim rate - recorded rate| {what}"
-)
+MAE = _agreement("mae_pp", "pp", "lower", "mean |sim rate - recorded rate| {what}")
 RMSE = _agreement(
     "rmse_pp",
     "pp",
     "lower",
-    agreement.root_mean_square_error,
     "square root of the mean (sim rate - recorded rate)^2 {what}",
 )
 CALIBRATION_SLOPE = _agreement(
     "calibration_slope",
     "1",
     "none",
-    agreement.calibration_line,
     "slope of recorded = a + b x sim, least squares {what}; 1 is calibrated, noise pulls it towards 0",
 )
 CALIBRATION_INTERCEPT = _agreement(
     "calibration_intercept_pp",
     "pp",
     "none",
-    agreement.calibration_line,
     "intercept of the same line {what}",
 )
 ORDER_ACCURACY = _agreement(
     "order_accuracy",
     "1",
     "higher",
-    agreement.order_accuracy,
     "pairs of groups that the twin orders as the recorded rates do / pairs whose recorded rates differ; a tie in the twin counts 1/2; {what}",
 )
 MMRV_RECORDED = _agreement(
     "mmrv_recorded_gap",
     "1",
     "lower",
-    agreement.mmrv,
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
 )
 VARIED_R = _agreement(
     "varied.pearson_r",
     "1",
     "higher",
-    agreement.pearson,
     "Pearson r of recorded rates and the twin's of varied replays (each trial's share that succeed, averaged) {what}",
 )
 VARIED_BIAS = _agreement(
     "varied.bias_pp",
     "pp",
     "none",
-    agreement.bias,
     "the twin's rate of varied replays - recorded rate, averaged {what}",
 )
 VARIED_MMRV = _agreement(
     "varied.mmrv_recorded_gap",
     "1",
     "lower",
-    agreement.mmrv,
     "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
 )
 MMRV_SIM = _agreement(
     "mmrv_sim_gap",
     "1",
     "lower",
-    agreement.mmrv,
     "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of groups",
 )
 LARGEST_GAP = _new(
     "agreement.largest_gap_pp",
     "pp",
     "lower",
-    agreement.largest_gap,
     "largest |sim rate - recorded rate| {what}",
 )
 DECISIONS = {
@@ -400,7 +333,6 @@ DECISIONS = {
         f"decision.{part}",
         "1",
         "higher",
-        agreement.choose,
         f"tasks in which {words} (best: highest rate, ties together) / tasks with a choice of condition or policy",
     )
     for name, part, words in (
@@ -420,7 +352,6 @@ REGRET = _new(
     "decision.regret_pp",
     "pp",
     "lower",
-    agreement.choose,
     "recorded success lost by choosing what is best in the twin, the worst of a tie, mean over tasks with a choice",
 )
 
@@ -430,35 +361,30 @@ AGREED = _new(
     "agreement.{by}.rate",
     "1",
     "higher",
-    intervals.wilson,
     "trials where {words} and the labelled outcome say the same / trials",
 )
 PHI = _new(
     "agreement.{by}.phi",
     "1",
     "higher",
-    gate.phi,
     "phi coefficient of {words} and the labelled outcome over trials",
 )
 KAPPA = _new(
     "agreement.{by}.kappa",
     "1",
     "higher",
-    gate.kappa,
     "Cohen's kappa of {words} and the labelled outcome over trials",
 )
 PPV = _new(
     "agreement.{by}.ppv",
     "1",
     "higher",
-    intervals.wilson,
     "positive predictive value: trials that succeeded / trials where {words} predicted success",
 )
 NPV = _new(
     "agreement.{by}.npv",
     "1",
     "higher",
-    intervals.wilson,
     "negative predictive value: trials that failed / trials where {words} predicted failure",
 )
 _BESIDE = "over trials where {words}, the forecast and the labelled outcome are known"
@@ -466,49 +392,42 @@ BASE_RATE = _new(
     "baseline.{by}.base_rate",
     "1",
     "none",
-    intervals.wilson,
     "trials that succeeded / trials where {words} and the labelled outcome are known: what always saying yes gets right",
 )
 BASELINE_ACCURACY = _new(
     "baseline.{by}.{baseline}.rate",
     "1",
     "none",
-    intervals.wilson,
     f"trials where the forecast without a twin ({{baseline}}) and the labelled outcome are the same / trials, {_BESIDE}",
 )
 BASELINE_PPV = _new(
     "baseline.{by}.{baseline}.ppv",
     "1",
     "none",
-    intervals.wilson,
     f"trials that succeeded / trials where the forecast without a twin ({{baseline}}) said success, {_BESIDE}",
 )
 BASELINE_NPV = _new(
     "baseline.{by}.{baseline}.npv",
     "1",
     "none",
-    intervals.wilson,
     f"trials that failed / trials where the forecast without a twin ({{baseline}}) said failure, {_BESIDE}",
 )
 BASELINE_GAIN = _new(
     "baseline.{by}.{baseline}.twin_gain_pp",
     "pp",
     "higher",
-    differences.tango_difference,
     f"share of right answers of the twin minus that of the forecast ({{baseline}}), paired, {_BESIDE}",
 )
 BASELINE_GAIN_OF_TASK = _new(
     "baseline.{by}.{baseline}.twin_gain_pp.{task}",
     "pp",
     "higher",
-    differences.tango_difference,
     BASELINE_GAIN.definition,
 )
 BREAK_EVEN_PRICE = _new(
     "gate.break_even_price",
     "1",
     "higher",
-    gate.break_even,
     "bad executions avoided / good plans refused, by verdicts that were not obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
 )
 _WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
@@ -516,105 +435,58 @@ BRIER = _new(
     "reliability.brier",
     "1",
     "lower",
-    gate.brier,
     f"Brier score: mean of (sampled success probability - outcome)^2; {_WHOSE}",
 )
 BRIER_OF_BASE_RATE = _new(
     "reliability.brier_of_base_rate",
     "1",
     "none",
-    gate.brier_of_base_rate,
     "Brier score of always saying the observed success rate; above it the probability is worth nothing",
 )
 ECE = _new(
     "reliability.ece",
     "1",
     "lower",
-    gate.expected_calibration_error,
     f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials, which the interval takes out; {_WHOSE}",
 )
 BRIER_PERFECT = _new(
     "reliability.brier_perfect",
     "1",
     "none",
-    calibration.perfect_forecaster,
     "Brier score of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 ECE_PERFECT = _new(
     "reliability.ece_perfect",
     "1",
     "none",
-    calibration.perfect_forecaster,
     "expected calibration error of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 LABEL_AGREED = _new(
     "label.localised.rate",
     "1",
     "higher",
-    intervals.wilson,
     "trials{where} where the operator's label and the success predicate on the poses localised after the execution say the same / trials where both are known{without}",
 )
-LABEL_AGREED_OF_TASK = _new(
-    "label.localised.{task}.rate", "1", "higher", intervals.wilson, LABEL_AGREED.definition
-)
+LABEL_AGREED_OF_TASK = _new("label.localised.{task}.rate", "1", "higher", LABEL_AGREED.definition)
 LABEL_OBJECTS = _new(
     "label.objects.rate",
     "1",
     "higher",
-    intervals.wilson,
     "trials where the operator counted as many objects as the predicate on the localised poses / trials labelled by object where both are known",
 )
 
-# Prediction-powered estimates and confidence sequences.
+# Confidence sequences.
 
-_PROXY = "proxy.{name}.{{task}}.{{condition}}.{{policy}}"
-PROXY_RATE = _new(
-    _PROXY.format(name="recorded_rate"),
-    "1",
-    "higher",
-    prediction_powered.post_stratified,
-    "recorded success rate with the twin's help: strata of the twin's answer, each with a Beta(1/2, 1/2) prior; {many}",
-)
-TRIALS_SAVED = _new(
-    _PROXY.format(name="trials_saved"),
-    "count",
-    "higher",
-    prediction_powered.trials_saved,
-    "further robot trials that the same interval would need without the twin; 0 unless success is shown to be more frequent after a yes than after a no (one-sided p of 0.025); {many}",
-)
-RANDOM_STARTS_P = _new(
-    _PROXY.format(name="random_starts_p"),
-    "1",
-    "none",
-    prediction_powered.applicability,
-    "p of Boschloo's test that the twin succeeds as often on the tried starts as on the others: small forbids the estimates; {many}",
-)
-STARTS_ALIKE_P = _new(
-    _PROXY.format(name="starts_alike_p"),
-    "1",
-    "none",
-    prediction_powered.starts_alike,
-    "p of the permutation test on the energy distance that the starts with a robot trial and those only the twin has were drawn alike: small forbids the estimates{compared}",
-)
 SEQUENCE = _new(
     "sequence.recorded.{task}.{condition}.{policy}",
     "1",
     "higher",
-    sequential.sequence_of,
     "successes / trials as labelled, with a betting confidence sequence in the order in which they were recorded (of a table: its rows): it may be looked at after every one, to stop or to continue",
-)
-SEQUENCE_GAIN = _new(
-    "sequence.gain_pp.recorded",
-    "pp",
-    "higher",
-    sequential.pairs_sequence,
-    "recorded gain with replanning over paired starts, with a betting confidence sequence in the order in which pairs became complete: it may be looked at after every one",
 )
 REPLANNING_EVIDENCE = _new(
     "sequence.replanning_evidence.recorded",
     "1",
     "none",
-    sequential.capital_log,
     "what a bettor against 'replanning changes nothing' made of 1, over {improved} improved and {worsened} worsened pairs; {enough:.0f} or more: stop, it is shown at {alpha:g}, however often one looked; {most:g} stands for all that is more",
 )
 
@@ -626,7 +498,6 @@ def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
         f"{images}.{metric.named(variant)}",
         metric.unit,
         "higher" if metric.higher_is_better else "lower",
-        score_image,
         f"{metric.definition}{{protocol}}",
     )
 
@@ -639,14 +510,13 @@ VIEWS, RENDERS = (
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
 LPIPS_MISSING = _new(
-    "views.{part}.lpips", "1", "lower", score_image, "learned perceptual image patch similarity"
+    "views.{part}.lpips", "1", "lower", "learned perceptual image patch similarity"
 )
 DEPTHS = {
     name: _new(
         f"views.{{part}}.depth_{name}",
         "m",
         "lower",
-        image.score_depth,
         f"{words} depth error, {image.DEPTH_PROTOCOL}; {{after}}",
     )
     for name, words in (

@@ -1,6 +1,6 @@
 """Measurements of motions, repeated runs and final states: how far both sides are apart."""
 
-from evaluator.metrics import state, trajectory
+from evaluator.metrics import trajectory
 from evaluator.quantity import new_quantity as _new
 
 # ruff: noqa: E501  # one line for each definition
@@ -11,46 +11,26 @@ MOTIONS = {
         f"motion.{{against}}.{name}",
         unit,
         "none" if name == "lag_s" else "lower",
-        computed_by,
         f"{what}, {{meaning}}: {words}, mean over trials; aligned by {{how}}",
     )
-    for name, unit, what, words, computed_by in (
-        ("position_mean_m", "m", TOOL, "mean distance over time", trajectory.pose_errors),
-        ("position_max_m", "m", TOOL, "largest distance over time", trajectory.pose_errors),
-        ("end_point_m", "m", TOOL, "distance at the last common instant", trajectory.pose_errors),
-        ("rotation_mean_rad", "rad", TOOL, "mean angle over time", trajectory.pose_errors),
-        ("rotation_max_rad", "rad", TOOL, "largest angle over time", trajectory.pose_errors),
-        ("end_point_rad", "rad", TOOL, "angle at the last common instant", trajectory.pose_errors),
-        (
-            "lag_s",
-            "s",
-            TOOL,
-            "delay of least distance, a rigid motion apart",
-            trajectory.find_lag_s,
-        ),
-        (
-            "without_lag_mean_m",
-            "m",
-            TOOL,
-            "mean distance after that delay is taken out",
-            trajectory.position_errors,
-        ),
+    for name, unit, what, words in (
+        ("position_mean_m", "m", TOOL, "mean distance over time"),
+        ("position_max_m", "m", TOOL, "largest distance over time"),
+        ("end_point_m", "m", TOOL, "distance at the last common instant"),
+        ("rotation_mean_rad", "rad", TOOL, "mean angle over time"),
+        ("rotation_max_rad", "rad", TOOL, "largest angle over time"),
+        ("end_point_rad", "rad", TOOL, "angle at the last common instant"),
+        ("lag_s", "s", TOOL, "delay of least distance, a rigid motion apart"),
+        ("without_lag_mean_m", "m", TOOL, "mean distance after that delay is taken out"),
         (
             "without_offset_mean_m",
             "m",
             TOOL,
             "mean distance after delay and best rigid motion are taken out",
-            trajectory.without_rigid_motion,
         ),
-        (
-            "relative_mean_m",
-            "m",
-            TOOL,
-            "mean difference of what both do within one second",
-            trajectory.relative_errors,
-        ),
-        ("joint_rms_rad", "rad", "joints", "root mean square error", trajectory.joint_errors),
-        ("joint_max_rad", "rad", "joints", "largest error of any joint", trajectory.joint_errors),
+        ("relative_mean_m", "m", TOOL, "mean difference of what both do within one second"),
+        ("joint_rms_rad", "rad", "joints", "root mean square error"),
+        ("joint_max_rad", "rad", "joints", "largest error of any joint"),
     )
 }
 """By the field of ``MotionSummary`` they are the mean of."""
@@ -63,7 +43,6 @@ BODY_DISTANCES = {
         f"{_BODY}{name.removesuffix('_m')}_median_m",
         "m",
         "lower",
-        None,
         f"{{what}}: {words}, median over recorded runs; replays against the run that they were made from, other simulated runs against every recorded one",
     )
     for name, words in (
@@ -82,13 +61,12 @@ STATES = {
         _STATE.format(name=f"{name}_{kind}_{unit}"),
         unit,
         "lower",
-        computed_by,
         _STATE_WORDS.format(kind=kind),
     )
-    for name, kind, unit, computed_by in (
-        ("position", "median", "m", None),
-        ("position", "mean", "m", None),
-        ("rotation", "median", "rad", state.turn_between_rad),
-        ("extents", "median", "m", state.extents_difference_m),
+    for name, kind, unit in (
+        ("position", "median", "m"),
+        ("position", "mean", "m"),
+        ("rotation", "median", "rad"),
+        ("extents", "median", "m"),
     )
 }

@@ -1,10 +1,9 @@
 """What a measurement is made of: its id, unit, definition, and the registry of all of them."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 Better = Literal["higher", "lower", "none"]
 """Which way a value is better; ``none`` where it describes and does not judge."""
@@ -51,15 +50,9 @@ class Quantity:
     definition: str
     """With words of the single measurement in braces."""
     better: Better
-    computed_by: Callable[..., Any] | None
-    """None for plain counts."""
 
     def of(self, **words: object) -> Defined:
-        """Name one measurement.
-
-        Args:
-            words: The parts of its id, which are made fit for ids, and of its definition.
-        """
+        """Name one measurement."""
         parts = {name: slug(str(word)) for name, word in words.items() if f"{{{name}}}" in self.id}
         return Defined(
             id=self.id.format(**parts),
@@ -90,12 +83,9 @@ def new_quantity(
     id: str,  # the word everywhere
     unit: str,
     better: Better,
-    computed_by: Callable[..., Any] | None,
     definition: str,
 ) -> Quantity:
     """Register a quantity; ids and definitions may hold names of parts in braces."""
-    quantity = Quantity(
-        id=id, unit=unit, definition=definition, better=better, computed_by=computed_by
-    )
+    quantity = Quantity(id=id, unit=unit, definition=definition, better=better)
     REGISTRY.append(quantity)
     return quantity

@@ -136,11 +136,7 @@ class Results:
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def get(self, measurement_id: str) -> Measurement:
-        """Return one measurement.
-
-        Raises:
-            EvaluatorError: Listing the ids that exist.
-        """
+        """Return one measurement."""
         for measurement in self.measurements:
             if measurement.id == measurement_id:
                 return measurement
@@ -266,7 +262,6 @@ def load_results(path: Path) -> Results:
     """Read ``results.json``, or the one of a run folder.
 
     Raises:
-        PathNotFoundError: When there is none.
         InvalidRecordError: When it does not fit the schema, or is newer than this reader.
     """
     if path.is_dir():

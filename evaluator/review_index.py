@@ -385,12 +385,7 @@ def written_index(
     files: Iterable[IndexedFile],
     about: Mapping[str, Any],
 ) -> bytes:
-    """Return the bytes of an index.
-
-    Args:
-        trials: Every trial in the order of the list, with the slugs of its ``FACETS``.
-        about: Whatever else the pages show, as JSON.
-    """
+    """Return the bytes of an index."""
     with closing(sqlite3.connect(":memory:")) as db, db:
         _create(db)
         marks = ", ".join("?" * (len(_COLUMNS) + len(_FOUND_ONLY)))
@@ -479,7 +474,6 @@ class ReviewIndex:
 
         Args:
             limit: At most so many; all of them below 0.
-            offset: So many are passed over.
         """
         where, values = selection.where()
         text = f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY "
@@ -524,11 +518,7 @@ class ReviewIndex:
         return found or (None, None)
 
     def values(self, name: str) -> tuple[tuple[str, str, int], ...]:
-        """Return what a facet can be: slug, name as recorded, and number of trials.
-
-        Args:
-            name: One of ``FACETS``.
-        """
+        """Return what a facet can be: slug, name as recorded, and number of trials."""
         if name not in FACETS:
             raise KeyError(name)
         text = f"SELECT {name}_slug, min({name}), count(*) FROM trials WHERE {name} != '' GROUP BY"
@@ -558,11 +548,7 @@ class ReviewIndex:
     def failures(
         self, selection: FailureSelection, *, limit: int, offset: int = 0
     ) -> tuple[IndexedTrial, ...]:
-        """Return the trials of a selection of failures, in the order of ``severity``.
-
-        Args:
-            offset: So many are passed over.
-        """
+        """Return the trials of a selection of failures, in the order of ``severity``."""
         where, values = selection.where()
         text = f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY seq"
         with self._reading() as db:
@@ -571,11 +557,7 @@ class ReviewIndex:
             )
 
     def failure_values(self, selection: FailureSelection, name: str) -> tuple[tuple[str, int], ...]:
-        """Return what one part can be under the other filters, and how often it is.
-
-        Args:
-            name: One of ``FAILURE_PARTS``.
-        """
+        """Return what one part can be under the other filters, and how often it is."""
         where, values = selection.where(but=name)
         column = FAILURE_PARTS[name]
         text = f"SELECT {column}, count(*) FROM trials WHERE {where} GROUP BY {column}"

@@ -43,11 +43,7 @@ class Missed:
 
 
 def parse_thresholds(text: str | float) -> list[Threshold]:
-    """Read ``0.8``, ``r=0.8`` or ``r=0.8,ppv=0.9``; a bare number is the agreement of trials.
-
-    Raises:
-        UsageError: For what is not a number, or a fraction outside 0..1.
-    """
+    """Read ``0.8``, ``r=0.8`` or ``r=0.8,ppv=0.9``; a bare number is the agreement of trials."""
     return [_parse(part.strip()) for part in str(text).split(",")]
 
 
@@ -75,11 +71,7 @@ def _parse(part: str) -> Threshold:
 
 
 def missed(thresholds: Sequence[Threshold], results: Results) -> list[Missed]:
-    """Return what was not reached; an undefined number reaches nothing.
-
-    Args:
-        thresholds: The least value of each number that counts as passed.
-    """
+    """Return what was not reached; an undefined number reaches nothing."""
     by_id = {measurement.id: measurement for measurement in results.measurements}
     found = []
     for threshold in thresholds:

@@ -144,7 +144,6 @@ DROPS = "recorder/Drops"
 CLOCKS = "recorder/Clocks"
 STATUS = "recorder/Status"
 ENTRY = "recorder/Entry"
-ADVICE = "gst/Advice"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
@@ -160,7 +159,6 @@ _JSON_SCHEMAS = {
     CLOCKS: ("bridge.episode", "schemas/clocks.schema.json"),
     STATUS: ("bridge.episode", "schemas/status.schema.json"),
     ENTRY: ("bridge.episode", "schemas/entry.schema.json"),
-    ADVICE: ("bridge.episode", "schemas/advice.schema.json"),
     POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
 }
 

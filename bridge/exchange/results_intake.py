@@ -50,9 +50,6 @@ ROLLOUTS = (SIMPLER, POLARIS, LEROBOT)
 FIGURES = ("k", "n", "rate", "rate_percent")
 """A table with a column side and one of these is one of rates."""
 READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".mp4")
-STREAM_ABOVE_BYTES = 4 * 2**20
-"""A larger trials CSV is read row by row and only counted: about 50,000 trials, whose single rows
-take some 200 MB."""
 MOST_FILES = 20_000
 """Files of a folder that are looked at."""
 
@@ -80,11 +77,6 @@ class Left:
 
     path: Path
     reason: str
-
-
-def is_large(path: Path) -> bool:
-    """Whether a table is streamed: its rows are counted and not kept."""
-    return path.is_file() and path.stat().st_size > STREAM_ABOVE_BYTES
 
 
 def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
@@ -214,8 +206,6 @@ def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[T
             left.append(Left(path=path, reason="no table, JSON or named video"))
         elif path.suffix.lower() == ".mp4":
             left.append(Left(path=path, reason="a video whose name tells no outcome"))
-        elif is_large(path):
-            left.append(Left(path=path, reason="too large beside others: evaluate it alone"))
         else:
             _try(path, partial(take, path, options), taken, left)
     return _tell_apart(taken, folder), left

@@ -107,7 +107,7 @@ def against_tables(
         "McNemar's mid-p test. The others: 95 % percentiles of trials drawn anew with both "
         f"answers, inside their groups; an interval that holds 0 shows no difference.{left}",
     )
-    return (table, *_flips(shared, (first, second)), *settings_table(trials, (first, second)))
+    return (table, *_flips(shared, (first, second)), *_settings_table(trials, (first, second)))
 
 
 def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str, Cell]]:
@@ -241,7 +241,7 @@ def _word(answer: bool | None) -> str | None:
     return None if answer is None else ("success" if answer else "failure")
 
 
-def settings_table(
+def _settings_table(
     trials: tuple[Sequence[Trial], Sequence[Trial]], names: tuple[str, str]
 ) -> tuple[Table, ...]:
     """List the settings in which the replays of both differ; nothing where none does."""

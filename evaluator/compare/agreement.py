@@ -129,11 +129,7 @@ class GroupIntervals:
         )
 
     def again(self) -> Remeasured:
-        """Draw the trials of every group anew.
-
-        Raises:
-            UndefinedStatisticError: When the number of trials of a group is not known.
-        """
+        """Draw the trials of every group anew."""
         rng = np.random.default_rng(SEED)
         tables = [group.trial_table for group in self._groups if group.trial_table is not None]
         if self._groups and len(tables) == len(self._groups):
@@ -297,11 +293,7 @@ def measure_over(
     value: Statistic,
     **parts: str,
 ) -> Measurement:
-    """Measure one statistic with its interval.
-
-    Args:
-        quantity: Percentage points or 1.
-    """
+    """Measure one statistic with its interval."""
     factor = 100.0 if quantity.unit == "pp" else 1.0
     found = intervals.of(statistic)
     model = intervals.model(statistic)

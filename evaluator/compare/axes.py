@@ -24,12 +24,7 @@ MOST_VALUES = 40
 def axis_tables(
     rows: Sequence[TrialRow], word: str, *, method: str = "wilson"
 ) -> tuple[Table, ...]:
-    """Lay out, for every value of every axis, how sim and outcome agree; none without tags.
-
-    Args:
-        word: What the recorded side is called: stand-in, real or recorded.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-    """
+    """Lay out, for every value of every axis, how sim and outcome agree; none without tags."""
     found: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:
         for axis, value in row.tags:
@@ -103,7 +98,6 @@ def progress_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
 
     Args:
         rows: Trials, with scores from 0 to 1 where there are any.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     scored = [r for r in rows if r.progress is not None or r.sim_progress is not None]
     lines = [(*key, *_progress_line(members)) for key, members in group_rows(scored).items()]

@@ -57,9 +57,6 @@ def apply_rule(
     Args:
         localised: Its localisation by the twin; the cell's own records count without it.
         task: Shapes and predicates; the one the episode names without it.
-
-    Raises:
-        EpisodeError: When a file turns out to be damaged.
     """
     task = recorded_task(recorded) if task is None else task
     plan = _plan(recorded, plan_id)
@@ -206,13 +203,12 @@ def _discordant(
     rows: Sequence[TrialRow], answer_of: Answer, forecast: Answer
 ) -> tuple[int, int, int]:
     """Trials that only the twin got right, that only the forecast got right, and all."""
-    better = worse = n = 0
+    better = worse = 0
     for row in rows:
         twin, other = answer_of(row) == row.recorded, forecast(row) == row.recorded
-        better += row.count * (twin and not other)
-        worse += row.count * (other and not twin)
-        n += row.count
-    return better, worse, n
+        better += twin and not other
+        worse += other and not twin
+    return better, worse, len(rows)
 
 
 def _shares(counts: Confusion) -> tuple[Cell, ...]:

@@ -22,8 +22,8 @@ from evaluator.compare.gate import agreement, gate_scorecard, reliability
 from evaluator.compare.measure import refuse_alike
 from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
-from evaluator.compare.prediction_powered import assisted_rates, sequences, stopping_table
-from evaluator.compare.rows import Comparison, RateGroup, TrialRow, is_streamed
+from evaluator.compare.rows import Comparison, RateGroup, TrialRow
+from evaluator.compare.sequences import sequences, stopping_table
 from evaluator.compare.stages import divergence_table, failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -71,20 +71,12 @@ def compare_rows(
     goal: float | None = None,
     void_causes: Sequence[str] = VOID_CAUSES,
 ) -> Comparison:
-    """Measure everything that follows from trial rows alone, wherever they came from.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        void_causes: How outcomes of a study begin that make a start void in all arms.
-
-    Raises:
-        AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
-    """
+    """Measure everything that follows from trial rows alone, wherever they came from."""
     empty = Comparison(run=run, source=source, stand_in=stand_in)
     if not rows:
         return empty
     for kind in ("task", "condition", "policy"):
-        refuse_alike(kind, ((getattr(row, kind), row.episode or "streamed") for row in rows))
+        refuse_alike(kind, ((getattr(row, kind), row.episode) for row in rows))
     found = _measure(rows, method, void_causes)
     return replace(
         empty,
@@ -127,7 +119,6 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *stages,
         *decisions(groups),
         *model_results(usable_groups(groups)),
-        *assisted_rates(rows),
         *sequences(rows, pairs),
     )
     return _Found(
@@ -162,7 +153,7 @@ def _tables(
         *axis_tables(rows, word),
         *progress_table(rows, word),
         *stopping_table(rows, goal),
-        *(() if is_streamed(rows) else (trials_table(rows, word),)),
+        trials_table(rows, word),
     )
 
 
@@ -174,16 +165,8 @@ NO_DATA = (
         "no planned replay has varied ones; robot-gst replay RUN --samples 16 makes them",
     ),
     ("stage.", "stage funnel", "no trial has labelled stages or counts sub-tasks"),
-    (
-        "proxy.",
-        "recorded rate with the twin's help",
-        "every start in the twin has its robot trial, or none has",
-    ),
 )
 """Parts of the evaluation whose input a run may not have."""
-
-
-STREAMED = "a streamed table keeps no single trials"
 
 
 def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> list[str]:
@@ -208,9 +191,8 @@ def _missing(rows: Sequence[TrialRow], measurements: Sequence[Measurement]) -> l
         without = trials_in(row for row in asked if getattr(row, side) is None)
         if without:
             found.append(f"{side}: {without} of {trials_in(rows)} trials have no {words[2:]}")
-    streamed = is_streamed(rows)
     found += [
-        f"{words}: no data ({STREAMED if streamed else why})"
+        f"{words}: no data ({why})"
         for start, words, why in NO_DATA
         if not any(m.id.startswith(start) for m in measurements)
     ]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evaluator.compare.measure import measured
-from evaluator.compare.rows import RateGroup, TrialRow, is_streamed
+from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import WITH, WITHOUT
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
@@ -59,9 +59,6 @@ class StartPair:
 
 def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusion]]:
     """Pair trials on task, policy and start_id; what cannot be paired is listed."""
-    if is_streamed(rows):
-        reason = "a streamed table: starts are not paired; give the paired trials as a table apart"
-        return [], [Exclusion(episode="all", scope="pairing of conditions", reason=reason)]
     conditions = {row.condition for row in rows}
     if not {WITHOUT, WITH} <= conditions:
         return [], []
@@ -290,7 +287,6 @@ def replanning_gains(groups: Sequence[RateGroup], *, method: str = "wilson") -> 
 
     Args:
         groups: Groups of both conditions; a gain needs one of each.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     pairs = changes(groups)
     measurements = [m for change in pairs for m in _gain(change, method)]

@@ -48,7 +48,6 @@ def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measu
 
     Args:
         rows: Trials; those without an answer or an outcome do not count.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     measurements = []
     for name, answer_of, words in (
@@ -84,8 +83,8 @@ def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
     Args:
         answer_of: Reads what the twin said of a trial; None where it said nothing.
     """
-    return Confusion.weigh(
-        (answer, row.recorded, row.count)
+    return Confusion.count(
+        (answer, row.recorded)
         for row in rows
         if (answer := answer_of(row)) is not None and row.recorded is not None
     )
@@ -172,7 +171,7 @@ def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
     seen = [
         (row.episode, row.p_success, row.recorded)
         for row in rows
-        if row.p_success is not None and row.recorded is not None and row.count == 1
+        if row.p_success is not None and row.recorded is not None
     ]
     if not seen:
         return []

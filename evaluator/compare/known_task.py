@@ -19,11 +19,7 @@ def known_task(name: str) -> Task | None:
 
 
 def recorded_task(episode: Episode) -> Task | None:
-    """Load the task an episode was recorded with; None where its file is nowhere.
-
-    Raises:
-        GstError: When the file is damaged, or no task.
-    """
+    """Load the task an episode was recorded with; None where its file is nowhere."""
     try:
         return streams.task_file(episode).task()
     except MissingTaskError:

@@ -56,9 +56,6 @@ def perceive_outcome(
 
     Args:
         task: With the success predicate; the one the episode names without it.
-
-    Raises:
-        EpisodeError: When a file turns out to be damaged.
     """
     info = recorded.info
     task = recorded_task(recorded) if task is None else task

@@ -79,14 +79,7 @@ Statistic = Callable[[], float | tuple[float, Interval | None]]
 
 
 def refuse_alike(kind: str, named: Iterable[tuple[str, str]]) -> None:
-    """Refuse two names that would share an id: the number of one would stand for both.
-
-    Args:
-        named: Each name with where it stands: an episode, or a row of a table.
-
-    Raises:
-        AlikeNamesError: Naming both, and where they first stand.
-    """
+    """Refuse two names that would share an id: the number of one would stand for both."""
     places: dict[str, str] = {}
     for name, where in named:
         places.setdefault(name, where)
@@ -129,7 +122,6 @@ def measured(
         compute: Gives the value, or the value with its interval; refuses by
             ``UndefinedStatisticError``.
         n: How many were counted; None where nothing is counted.
-        counted: What was counted, in the singular: trial, pair, run.
         reason_without_interval: Said where there is no interval.
         interval_n: What the coverage of the interval depends on, where it is not ``n``.
         coverage_key: Name in ``coverage.HOLDS_FROM``, where one method serves several statistics.
@@ -172,13 +164,7 @@ def proportion(
     episodes: Iterable[str] = (),
     method: str = "wilson",
 ) -> Measurement:
-    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0.
-
-    Args:
-        counted: What was counted, in the singular: trial, pair.
-        reason_if_undefined: Said where n is 0.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-    """
+    """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
     interval, refusal = vouched_rate(k, n, method) if n else (None, "")
     return Measurement(
         **vars(defined),
@@ -198,6 +184,5 @@ def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
 
     Args:
         n: Trials, 1 or more.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     return vouch(RATE_INTERVALS[method](k, n), n)

@@ -48,11 +48,7 @@ def shared_by(groups: Sequence[RateGroup]) -> list[str]:
 
 
 def counts_of(groups: Sequence[RateGroup]) -> tuple[GroupCounts, ...]:
-    """Return what was counted in each group, paired trials apart from those without a partner.
-
-    Raises:
-        UndefinedStatisticError: When the number of trials of a group is not known.
-    """
+    """Return what was counted in each group, paired trials apart from those without a partner."""
     found = []
     for group, shared in zip(groups, shared_by(groups), strict=True):
         sides = []

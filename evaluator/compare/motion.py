@@ -94,12 +94,6 @@ def summarise_motions(
     """Compare a recorded execution with its replays, and these with each other; each read once.
 
     What has no tool poses in common with another one is left out.
-
-    Args:
-        replays: Its dynamic replays, ``planned`` and ``executed``, as far as there are any.
-
-    Raises:
-        EpisodeError: When a file turns out to be damaged.
     """
     tracks = {side: read_tracks(episode, plan_id) for side, episode in replays.items()}
     own = read_tracks(recorded, plan_id)
@@ -122,11 +116,7 @@ def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
     """Compare two motions on one clock, or over normalised time where there is none.
 
     Args:
-        mine: The motion that is cut to its execution and gives the instants of comparison.
         other: The motion held against it; shifted to the same start where its clock is another one.
-
-    Raises:
-        UndefinedStatisticError: When they have no tool poses in common.
     """
     mine = mine.cut()
     if mine.tool is None or other.tool is None:

@@ -33,7 +33,7 @@ def reliability_points(rows: Sequence[TrialRow]) -> list[ReliabilityPoint]:
     seen = [
         (row.p_success, row.recorded)
         for row in rows
-        if row.p_success is not None and row.recorded is not None and row.count == 1
+        if row.p_success is not None and row.recorded is not None
     ]
     if not seen:
         return []

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from bridge.episode.metadata import treatment_of
 from bridge.task.protocol import FILE_NAME, Endpoint, Protocol
 from evaluator.compare.measure import Part, ends, measured, vouched_rate
-from evaluator.compare.rows import TrialRow, in_order, is_streamed
+from evaluator.compare.rows import TrialRow, in_order
 from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.errors import UndefinedStatisticError
@@ -40,7 +40,7 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
     Args:
         protocol: Its protocol; rows stay as they are without a design.
     """
-    if protocol is None or protocol.primary is None or is_streamed(rows):
+    if protocol is None or protocol.primary is None:
         return list(rows)
     arms = {code: name.rpartition(", ")[::2] for name, code in protocol.codes.items()}
     policies = {each.policy for each in protocol.policies}
@@ -68,12 +68,8 @@ def protocol_results(
     left_out: Sequence[Exclusion] = (),
     task_hashes: Mapping[str, frozenset[str]] | None = None,
 ) -> Part:
-    """Compare a study with its design, and answer the design's questions; nothing without one.
-
-    Args:
-        task_hashes: Hashes of the task files that the episodes were recorded with, by task.
-    """
-    if protocol is None or protocol.primary is None or is_streamed(rows):
+    """Compare a study with its design, and answer the design's questions; nothing without one."""
+    if protocol is None or protocol.primary is None:
         return Part()
     mine = [row for row in rows if row.study_arm]
     found = [

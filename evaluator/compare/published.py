@@ -103,9 +103,6 @@ def check_published(
 ) -> PublishedCheck:
     """Recompute every printed figure of a table.
 
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-
     Raises:
         TableError: Naming the row that cannot be read at all, or that is there twice.
     """

@@ -23,15 +23,7 @@ from evaluator.result import Exclusion, Measurement
 def compare_records(
     records: Sequence[RateRecord], path: Path, *, method: str = "wilson"
 ) -> Comparison:
-    """Compare rates that were read already; ``path`` is where they come from.
-
-    Args:
-        path: The file they come from, for the name of the run and the hash.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-
-    Raises:
-        AlikeNamesError: When ids cannot tell two tasks, conditions or policies apart.
-    """
+    """Compare rates that were read already; ``path`` is where they come from."""
     for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(r, kind), f"row {r.row}") for r in records))
     sides = {record.side for record in records}

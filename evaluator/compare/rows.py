@@ -103,8 +103,6 @@ class TrialRow:
     sim_progress: float | None = None
     tags: tuple[tuple[str, str], ...] = ()
     """What was varied, by axis: lighting, pose, distractor, start region."""
-    count: int = 1
-    """Trials this row stands for; above 1 only in a streamed table, where ``episode`` is empty."""
     began_ns: int = 0
     """When its recording began; 0 where nobody knows, as in a table, whose rows are in order."""
     path: Path | None = None
@@ -120,11 +118,6 @@ class TrialRow:
     def recorded_word(self) -> str:
         """``stand-in``, ``real`` or ``recorded``: what the recorded side of this row is."""
         return RECORDED_WORDS[self.stand_in]
-
-
-def is_streamed(rows: Iterable[TrialRow]) -> bool:
-    """Whether rows come from a streamed table: one for equal trials, which are not told apart."""
-    return any(not row.episode for row in rows)
 
 
 def in_order(rows: Sequence[TrialRow]) -> list[TrialRow]:

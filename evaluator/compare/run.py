@@ -54,12 +54,7 @@ def compare_run(
     A broken episode is left out and named; a missing part is listed, never guessed.
 
     Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        images: Backbones of LPIPS, and other methods to compare with the views of the run.
         cache: What earlier evaluations read; without one every file is read.
-
-    Raises:
-        PathNotFoundError: When the run folder is not there.
     """
     cache = SummaryCache(None) if cache is None else cache
     read = read_run(RunFolder.open(run.path), cache, output)
@@ -172,7 +167,6 @@ def compare_read(
 
     Args:
         reads: The runs; an episode has another id in each.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     rows = [row for read in reads for row in read.rows]
     rows += more_rows

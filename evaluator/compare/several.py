@@ -9,7 +9,7 @@ from pathlib import Path
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.exchange.results_intake import PUBLISHED, Left, Taken, is_large, look_through, take
+from bridge.exchange.results_intake import PUBLISHED, Left, Taken, look_through, take
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
@@ -63,13 +63,6 @@ def compare_several(
     Groups are task x condition x policy over all of them. An episode or trial id that two sources
     have is told apart by the source's name; a file that is there twice counts once. Starts of one
     id are one start, wherever they were tried.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: The success rate that is asked about, 0 to 1; None asks nothing.
-
-    Raises:
-        UsageError: When a source is given twice, or nothing can be read.
     """
     refuse_twice(sources)
     with ExitStack() as caches:
@@ -98,10 +91,6 @@ def with_against(
 
     Args:
         source: Where it is from; settings of replays are read there.
-
-    Raises:
-        UsageError: When both are the same, or the other is nothing that can be read.
-        EvaluatorError: When they share no trial.
     """
     refuse_twice([source, other])
     mine, theirs = (answers_of(path, options, output) for path in (source, other))
@@ -127,11 +116,7 @@ def answers_of(
 
 
 def refuse_twice(sources: Sequence[Path]) -> None:
-    """Refuse a source that is given twice: its trials would count double.
-
-    Raises:
-        UsageError: Naming it.
-    """
+    """Refuse a source that is given twice: its trials would count double."""
     seen: set[Path] = set()
     for source in sources:
         if source.resolve() in seen:
@@ -162,9 +147,6 @@ def _gather(
             taken, left = look_through(source, options)
             gathered.taken += taken
             gathered.left += left
-        elif is_large(source):
-            message = f"{source} is too large beside others: evaluate it alone."
-            raise UsageError(message)
         else:
             gathered.taken.append(take(source, options))
     kept = _without_copies(gathered)

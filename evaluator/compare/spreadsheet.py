@@ -6,23 +6,16 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
-from bridge.exchange.results_intake import (
-    PUBLISHED,
-    STREAM_ABOVE_BYTES,
-    Taken,
-    is_large,
-    take,
-)
+from bridge.exchange.results_intake import PUBLISHED, Taken, take
 from bridge.exchange.table_text import AS_SAVED, TableOptions
-from bridge.exchange.trials_csv import TrialRecord, open_trials, read_trials, trials_path
-from bridge.exchange.trials_stream import count_trials
+from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.names import settle_names
 from evaluator.compare.notes import with_notes
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
-from evaluator.compare.success import trials_in, unpaired_keys
+from evaluator.compare.success import unpaired_keys
 from evaluator.result import Exclusion
 
 
@@ -90,18 +83,10 @@ def compare_csv(
     ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, a JSON list of trials or rates,
     and a folder of SIMPLER videos.
 
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: The success rate that is asked about, 0 to 1; None asks nothing.
-
     Raises:
         TableError: Naming the row that contradicts itself.
-        UsageError: When it is none of these.
     """
-    if not path.is_dir() and path.suffix.lower() != ".json" and is_large(path):
-        found = _compare_streamed(path, method, options)
-    else:
-        found = compare_taken(take(path, options), method=method, goal=goal, options=options)
+    found = compare_taken(take(path, options), method=method, goal=goal, options=options)
     if goal is None or any(table.id == "stopping" and table.rows for table in found.tables):
         return found
     missing = "stop or continue: --goal needs recorded outcomes of single trials, one after another"
@@ -115,13 +100,7 @@ def compare_taken(
     goal: float | None = None,
     options: TableOptions = AS_SAVED,
 ) -> Comparison:
-    """Compare what one file or folder holds.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: The success rate that is asked about, 0 to 1; None asks nothing.
-        options: What becomes of names that differ only by case.
-    """
+    """Compare what one file or folder holds."""
     path, read_as = taken.path, [taken.summary]
     if taken.kind == PUBLISHED:
         return check_published(path, method=method, options=options).comparison
@@ -148,48 +127,6 @@ def rollout_note(taken: Taken) -> tuple[str, str]:
         "compare"
     )
     return taken.kind, note
-
-
-def compare_trials(
-    path: Path,
-    *,
-    method: str = "wilson",
-    goal: float | None = None,
-    stream_above: int = STREAM_ABOVE_BYTES,
-    options: TableOptions = AS_SAVED,
-) -> Comparison:
-    """Compare a trials CSV as if it were a run.
-
-    A large one is streamed: its rows are counted by their answers, in constant memory; what needs
-    single trials (pairs of starts, success probabilities, the list of trials) is left out by name.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-        goal: The success rate that is asked about, 0 to 1; None asks nothing, and so does a
-            streamed table.
-        stream_above: Size of the file from which it is streamed [bytes].
-    """
-    if path.stat().st_size > stream_above:
-        return _compare_streamed(path, method, options)
-    return compare_taken(take(path, options), method=method, goal=goal, options=options)
-
-
-def _compare_streamed(path: Path, method: str, options: TableOptions) -> Comparison:
-    counted = count_trials(path, options)
-    each = [replace(row_from_record(record), episode="", count=count) for record, count in counted]
-    rows, merged = settle_names(each, options.names)
-    stand_in = stand_in_of(record.stand_in for record, _ in counted)
-    base = compare_rows(rows, run=path.stem, source="trials", stand_in=stand_in, method=method)
-    left_out = [
-        Exclusion(episode=f"{trials_in(lacking)} trials", scope="agreement", reason=reason)
-        for reason, lacking in (
-            ("the outcome is unknown", [row for row in rows if row.recorded is None]),
-            ("sim_planned is unknown", [row for row in rows if row.sim_planned is None]),
-        )
-        if lacking
-    ]
-    summary = open_trials(path, options).understood("trials", sum(count for _, count in counted))
-    return replace(_with_source(base, path, left_out, [summary, *merged]), rows=())
 
 
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:

@@ -39,7 +39,7 @@ def stage_results(
     groups: dict[tuple[str, str], list[Trial]] = {}
     for row in rows:
         stages = stages_of(row)
-        if stages and row.count == 1:
+        if stages:
             groups.setdefault((row.task, row.condition), []).append((row, stages))
     measurements: list[Measurement] = []
     left_out: list[Exclusion] = []
@@ -100,15 +100,14 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
 
     Args:
         rows: Trials; only failures count.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     twin = failure_taxonomy(
-        (row.first_failing or "unknown", row.failing_cause or "", row.count)
+        (row.first_failing or "unknown", row.failing_cause or "")
         for row in rows
         if row.sim_planned is False
     )
     recorded = failure_taxonomy(
-        (first_failed_stage(row), "", row.count) for row in rows if row.recorded is False
+        (first_failed_stage(row), "") for row in rows if row.recorded is False
     )
     lines = [("sim planned", kind.clause, kind.cause, kind.count) for kind in twin]
     lines += [(word, kind.clause, kind.cause, kind.count) for kind in recorded]
@@ -138,7 +137,7 @@ def divergence_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
             step = diverged.stage or "outside the steps"
             key = diverged.attribution, diverged.quantity, diverged.body, diverged.between
             where = (row.task, step, *key)
-            counts[where] += row.count
+            counts[where] += 1
     if not counts:
         return ()
     lines = sorted(counts.items(), key=lambda item: (item[0][0], -item[1], item[0]))

@@ -87,12 +87,8 @@ def summarise_states(
     recording. Nothing is found when the plan predicts no object.
 
     Args:
-        replays: Its dynamic replays, ``planned`` and ``executed``, as far as there are any.
         localised: Its localisation by the twin; the cell's own records count without it.
         task: Says which objects are soft or symmetric; the one the episode names without it.
-
-    Raises:
-        EpisodeError: When a file turns out to be damaged.
     """
     sent = read_sent(recorded, plan_id)
     if sent is None:
@@ -179,12 +175,7 @@ def _defined(key: Group, name: str, kind: str, **words: object) -> Defined:
 
 
 def final_table(keys: Sequence[Group], by_id: dict[str, Measurement]) -> Table:
-    """Medians of each group.
-
-    Args:
-        keys: Groups in the order of the rows: who predicts, against what, task, condition.
-        by_id: Measurements of these groups, by their ids.
-    """
+    """Medians of each group."""
     rows = []
     for key in keys:
         position = by_id[_defined(key, "position", "median").id]

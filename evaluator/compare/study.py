@@ -13,7 +13,7 @@ from functools import partial
 from bridge.episode.metadata import RETRY, EpisodeInfo, Outcome, treatment_of
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.measure import ends, measured, proportion
-from evaluator.compare.rows import TrialRow, is_streamed
+from evaluator.compare.rows import TrialRow
 from evaluator.measurements import Defined
 from evaluator.result import Cell, Exclusion, Measurement, Table
 from evaluator.statistics.differences import mcnemar, tango_points
@@ -59,8 +59,6 @@ def study_starts(
     Args:
         rows: Trials; those outside a study are passed over.
     """
-    if is_streamed(rows):
-        return [], []
     mine = [row for row in rows if row.study_arm]
     gathered: dict[tuple[str, str, str], list[TrialRow]] = {}
     for row in mine:
@@ -105,9 +103,6 @@ def study_results(
     method: str = "wilson",
 ) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
     """Measure the gain of *with* over the other arms: pooled test, and each task's interval.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
 
     Returns:
         Measurements ``study.*``, the table of the arms and that of the gains, and what was left

@@ -61,8 +61,8 @@ def unpaired_keys(rows: Iterable[TrialRow]) -> set[Key]:
 
 
 def trials_in(rows: Iterable[TrialRow]) -> int:
-    """Count trials; a row of a streamed table stands for several."""
-    return sum(row.count for row in rows)
+    """Count trials."""
+    return sum(1 for _ in rows)
 
 
 def names_of(rows: Iterable[TrialRow]) -> list[str]:
@@ -82,7 +82,6 @@ def answered(
 
     Args:
         answer: Reads yes, no, or None for unknown from a trial.
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
     """
     known = [row for row in rows if answer(row) is not None]
     return proportion(
@@ -97,11 +96,7 @@ def answered(
 
 
 def side_rates(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure every side of every group, counted in trials; object counts beside them.
-
-    Args:
-        method: Interval of rates: wilson, clopper-pearson or jeffreys.
-    """
+    """Measure every side of every group, counted in trials; object counts beside them."""
     measurements = []
     for key, members in group_rows(rows).items():
         for side, answer in SIDES.items():
@@ -136,8 +131,8 @@ def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Me
     return [
         proportion(
             of_group(RATE_BY_UNIT, key, unit=unit),
-            0 if mixed else sum((row.k or 0) * row.count for row in counted),
-            0 if mixed else sum((row.n or 0) * row.count for row in counted),
+            0 if mixed else sum(row.k or 0 for row in counted),
+            0 if mixed else sum(row.n or 0 for row in counted),
             counted=unit,
             reason_if_undefined=f"trials are counted in different units: {firsts}",
             episodes=names_of(counted),
@@ -234,7 +229,7 @@ def trial_table(
     table = [0, 0, 0, 0]
     for row, yes in zip(both, answers, strict=True):
         place = (0 if row.recorded else 1) if yes else (2 if row.recorded else 3)
-        table[place] += row.count
+        table[place] += 1
     return table[0], table[1], table[2], table[3]
 
 
@@ -243,7 +238,6 @@ def averages(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Mea
 
     Args:
         groups: Groups of any condition; a condition with fewer than two has no average.
-        method: Interval of the pooled rate: wilson, clopper-pearson or jeffreys.
     """
     measurements = []
     for condition in dict.fromkeys(group.condition for group in groups):

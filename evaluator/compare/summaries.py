@@ -116,7 +116,6 @@ def sum_up(
 
     Args:
         trials: Trials laid beside their replays; without a plan sent one is passed over.
-        cache: What was made before, under the hashes of the files.
         pool: Compares several trials at once; one after the other without.
     """
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}

@@ -57,11 +57,7 @@ def _brackets(shown: Sequence[Measurement]) -> str:
 
 
 def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "") -> Table:
-    """Success without and with replanning, in the twin and recorded.
-
-    Args:
-        word: What the recorded side is called: stand-in, real or recorded.
-    """
+    """Success without and with replanning, in the twin and recorded."""
     paired = any(group.trial_table is not None for group in groups)
     one_sided = any(group.sim.n for group in groups) and not paired
     without_plans = all(group.executed is not None for group in groups)
@@ -109,11 +105,7 @@ def _gap(group: RateGroup) -> float | None:
 
 
 def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
-    """The replanning gain: percentage points and relative gain are two columns; none without.
-
-    Args:
-        word: What the recorded side is called: stand-in, real or recorded.
-    """
+    """The replanning gain: percentage points and relative gain are two columns; none without."""
     if not gains:
         return ()
     by_id = {gain.id: gain for gain in gains}
@@ -161,7 +153,6 @@ def layout_table(
 
     Args:
         groups: Success rates per task, condition and policy; one condition alone makes no table.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
@@ -201,12 +192,7 @@ def layout_table(
 
 
 def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
-    """One line per trial.
-
-    Args:
-        rows: Trials, in the order of the lines.
-        word: What the recorded side is called: stand-in, real or recorded.
-    """
+    """One line per trial."""
     return Table(
         id="trials",
         title="Trials",
@@ -245,11 +231,7 @@ def trials_table(rows: Sequence[TrialRow], word: str) -> Table:
 
 
 def confusion_table(rows: Sequence[TrialRow], word: str) -> Table:
-    """What the twin said against what happened, counted over trials.
-
-    Args:
-        word: What the recorded side is called: stand-in, real or recorded.
-    """
+    """What the twin said against what happened, counted over trials."""
     lines: list[dict[str, Cell]] = []
     for name, answer_of in (
         ("sim planned", lambda row: row.sim_planned),

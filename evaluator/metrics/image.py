@@ -35,12 +35,7 @@ def refuse_swapped(
     Grey images cannot tell, and are let through.
 
     Args:
-        recorded: Recorded image, red first, 0 to 1.
         replayed: The image held against it, in the same order and range.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        SwappedColourError: With both numbers.
     """
     check_same_shape(recorded, replayed)
     as_it_is = float(np.square(recorded - replayed).mean())
@@ -72,12 +67,7 @@ def score_depth(
     recorded_m: Float[np.ndarray, "height width"],
     rendered_m: Float[np.ndarray, "rendered_height rendered_width"],
 ) -> DepthScore:
-    """Compare two depth images [m]; 0 is "no measurement".
-
-    Raises:
-        ImageShapeError: When the sizes differ.
-        UndefinedStatisticError: When no pixel has both.
-    """
+    """Compare two depth images [m]; 0 is "no measurement"."""
     if recorded_m.shape != rendered_m.shape:
         raise ImageShapeError(
             found=f"the recorded depth is {recorded_m.shape}, the rendered one {rendered_m.shape}"

@@ -105,9 +105,6 @@ def common_text(stamps: Sequence[Stamp]) -> str:
     """Write what several stamps share once, and behind it what is each metric's own.
 
     Which code computed a value is left to the table of full stamps.
-
-    Raises:
-        ValueError: Without a stamp.
     """
     if not stamps:
         message = "a row of image numbers needs at least one protocol stamp"
@@ -152,8 +149,6 @@ class ImageOptions:
     """METHOD=FOLDER of renders named as the reference; once for each method to compare."""
     reference: Path | None = None
     """Folder of recorded images; the recorded side of the run's held-out views without it."""
-    masks: Annotated[Path | None, RARE] = None
-    """Folder of masks named as the reference, white inside; all is scored under them too."""
     split: Annotated[str, RARE] = UNSTATED
     """Which images were held out, for the stamp: "every 8th frame". A run says so itself."""
     lpips_vgg: Annotated[Path | None, RARE] = None
@@ -179,18 +174,14 @@ class ImageOptions:
         """Refuse settings that nothing would be compared with.
 
         Raises:
-            UsageError: When there is a reference, a mask or a split without any renders.
+            UsageError: When there is a reference or a split without any renders.
         """
-        if not self.renders and (self.reference or self.masks or self.split != UNSTATED):
-            message = "--reference, --masks and --split belong to --renders METHOD=FOLDER."
+        if not self.renders and (self.reference or self.split != UNSTATED):
+            message = "--reference and --split belong to --renders METHOD=FOLDER."
             raise UsageError(message)
 
     def methods(self) -> dict[str, Path]:
-        """Return the folders of renders by method; a folder alone is named after itself.
-
-        Raises:
-            UsageError: For a name twice, or none.
-        """
+        """Return the folders of renders by method; a folder alone is named after itself."""
         found: dict[str, Path] = {}
         for text in self.renders:
             name, equals, folder = text.partition("=")

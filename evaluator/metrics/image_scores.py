@@ -103,10 +103,6 @@ def score_image(
         mask: What to look at; the whole frame without one.
         mode: What the mask does; metrics of whole images are undefined over single pixels.
         alignment: Brightening before the comparison; whole images decide it, whatever the mask.
-        nets: For LPIPS; none leaves it out.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
     """
     replayed = aligned(recorded_u8, replayed_u8, alignment)
     recorded = as_float(recorded_u8)

@@ -27,11 +27,7 @@ MIN_SIDE_PX = 32
 
 
 def metric_id(net: NetName, given: InputName) -> str:
-    """Return the id of LPIPS with one backbone and one input range.
-
-    Args:
-        given: The range in which it is fed with images: ``01`` or ``pm1``, see ``INPUTS``.
-    """
+    """Return the id of LPIPS with one backbone and one input range."""
     return f"lpips_{net}_{given}"
 
 
@@ -77,11 +73,7 @@ class PerceptualNet(Protocol):
         recorded: Float[np.ndarray, "height width 3"],
         replayed: Float[np.ndarray, "height width 3"],
     ) -> Distances:
-        """Return a distance, or the reason against one, by metric id.
-
-        Args:
-            recorded: Recorded image in RGB, 0 to 1.
-        """
+        """Return a distance, or the reason against one, by metric id."""
 
 
 def net_of(metric: ImageMetric, nets: Sequence[PerceptualNet]) -> PerceptualNet | None:

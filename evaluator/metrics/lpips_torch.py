@@ -93,10 +93,6 @@ class LpipsWeightsError(UsageError):
 def read_backbone(net: NetName, path: Path) -> tuple[list[Convolution], str]:
     """Read the convolutions of a backbone; its other weights are not looked at.
 
-    Args:
-        net: Which network it must be.
-        path: A state dict as torchvision names it, ``features.0.weight`` and so on.
-
     Returns:
         Weight and bias of each layer as float32, and the SHA-256 of the file.
 
@@ -126,10 +122,6 @@ def read_heads(net: NetName) -> tuple[list[Float[Tensor, "_channels 1 1"]], str]
 
     Returns:
         One weight for each channel of each tap, and where they came from, in words.
-
-    Raises:
-        MissingDependencyError: When no installed package holds them.
-        LpipsWeightsError: When the file holds something else.
     """
     for package, folder in HEADS:
         spec = find_spec(package)
@@ -249,12 +241,7 @@ class LpipsNet:
 
     @classmethod
     def open(cls, name: NetName, path: Path) -> "LpipsNet":
-        """Load a backbone from a file, and the heads from an installed wheel.
-
-        Raises:
-            LpipsWeightsError: When one of them is not what it should be.
-            MissingDependencyError: When no installed package holds the heads.
-        """
+        """Load a backbone from a file, and the heads from an installed wheel."""
         backbone, sha256 = read_backbone(name, path)
         heads, origin = read_heads(name)
         return cls(name, backbone, heads, describe_weights(name, sha256, origin))
@@ -267,9 +254,6 @@ class LpipsNet:
         """Return both distances of a pair in 0..1, or why there is none.
 
         Range: 0 and up, 0 is identical, lower is better.
-
-        Args:
-            recorded: Recorded image in RGB, 0 to 1.
         """
         ids = {given: metric_id(self.name, given) for given in INPUTS}
         if min(recorded.shape[:2]) < MIN_SIDE_PX:

@@ -38,9 +38,6 @@ def find_lag_s(
     Args:
         stamps_ns: Instants on the common clock.
         replayed: The same motion; held at its ends where it is shorter.
-
-    Raises:
-        UndefinedStatisticError: When it is undefined.
     """
     choice = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MAX_INSTANTS)).round()
     ids = np.unique(choice.astype(np.int64))
@@ -138,9 +135,6 @@ def joint_errors(recorded: JointTrack, replayed: JointTrack) -> JointErrors:
         recorded: Recorded joint positions [rad] over time.
         replayed: Those of the replay, on the same clock; joints that only one side names are left
             out.
-
-    Raises:
-        UndefinedStatisticError: When the two share no joint, or no instant.
     """
     names = tuple(name for name in recorded.names if name in replayed.names)
     if not names:
@@ -217,9 +211,6 @@ def pose_errors(recorded: PoseTrajectory, replayed: PoseTrajectory) -> PoseError
 
     Args:
         replayed: Those of the replay, in the same frame and on the same clock.
-
-    Raises:
-        UndefinedStatisticError: When the stamps do not overlap.
     """
     common = _common(recorded.stamps_ns, replayed)
     stamps = recorded.stamps_ns[common]
@@ -240,9 +231,6 @@ def position_errors(
 
     Args:
         replayed: Poses of the replay, in the same frame and on the same clock.
-
-    Raises:
-        UndefinedStatisticError: When the stamps do not overlap.
     """
     common = _common(stamps_ns, replayed)
     other_m = replayed.positions_at(stamps_ns[common])

@@ -85,11 +85,7 @@ def page(
     *,
     everything: bool = False,
 ) -> str:
-    """Build the page of the results.
-
-    Args:
-        everything: Show the tables that nobody decides by and the list of all numbers, too.
-    """
+    """Build the page of the results."""
     shown = shown_tables(results, everything=everything)
     shown_first = [pair for name in FIGURES for pair in figures if pair[0].id == name][:1]
     tables_first = front_tables(results)

@@ -209,11 +209,10 @@ SECTIONS: tuple[Section, ...] = (
         figures=("views",),
     ),
     Section(
-        id="prediction_powered",
-        title="Prediction-powered estimates",
-        lead="What the twin adds to few robot trials, and whether enough were made.",
+        id="sequences",
+        title="Enough trials?",
+        lead="Whether enough trials were made.",
         numbers=(
-            ("proxy.*", ""),
             ("sequence.recorded.*", ""),
             ("power.trials_needed.recorded.*", ""),
         ),

@@ -51,7 +51,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("average.", "rate.", "proxy.recorded_rate", "sequence.recorded.")
+SHARES = ("average.", "rate.", "sequence.recorded.")
 UNSIGNED = (
     "agreement.mae_pp",
     "agreement.rmse_pp",
@@ -64,11 +64,7 @@ HUGE = 1e7
 
 
 def number(value: float, unit: str) -> str:
-    """Write a value in the unit a reader thinks in.
-
-    Args:
-        unit: Unit of the measurement: one of ``SHOWN_UNITS``, or another, which is left out.
-    """
+    """Write a value in the unit a reader thinks in."""
     _, name, _ = SHOWN_UNITS.get(unit, PLAIN)
     return f"{_figure(value, unit)}{name}"
 

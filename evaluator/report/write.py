@@ -63,11 +63,7 @@ class Written:
 def write_report(
     comparison: Comparison, folder: Path, *, everything: bool = False, latex: bool = False
 ) -> Written:
-    """Write every file of one evaluation into ``folder``, replacing an earlier one.
-
-    Raises:
-        EvaluatorError: When the folder cannot be written.
-    """
+    """Write every file of one evaluation into ``folder``, replacing an earlier one."""
     drawn, not_drawn = drawings_of(comparison)
     results = comparison.results()
     if not_drawn:

@@ -194,10 +194,6 @@ def _read(
 
 
 def broken(name: str, error: Exception, *, scope: str = "everything") -> Exclusion:
-    """Leave a file out of something, with what reading it raised.
-
-    Args:
-        scope: What it is left out of.
-    """
+    """Leave a file out of something, with what reading it raised."""
     words = str(error) if isinstance(error, GstError) else f"{type(error).__name__}: {error}"
     return Exclusion(episode=name, scope=scope, reason=words)

@@ -205,11 +205,7 @@ def _read_trial(run: RunFolder, episode: Episode, info: EpisodeInfo) -> Recorded
 
 
 def localised_positions(localisations: Iterable[bytes]) -> list[LocalisedPosition]:
-    """Return where objects were found, in log order.
-
-    Raises:
-        InvalidRecordError: When a record does not fit its schema.
-    """
+    """Return where objects were found, in log order."""
     places = []
     for data in localisations:
         record = parse_record(data, name="localisation")
@@ -327,11 +323,7 @@ class FirstDivergence:
 
 
 def first_divergence(episode: Episode) -> FirstDivergence | None:
-    """Read what a replay says of it; None where nothing parts, or nothing was compared.
-
-    Raises:
-        GstError: When its record cannot be read.
-    """
+    """Read what a replay says of it; None where nothing parts, or nothing was compared."""
     messages = list(episode.messages(episode.topics_of_type(schema.DIVERGENCE)))
     first = parse_record(messages[-1].data, name="divergence")["first"] if messages else None
     if first is None:
@@ -408,11 +400,7 @@ class DerivedFile:
 
     @property
     def episode(self) -> Episode:
-        """Open it; nothing is held open, so whoever asks twice opens it twice.
-
-        Raises:
-            BridgeError: When it has gone or changed since.
-        """
+        """Open it; nothing is held open, so whoever asks twice opens it twice."""
         return Episode.open(self.path)
 
     @property
@@ -540,14 +528,6 @@ class DerivedIndex:
         ]
         decided = _newest(alone).facts.verdict if alone else None
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
-
-    def by_engine(self, *, source: str, source_sha256: str, plan_id: str) -> dict[str, DerivedFile]:
-        """Return the newest planned replay of a plan in each engine, those that never count too."""
-        found: dict[str, list[DerivedFile]] = {}
-        for file in _current(self._replays.get((source, plan_id, "planned"), []), source_sha256):
-            if file.derived.engine:
-                found.setdefault(file.derived.engine, []).append(file)
-        return {engine: _newest(files) for engine, files in found.items()}
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
         """Find the newest localisation of a recorded episode.

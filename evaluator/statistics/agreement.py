@@ -1,7 +1,8 @@
 """How far the twin's success rates lie from the recorded ones, and whether it ranks as they do.
 
 A correlation sees neither a constant offset nor a wrong slope: +12 points everywhere give r = 1.
-Arguments are keyword-only throughout: bias changes its sign and MMRV its meaning when swapped.
+Both sides are rates from 0 to 1 of the same groups in the same order, given by keyword: bias
+changes its sign and MMRV its meaning when they are swapped.
 """
 
 import math
@@ -35,11 +36,9 @@ def exact(
 
     Args:
         recorded: Recorded rate of each group; a fraction stays exact.
-        sim: The twin's, of the same groups in the same order.
 
     Raises:
         UndefinedStatisticError: Below ``at_least`` groups.
-        ValueError: When the sides differ in length.
     """
     if len(recorded) != len(sim):
         message = f"{len(recorded)} recorded rates but {len(sim)} of the twin"
@@ -56,14 +55,7 @@ def exact(
 def varying(
     statistic: str, recorded: Sequence[Number], sim: Sequence[Number]
 ) -> tuple[list[Fraction], list[Fraction]]:
-    """Return both sides, at least 3 groups of which not all are the same on either side.
-
-    Args:
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: With the reason.
-    """
+    """Return both sides, at least 3 groups of which not all are the same on either side."""
     # No groups are too few groups here; exact() would word it as an absence.
     if len(recorded) == len(sim) == 0:
         raise UndefinedStatisticError(
@@ -98,57 +90,25 @@ CONVENTIONS = ("recorded", "sim")
 
 
 def bias(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return mean(sim - recorded): above 0 the twin is optimistic. r does not see this.
-
-    Args:
-        recorded: Recorded rate of each group, 0 to 1.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: Without groups.
-    """
+    """Return mean(sim - recorded): above 0 the twin is optimistic. r does not see this."""
     gaps = _gaps("bias", recorded, sim)
     return float(sum(gaps) / len(gaps))
 
 
 def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return mean |sim - recorded|; 0 is perfect.
-
-    Args:
-        recorded: Recorded rate of each group, 0 to 1.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: Without groups.
-    """
+    """Return mean |sim - recorded|; 0 is perfect."""
     gaps = _gaps("mean absolute error", recorded, sim)
     return float(sum(map(abs, gaps)) / len(gaps))
 
 
 def root_mean_square_error(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return sqrt(mean (sim - recorded)^2); 0 is perfect, and never below the mean |gap|.
-
-    Args:
-        recorded: Recorded rate of each group, 0 to 1.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: Without groups.
-    """
+    """Return sqrt(mean (sim - recorded)^2); 0 is perfect, and never below the mean |gap|."""
     gaps = _gaps("RMSE", recorded, sim)
     return math.sqrt(sum(gap * gap for gap in gaps) / len(gaps))
 
 
 def largest_gap(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return max |sim - recorded| over groups.
-
-    Args:
-        recorded: Recorded rate of each group, 0 to 1.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: Without groups.
-    """
+    """Return max |sim - recorded| over groups."""
     return float(max(map(abs, _gaps("largest gap", recorded, sim))))
 
 
@@ -165,10 +125,6 @@ def calibration_line(*, recorded: Sequence[Number], sim: Sequence[Number]) -> Ca
 
     Both sides are counts with noise, so the slope is pulled towards 0 (attenuation); it predicts,
     it does not say what the physics would do.
-
-    Args:
-        recorded: Recorded rate of each group, 0 to 1: what the line predicts.
-        sim: The twin's, of the same groups in the same order: what it predicts from.
 
     Raises:
         UndefinedStatisticError: Below 3 groups, or when the sim side is constant.
@@ -195,14 +151,8 @@ def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recor
 
     Range: 0 to 1, 0 is perfect.
 
-    Args:
-        recorded: Recorded rate of each group, 0 to 1.
-        sim: The twin's, of the same groups in the same order.
-        gap: ``recorded`` or ``sim``: in whose rates a wrong order is weighed.
-
     Raises:
         UndefinedStatisticError: Below 2 groups.
-        ValueError: For a convention that does not exist.
     """
     x, y = exact("MMRV", recorded, sim, at_least=2)
     if gap not in CONVENTIONS:
@@ -270,11 +220,7 @@ def _gaps(statistic: str, recorded: Sequence[Number], sim: Sequence[Number]) -> 
 
 
 def mean_rate(rates: Sequence[Number]) -> float:
-    """Return the macro average: every group counts the same, however many trials it has.
-
-    Raises:
-        UndefinedStatisticError: Without groups.
-    """
+    """Return the macro average: every group counts the same, however many trials it has."""
     if not rates:
         raise UndefinedStatisticError(statistic="mean rate", reason="there are no groups")
     return float(floats(rates).mean())
@@ -288,12 +234,6 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return Pearson's r over groups; exact on counts, so that rates on a line give 1 and not less.
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
-
-    Args:
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: With the reason.
     """
     x, y = varying("Pearson r", recorded, sim)
     mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
@@ -305,11 +245,7 @@ def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
 
 def within_and_between(tasks: Sequence[Sequence[tuple[Number, Number]]]) -> tuple[float, float]:
-    """Return r of the distances to the means of tasks, and r of those means.
-
-    Raises:
-        UndefinedStatisticError: When one of both is undefined.
-    """
+    """Return r of the distances to the means of tasks, and r of those means."""
     inside: list[tuple[Fraction, Fraction]] = []
     means: list[tuple[Fraction, Fraction]] = []
     for groups in tasks:
@@ -325,13 +261,6 @@ def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return Spearman's rank correlation; ties share their average rank.
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
-
-    Args:
-        recorded: Recorded rate of each group; only their order counts.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: With the reason.
     """
     x, y = varying("Spearman rho", recorded, sim)
     return pearson(ranks(x), ranks(y))
@@ -343,13 +272,6 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     (C - D) / sqrt((pairs - pairs tied in recorded) (pairs - pairs tied in sim)).
 
     Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
-
-    Args:
-        recorded: Recorded rate of each group; only their order counts.
-        sim: The twin's, of the same groups in the same order.
-
-    Raises:
-        UndefinedStatisticError: With the reason.
     """
     x, y = varying("Kendall tau-b", recorded, sim)
     pairs = [(i, j) for j in range(len(x)) for i in range(j)]
@@ -361,10 +283,6 @@ def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
 
 def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Interval:
     """Return Fisher's z interval of Pearson's r. The groups must be independent of each other.
-
-    Args:
-        r: Pearson's r over the groups.
-        level: Confidence level, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Below 4 groups, or when r is exactly 1 or -1.
@@ -414,7 +332,6 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
 
     Raises:
         UndefinedStatisticError: Below two candidates: there is nothing to choose.
-        ValueError: When the sides name different candidates.
     """
     if recorded.keys() != sim.keys():
         message = f"different candidates: {sorted(recorded)} recorded, {sorted(sim)} in the twin"

@@ -64,11 +64,7 @@ class Scale:
         return self.clip(self.back(middle - half)), self.clip(self.back(middle + half))
 
     def refuse_limit(self, statistic: str, value: float) -> None:
-        """Refuse a value at which the scale has no end.
-
-        Raises:
-            UndefinedStatisticError: Naming it.
-        """
+        """Refuse a value at which the scale has no end."""
         if self.is_open and min(value - self.low, self.high - value) < NEAR:
             raise UndefinedStatisticError(
                 statistic=statistic, reason=f"it is {value:g} exactly, the end of its range"
@@ -154,9 +150,6 @@ class GroupSample:
 
         On Fisher's z or the logarithm where ``SCALES`` says so.
 
-        Args:
-            level: Confidence level, 0 to 1.
-
         Raises:
             UndefinedStatisticError: Below 4 units, when the statistic is undefined, at the end of
                 its range, or when nothing varies.
@@ -180,9 +173,6 @@ class GroupSample:
 
 def student_interval(values: Sequence[Number], *, level: float = LEVEL) -> Interval:
     """Return Student's t interval of a mean over independent groups, or over cluster means.
-
-    Args:
-        level: Confidence level, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Below 3 values, or when they are all the same: no interval of
@@ -270,9 +260,6 @@ class Remeasured:
         Two measurements differ by sqrt(2) times the spread of one, around the value that was
         found; on Fisher's scale for correlations and shares, on the logarithm for errors.
 
-        Args:
-            level: Share of repeated measurements that are to fall inside, 0 to 1.
-
         Raises:
             UndefinedStatisticError: Below 3 groups, when the statistic is undefined or at the end
                 of its range, or when no redrawn rate changes it.
@@ -310,12 +297,6 @@ def remeasure_paired(
     """Draw each group's table of trials anew: both succeed, only sim, only recorded, neither.
 
     From a multinomial with the observed shares, 1/4 added to each count.
-
-    Args:
-        tables: For each group the trials in which both succeed, only sim, only recorded, neither.
-
-    Raises:
-        UndefinedStatisticError: When a group has no trial.
     """
     if any(sum(table) == 0 for table in tables):
         raise UndefinedStatisticError(statistic=WHAT, reason="a group has no trial with both sides")
@@ -345,7 +326,6 @@ def remeasure_counts(
 
     Args:
         recorded: Successes and trials of each group as recorded; 1 trial or more.
-        sim: The twin's, of the same groups in the same order.
     """
     found, drawn = [], []
     for side in (recorded, sim):

@@ -33,13 +33,6 @@ def perfect_forecaster(predicted: Sequence[float]) -> tuple[Perfect, Perfect]:
     """Return the Brier score and the calibration error that the same probabilities would show.
 
     Outcomes are drawn from the stated probabilities themselves, with a fixed seed.
-
-    Args:
-        predicted: Stated probability of success of each trial, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     brier(predicted, [True] * len(predicted))
     p = np.array(predicted, dtype=np.float64)
@@ -61,13 +54,6 @@ def brier_interval(predicted: Sequence[float], happened: Sequence[bool]) -> Inte
 
     Bayesian bootstrap (Rubin 1981) of the squared errors, with half a trial at 0 and half a one at
     1 added: for errors that are only 0 or 1 it is Jeffreys' interval of their rate.
-
-    Args:
-        predicted: Stated probability of success of each trial, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     brier(predicted, happened)
     errors = (np.array(predicted, dtype=np.float64) - np.array(happened)) ** 2
@@ -87,13 +73,6 @@ def calibration_error_interval(predicted: Sequence[float], happened: Sequence[bo
     by the triangle inequality; of that the larger 95 % quantile counts, under the stated
     probabilities or under Jeffreys' posterior of each bin's rate (drawn with a fixed seed). It
     covers more than 95 %.
-
-    Args:
-        predicted: Stated probability of success of each trial, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     bins = reliability_bins(predicted, happened)
     k = np.array([each.succeeded for each in bins], dtype=np.float64)

@@ -110,7 +110,6 @@ def rate_coverage(method: str, n: int) -> Coverage:
     """Count out how often the interval of a rate holds it, over rates 0.05, 0.06 .. 0.95.
 
     Args:
-        method: wilson, clopper-pearson or jeffreys.
         n: Trials, at least 1.
     """
     _, low, high = _ends(RATE_INTERVALS[method], n)

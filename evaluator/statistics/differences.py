@@ -40,11 +40,7 @@ class McNemar:
 
 
 def mcnemar(pairs: Iterable[tuple[bool, bool]]) -> McNemar:
-    """Test pairs (before, after) of the same start for a change in success.
-
-    Raises:
-        UndefinedStatisticError: Without a single discordant pair.
-    """
+    """Test pairs (before, after) of the same start for a change in success."""
     seen = list(pairs)
     improved = sum(after and not before for before, after in seen)
     worsened = sum(before and not after for before, after in seen)
@@ -77,10 +73,6 @@ def tango_difference(improved: int, worsened: int, n: int, *, level: float = LEV
     All differences d that the score test with the variance under d does not reject, found by
     bisection; the restricted estimate of the worsened probability is the larger root of
     Tango's quadratic (his equations 4 and 5).
-
-    Raises:
-        UndefinedStatisticError: Without pairs.
-        ImpossibleCountError: When more pairs changed than there are.
     """
     if n == 0:
         raise UndefinedStatisticError(statistic="Tango interval", reason="there are no pairs")
@@ -94,11 +86,7 @@ def tango_difference(improved: int, worsened: int, n: int, *, level: float = LEV
 
 
 def tango_points(improved: int, worsened: int, n: int) -> tuple[float, Interval]:
-    """Return the paired difference and its ``tango_difference``, both in percentage points.
-
-    Raises:
-        UndefinedStatisticError: Without pairs.
-    """
+    """Return the paired difference and its ``tango_difference``, both in percentage points."""
     fraction = tango_difference(improved, worsened, n)
     interval = replace(fraction, low=100 * fraction.low, high=100 * fraction.high)
     return 100 * (improved - worsened) / n, interval
@@ -149,9 +137,6 @@ def newcombe_difference(
     """Return the interval of second - first for independent groups (Newcombe 1998, method 10).
 
     The result is a fraction: 0.2 is a gain of 20 percentage points.
-
-    Args:
-        level: Confidence level, 0 to 1.
     """
     first = wilson(k_first, n_first, level=level)
     second = wilson(k_second, n_second, level=level)
@@ -171,9 +156,6 @@ def guaranteed_difference(
 
     The difference of two Clopper-Pearson intervals, each at (1 + level) / 2: by Bonferroni both
     hold together with at least ``level``. Wide; for where Newcombe's is refused.
-
-    Args:
-        level: Confidence level that is kept for every pair of true rates, 0 to 1.
     """
     each = (1 + level) / 2
     first = clopper_pearson(k_first, n_first, level=each)
@@ -197,7 +179,6 @@ def boschloo(k_first: int, n_first: int, k_second: int, n_second: int) -> float:
 
     Raises:
         UndefinedStatisticError: Without trials, or for groups whose tables cannot be counted out.
-        ImpossibleCountError: For counts that cannot be.
     """
     check_count(k_first, n_first)
     check_count(k_second, n_second)
@@ -314,9 +295,6 @@ def mean_of_intervals(values: Sequence[float], intervals: Sequence[Interval]) ->
 
     Args:
         intervals: Of each; together they give the method its name, which must be one.
-
-    Raises:
-        UndefinedStatisticError: Without estimates.
     """
     if not values:
         raise UndefinedStatisticError(statistic="interval of a mean", reason="there are none")

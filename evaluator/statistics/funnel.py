@@ -28,10 +28,6 @@ def funnel(trials: Sequence[Sequence[bool | None]], names: Sequence[str]) -> lis
 
     Args:
         trials: How each stage ended, one sequence per trial; None is unknown.
-
-    Raises:
-        UndefinedStatisticError: Without trials or stages.
-        ValueError: When a trial has another number of stages.
     """
     if not trials or not names:
         raise UndefinedStatisticError(
@@ -60,10 +56,8 @@ class FailureKind:
     count: int
 
 
-def failure_taxonomy(failures: Iterable[tuple[str, str, int]]) -> list[FailureKind]:
-    """Count failures (clause, cause, how many trials), most frequent first."""
-    counts: Counter[tuple[str, str]] = Counter()
-    for clause, cause, count in failures:
-        counts[clause, cause] += count
+def failure_taxonomy(failures: Iterable[tuple[str, str]]) -> list[FailureKind]:
+    """Count failures (clause, cause), most frequent first."""
+    counts = Counter(failures)
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return [FailureKind(clause=clause, cause=cause, count=n) for (clause, cause), n in ordered]

@@ -4,6 +4,7 @@ Equal rates can hide that the twin was wrong about every single trial.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -31,24 +32,13 @@ def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
     """Return the mean of (p - outcome)^2 (Brier 1950).
 
     Range: 0 to 1, 0 is perfect; always saying 1/2 gives 1/4.
-
-    Args:
-        predicted: Predicted probability of success of each trial, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     p = _checked("Brier score", predicted, happened)
     return float(np.mean((p - np.array(happened, dtype=np.float64)) ** 2))
 
 
 def brier_of_base_rate(happened: Sequence[bool]) -> float:
-    """Return the Brier score of always saying the observed rate: what knowing nothing reaches.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-    """
+    """Return the Brier score of always saying the observed rate: what knowing nothing reaches."""
     if not happened:
         raise UndefinedStatisticError(statistic="Brier score", reason="there are no trials")
     rate = sum(happened) / len(happened)
@@ -66,12 +56,7 @@ def expected_calibration_error(
     Range: 0 to 1, 0 is perfect.
 
     Args:
-        predicted: Predicted probability of success of each trial, 0 to 1.
         num_bins: Bins of equal width over 0..1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     bins = reliability_bins(predicted, happened, num_bins=num_bins)
     return sum(abs(b.mean_probability * b.n - b.succeeded) for b in bins) / len(happened)
@@ -83,12 +68,7 @@ def reliability_bins(
     """Return the bins that hold trials, in order.
 
     Args:
-        predicted: Predicted probability of success of each trial, 0 to 1.
         num_bins: Bins of equal width over 0..1; the last one holds 1 too.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ValueError: For probabilities outside 0..1.
     """
     p = _checked("reliability", predicted, happened)
     answers = np.array(happened, dtype=bool)
@@ -133,14 +113,7 @@ class Confusion:
     @staticmethod
     def count(pairs: Iterable[tuple[bool, bool]]) -> "Confusion":
         """Count pairs (said, happened)."""
-        return Confusion.weigh((predicted, happened, 1) for predicted, happened in pairs)
-
-    @staticmethod
-    def weigh(pairs: Iterable[tuple[bool, bool, int]]) -> "Confusion":
-        """Count triples (said, happened, how many trials it stands for)."""
-        sums = {(True, True): 0, (True, False): 0, (False, True): 0, (False, False): 0}
-        for predicted, happened, count in pairs:
-            sums[bool(predicted), bool(happened)] += count
+        sums = Counter((bool(predicted), bool(happened)) for predicted, happened in pairs)
         return Confusion(
             true_positive=sums[True, True],
             false_positive=sums[True, False],
@@ -179,9 +152,6 @@ def phi(confusion: Confusion) -> float:
 
     Range: -1 to 1, 1 is full agreement, 0 is none beyond the margins.
     Undefined when: one column is constant, for then there is nothing to correlate.
-
-    Raises:
-        UndefinedStatisticError: Naming the constant column.
     """
     tp, fp = confusion.true_positive, confusion.false_positive
     fn, tn = confusion.false_negative, confusion.true_negative
@@ -205,9 +175,6 @@ def kappa(confusion: Confusion) -> float:
     """Return Cohen's kappa (1960): agreement beyond what the margins give by chance.
 
     Range: -1 to 1. Undefined when: both columns are constant and alike.
-
-    Raises:
-        UndefinedStatisticError: With the reason.
     """
     n = confusion.n
     if n == 0:
@@ -242,9 +209,6 @@ def cost_curve(confusion: Confusion, refusal_prices: Iterable[float]) -> list[Co
 
     Args:
         refusal_prices: What refusing a good plan costs, in units of one bad execution.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
     """
     if confusion.n == 0:
         raise UndefinedStatisticError(statistic="cost curve", reason="there are no trials")

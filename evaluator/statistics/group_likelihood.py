@@ -134,11 +134,7 @@ class Likelihood:
     """Probability of the counts of every group on a grid of both log-odds."""
 
     def __init__(self, groups: Sequence[GroupCounts]) -> None:
-        """Lay out.
-
-        Args:
-            groups: At least one trial on each side of each.
-        """
+        """Lay out."""
         names = list(dict.fromkeys(group.task for group in groups))
         self.members = [
             np.array([g for g, group in enumerate(groups) if group.task == name]) for name in names

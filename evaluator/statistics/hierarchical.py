@@ -148,7 +148,6 @@ class AgreementModel:
         """Find the posterior.
 
         Args:
-            groups: At least three, each with a trial on both sides.
             num_nodes: Parameter sets that carry the posterior; by the number of groups without.
             seed: Scrambles the nodes; another seed shows how exact the quadrature is.
 
@@ -263,11 +262,7 @@ class AgreementModel:
         *,
         with_rates: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Place Sobol nodes as Student's t, and return them with the log of their weights.
-
-        Args:
-            turn: Scrambles them otherwise in every round.
-        """
+        """Place Sobol nodes as Student's t, and return them with the log of their weights."""
         dim = len(centre)
         rng = np.random.default_rng([self._seed, turn])
         cube = np.clip(sobol(num_nodes, dim + 1, rng), 1e-9, 1 - 1e-9)

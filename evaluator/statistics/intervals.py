@@ -28,15 +28,7 @@ class ImpossibleCountError(EvaluatorError):
 
 
 def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the score interval of a proportion k/n (Wilson 1927), the default for rates.
-
-    Args:
-        level: Confidence level, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
-    """
+    """Return the score interval of a proportion k/n (Wilson 1927), the default for rates."""
     check_count(k, n)
     z = normal_quantile(0.5 + level / 2)
     rate = k / n
@@ -48,15 +40,7 @@ def wilson(k: int, n: int, *, level: float = LEVEL) -> Interval:
 
 
 def clopper_pearson(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the interval that covers at least ``level`` for every true rate (1934).
-
-    Args:
-        level: Confidence level, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
-    """
+    """Return the interval that covers at least ``level`` for every true rate (1934)."""
     check_count(k, n)
     tail = (1 - level) / 2
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
@@ -69,13 +53,6 @@ def jeffreys(k: int, n: int, *, level: float = LEVEL) -> Interval:
 
     With the ends 0 at k = 0 and 1 at k = n (Brown, Cai and DasGupta 2001, section 4.1): without
     that change it never covers rates near 0 and 1.
-
-    Args:
-        level: Probability of the posterior that lies between the ends, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
     """
     check_count(k, n)
     tail = (1 - level) / 2
@@ -98,9 +75,6 @@ def relative_gain(before: float, after: float) -> float:
     Args:
         before: Rate that the gain is relative to; not 0.
         after: Rate in the same unit.
-
-    Raises:
-        UndefinedStatisticError: When there is nothing to be relative to.
     """
     if before == 0:
         raise UndefinedStatisticError(
@@ -110,12 +84,7 @@ def relative_gain(before: float, after: float) -> float:
 
 
 def check_count(k: int, n: int) -> None:
-    """Refuse what cannot be counted.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
-    """
+    """Refuse what cannot be counted."""
     if n == 0:
         raise UndefinedStatisticError(statistic="rate", reason="there are no trials")
     if not 0 <= k <= n:
@@ -135,9 +104,6 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
 
     The l-th smallest and the l-th largest hold it with probability 1 - 2 P(B < l), where B is
     binomial(n, 1/2); the largest l that keeps the level (Thompson 1936).
-
-    Args:
-        level: Confidence level, 0 to 1.
 
     Raises:
         UndefinedStatisticError: Below 6 values at 95 %: even the smallest and the largest may miss.
@@ -159,11 +125,7 @@ def median_interval(values: Sequence[float], *, level: float = LEVEL) -> Interva
 
 
 def median_rank(n: int, level: float = LEVEL) -> int:
-    """Return l, counted from 1; 0 where no two values keep the level.
-
-    Args:
-        level: Confidence level, 0 to 1.
-    """
+    """Return l, counted from 1; 0 where no two values keep the level."""
     if not n:
         return 0
     below = bdtr(np.arange(n // 2 + 1), n, 0.5)  # P(B <= l - 1) for l = 1, 2 ..

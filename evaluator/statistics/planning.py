@@ -26,7 +26,6 @@ def paired_chances(p_first: float, p_second: float, correlation: float) -> tuple
     """Return the chances of a pair to improve and to worsen, from both rates.
 
     Args:
-        p_first: Rate before, 0 to 1.
         correlation: Phi of both outcomes of a start; 0 where nobody knows, which asks for more
             starts than what is usual, above 0. Cut to what the rates allow.
     """
@@ -79,12 +78,7 @@ def pairs_for_width(p_improved: float, p_worsened: float, width: float) -> int:
 
 
 def rate_width(rate: float, num_trials: int, *, method: str = "wilson") -> float:
-    """Return the expected width of the interval of a rate.
-
-    Args:
-        rate: True rate, 0 to 1.
-        method: wilson, clopper-pearson or jeffreys.
-    """
+    """Return the expected width of the interval of a rate."""
     ends = [RATE_INTERVALS[method](k, num_trials) for k in range(num_trials + 1)]
     mass = np.diff(bdtr(np.arange(num_trials + 1), num_trials, rate), prepend=0.0)
     return float(mass @ np.array([each.high - each.low for each in ends]))
@@ -92,10 +86,6 @@ def rate_width(rate: float, num_trials: int, *, method: str = "wilson") -> float
 
 def trials_for_width(rate: float, width: float, *, method: str = "wilson") -> int:
     """Return the trials with which a rate's interval is expected to be no wider than ``width``.
-
-    Args:
-        rate: True rate, 0 to 1.
-        method: wilson, clopper-pearson or jeffreys.
 
     Raises:
         UndefinedStatisticError: When 4,000 trials are not enough.
@@ -106,12 +96,7 @@ def trials_for_width(rate: float, width: float, *, method: str = "wilson") -> in
 def power_above(
     rate: float, limit: float, num_trials: int, *, alpha: float = ALPHA, method: str = "wilson"
 ) -> float:
-    """Return the chance that the interval of a rate lies above a limit.
-
-    Args:
-        rate: True rate, 0 to 1.
-        method: wilson, clopper-pearson or jeffreys.
-    """
+    """Return the chance that the interval of a rate lies above a limit."""
     make = RATE_INTERVALS[method]
     low, high = -1, num_trials  # the lower end rises with k: the last that is not above
     while low < high:
@@ -129,10 +114,6 @@ def trials_above(
     method: str = "wilson",
 ) -> int:
     """Return the trials with which the interval of a rate lies above a limit.
-
-    Args:
-        rate: True rate, 0 to 1.
-        method: wilson, clopper-pearson or jeffreys.
 
     Raises:
         UndefinedStatisticError: When the rate is not above the limit, or 4,000 are not enough.

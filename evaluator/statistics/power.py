@@ -30,7 +30,6 @@ def trials_needed(
     as its closed form has it): 82 per arm for 60 % against 80 %.
 
     Args:
-        p_first: True rate of the first arm, 0 to 1.
         sides: 2 for a difference in either direction, 1 where only one direction counts.
 
     Raises:
@@ -47,9 +46,6 @@ def detectable_rate(
     p_first: float, n_per_arm: int, *, power: float = POWER, alpha: float = ALPHA
 ) -> float:
     """Return the smallest better rate that n trials per arm would show with this power.
-
-    Args:
-        p_first: True rate of the first arm, 0 to 1.
 
     Raises:
         UndefinedStatisticError: When even a rate of 1 would not show.

@@ -1,8 +1,7 @@
 """Looking after every trial without paying for it: stop, or continue?
 
 A test for a fixed n that is looked at again and again will be significant sooner or later. A
-confidence sequence holds at every n at once: here of a success rate, and of the difference between
-two conditions on the same starts (three outcomes of a pair: improved, worsened, the same).
+confidence sequence holds at every n at once: here of a success rate.
 """
 
 import math
@@ -10,20 +9,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from scipy.special import betaln, gammaln, xlog1py, xlogy
+from jaxtyping import Bool, Float64
+from scipy.special import betaln, xlog1py, xlogy
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Interval
-from evaluator.statistics.intervals import LEVEL, ImpossibleCountError, check_count
+from evaluator.statistics.intervals import LEVEL, check_count
 
 PRIOR = 0.5
 """Krichevsky and Trofimov's bettor: a mixture of bets with Beta(1/2, 1/2) weights."""
 MAX_TRIALS = 100_000
-BISECTIONS, PAIR_BISECTIONS = 60, 50
-SURE = "sequence of pairs"
+BISECTIONS = 60
 
-Counts = Int64[np.ndarray, " looks"]
 Ends = Float64[np.ndarray, " looks"]
 Poor = Bool[np.ndarray, " looks"]
 
@@ -40,9 +37,6 @@ def capital_log(k: int, n: int, rate: float) -> float:
         n: Trials; without any the bettor still owns 1, so the log is 0.
         rate: The rate that is bet against, 0 to 1; one that excludes what has happened gives
             infinity.
-
-    Raises:
-        ImpossibleCountError: When k is not in 0..n.
     """
     if n == 0:
         return 0.0
@@ -58,15 +52,7 @@ def capital_log(k: int, n: int, rate: float) -> float:
 
 
 def betting_interval(k: int, n: int, *, level: float = LEVEL) -> Interval:
-    """Return the rates a bettor has not yet refuted; valid however often one looked before.
-
-    Args:
-        level: Confidence level that is kept over all looks together, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-        ImpossibleCountError: When k is not in 0..n.
-    """
+    """Return the rates a bettor has not yet refuted; valid however often one looked before."""
     check_count(k, n)
     ruin = -math.log1p(-level)
     low = 0.0 if k == 0 else _end(k, n, ruin, 0.0)
@@ -119,10 +105,6 @@ class ConfidenceSequence:
 def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> ConfidenceSequence:
     """Return the sequence after all these trials; ``add`` one by one, but for all at once.
 
-    Args:
-        outcomes: Whether each trial succeeded, in the order in which they were run.
-        level: Confidence level that is kept over all looks together, 0 to 1.
-
     Raises:
         UndefinedStatisticError: When after some trial no constant rate was left.
     """
@@ -136,8 +118,8 @@ def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> Confidence
     def is_poor(rate: Ends) -> Poor:
         return np.asarray(mixture - xlogy(k, rate) - xlog1py(n - k, -rate) < ruin)
 
-    lows = np.where(k == 0, 0.0, _ends(k / n, 0.0, is_poor, BISECTIONS))
-    highs = np.where(k == n, 1.0, _ends(k / n, 1.0, is_poor, BISECTIONS))
+    lows = np.where(k == 0, 0.0, _ends(k / n, 0.0, is_poor))
+    highs = np.where(k == n, 1.0, _ends(k / n, 1.0, is_poor))
     low, high = np.maximum.accumulate(lows), np.minimum.accumulate(highs)
     crossed = np.flatnonzero(low > high)
     if len(crossed):
@@ -147,10 +129,10 @@ def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> Confidence
     return sequence
 
 
-def _ends(seen: Ends, outside: float, is_poor: Callable[[Ends], Poor], bisections: int) -> Ends:
+def _ends(seen: Ends, outside: float, is_poor: Callable[[Ends], Poor]) -> Ends:
     """Bisect all looks together: where, from what was seen, the capital reaches 1/alpha."""
     far = np.full(len(seen), outside)
-    for _ in range(bisections):
+    for _ in range(BISECTIONS):
         middle = (seen + far) / 2
         poor = is_poor(middle)
         seen, far = np.where(poor, middle, seen), np.where(poor, far, middle)
@@ -177,14 +159,7 @@ class Advice:
 
 
 def stop_or_continue(sequence: ConfidenceSequence, goal: float) -> Advice:
-    """Say whether the rate is above or below a goal, or how many more trials it may take.
-
-    Args:
-        goal: The success rate that is asked about, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without trials.
-    """
+    """Say whether the rate is above or below a goal, or how many more trials it may take."""
     if sequence.n == 0:
         raise UndefinedStatisticError(statistic="stop or continue", reason="there are no trials")
     if sequence.low > goal:
@@ -201,15 +176,6 @@ def _trials_to_decide(rate: float, goal: float, at_least: int, level: float) -> 
         interval = betting_interval(round(rate * n), n, level=level)
         return interval.low > goal or interval.high < goal
 
-    return fewest(decided, at_least)
-
-
-def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
-    """Return from how many on something is decided, ``at_least`` or more; None beyond the most.
-
-    Args:
-        decided: Says whether so many decide it; true for all larger numbers once it is true.
-    """
     high = max(1, at_least)
     while not decided(high):
         high *= 2
@@ -220,106 +186,3 @@ def fewest(decided: Callable[[int], bool], at_least: int) -> int | None:
         middle = (low + high) // 2
         low, high = (low, middle) if decided(middle) else (middle, high)
     return max(high, at_least)
-
-
-def pairs_capital_log(improved: int, worsened: int, n: int, difference: float) -> float:
-    """Return the log of what a bettor against this difference owns after n pairs.
-
-    The bettor mixes all bets on (improved, worsened, same) with Dirichlet(1/2, 1/2, 1/2) weights;
-    the capital against a difference d = P(improved) - P(worsened) is the least of those against
-    any pair of chances with that difference, so it ever exceeds 1/alpha with probability at most
-    alpha (Ville 1939). The chances that fit best under d solve a quadratic.
-
-    Args:
-        difference: P(improved) - P(worsened) that is bet against, -1 to 1.
-
-    Raises:
-        ImpossibleCountError: When more pairs changed than there are.
-    """
-    if min(improved, worsened) < 0 or improved + worsened > n:
-        raise ImpossibleCountError(k=improved + worsened, n=n)
-    better, worse, same = (np.array([k]) for k in (improved, worsened, n - improved - worsened))
-    return float(_pairs_capital_log(better, worse, same, np.array([difference]))[0])
-
-
-def _pairs_capital_log(better: Counts, worse: Counts, same: Counts, d: Ends) -> Ends:
-    n = better + worse + same
-    counts = (better, worse, same)
-    mixture = sum(gammaln(k + PRIOR) - gammaln(PRIOR) for k in counts)
-    mixture = mixture - (gammaln(n + 3 * PRIOR) - gammaln(3 * PRIOR))
-    chances = _best_chances(better, worse, same, d)
-    return np.asarray(mixture - sum(xlogy(k, p) for k, p in zip(counts, chances, strict=True)))
-
-
-def _best_chances(better: Counts, worse: Counts, same: Counts, d: Ends) -> tuple[Ends, ...]:
-    """Chances with P(improved) - P(worsened) = d under which the counts are likeliest."""
-    n = np.maximum(1, better + worse + same)
-    b = (better + worse) * (1 + d) + 2 * d * (better + same)
-    root = np.sqrt(np.maximum(0.0, b * b - 8 * n * better * d * (1 + d)))
-    p = np.clip((b + root) / (4 * n), np.maximum(0.0, d), (1 + d) / 2)
-    return p, np.maximum(0.0, p - d), np.maximum(0.0, 1 - 2 * p + d)
-
-
-def pairs_sequence(changes: Sequence[int], *, level: float = LEVEL) -> Interval:
-    """Return what is left after every pair in order: +1 improved, -1 worsened, 0 the same.
-
-    Ends only move inwards: what was refuted once stays refuted.
-
-    Args:
-        changes: One number for each pair, in the order in which the pairs became complete.
-        level: Confidence level that is kept over all looks together, 0 to 1.
-
-    Raises:
-        UndefinedStatisticError: Without pairs, or when after some pair no difference was left.
-    """
-    if not changes:
-        raise UndefinedStatisticError(statistic=SURE, reason="there are no pairs")
-    seen, ruin = np.array(changes, dtype=np.int64), -math.log1p(-level)
-    better, worse = np.cumsum(seen > 0), np.cumsum(seen < 0)
-    same = np.arange(1, len(seen) + 1) - better - worse
-
-    def is_poor(difference: Ends) -> Poor:
-        return np.asarray(_pairs_capital_log(better, worse, same, difference) < ruin)
-
-    def ends(outside: float) -> Ends:
-        mean = (better - worse) / (better + worse + same)
-        found = _ends(mean, outside, is_poor, PAIR_BISECTIONS)
-        return np.where(is_poor(np.full(len(seen), outside)), outside, found)
-
-    low, high = np.maximum.accumulate(ends(-1.0)), np.minimum.accumulate(ends(1.0))
-    crossed = np.flatnonzero(low > high)
-    if len(crossed):
-        raise UndefinedStatisticError(
-            statistic=SURE,
-            reason=f"after {int(crossed[0]) + 1} pairs no constant difference fits: it has changed",
-        )
-    return Interval(low=float(low[-1]), high=float(high[-1]), level=level, method="betting-pairs")
-
-
-def pairs_advice(changes: Sequence[int], interval: Interval) -> Advice:
-    """Say whether the difference is above or below 0, or how many more pairs that may take.
-
-    Args:
-        changes: One number for each pair: +1 improved, -1 worsened, 0 the same; one pair at least.
-        interval: What ``pairs_sequence`` left of the difference after these pairs.
-    """
-    if interval.low > 0:
-        return Advice(stop=True, answer="above", more_trials=None)
-    if interval.high < 0:
-        return Advice(stop=True, answer="below", more_trials=None)
-    n = len(changes)
-    improved, worsened = sum(c > 0 for c in changes), sum(c < 0 for c in changes)
-    needed = _pairs_to_decide(improved / n, worsened / n, n, interval.level)
-    return Advice(stop=False, answer="open", more_trials=None if needed is None else needed - n)
-
-
-def _pairs_to_decide(better: float, worse: float, at_least: int, level: float) -> int | None:
-    ruin = -math.log1p(-level)
-
-    def decided(n: int) -> bool:
-        improved, worsened = round(better * n), round(worse * n)
-        return improved != worsened and pairs_capital_log(improved, worsened, n, 0.0) >= ruin
-
-    if better == worse:
-        return None
-    return fewest(decided, at_least)

@@ -36,9 +36,6 @@ def sobol(
         count: Points; a power of two fills the cube most evenly.
         dimensions: From 1 to ``MOST_DIMENSIONS``.
         rng: Scrambles them; without, the first point is 0.
-
-    Raises:
-        ValueError: For more dimensions, or more points than there are digits for.
     """
     if not 1 <= dimensions <= MOST_DIMENSIONS or not 0 < count <= 2**BITS:
         message = f"Sobol points: {count} in {dimensions} dimensions of {MOST_DIMENSIONS}"

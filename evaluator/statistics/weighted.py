@@ -41,12 +41,7 @@ def ratio(
     first: Float64[np.ndarray, " sets"],
     second: Float64[np.ndarray, " sets"],
 ) -> Values:
-    """Return shared / sqrt(first second), undefined where a factor is 0.
-
-    Args:
-        shared: What both sides have in common in each set: their covariance, or their concordance.
-        first: The same of the first side with itself: its variance, or its untied pairs.
-    """
+    """Return shared / sqrt(first second), undefined where a factor is 0."""
     defined = (first > EPSILON) & (second > EPSILON)
     scale = np.sqrt(np.where(defined, first * second, 1.0))
     return np.clip(shared / scale, -1.0, 1.0), defined

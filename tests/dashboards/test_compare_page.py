@@ -1,4 +1,4 @@
-"""Two runs, conditions, policies or engines: the page shows what the evaluator finds, no more."""
+"""Two runs of the same trials: the page shows what the evaluator finds, no more."""
 
 import re
 import shutil
@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from headless import CHROMIUM, NO_CHROMIUM, chromium
-from scipy.stats import binom
 from serving import dashboard
 from visible import words
 
@@ -19,14 +18,8 @@ from dashboards import share_file
 from dashboards.config import ShareConfig
 from dashboards.guard import Admission
 from dashboards.library import Library
-from evaluator.cache import SummaryCache
-from evaluator.compare.run import read_run
 from evaluator.compare.several import with_against
-from evaluator.compare.within import choices, within_tables
-from evaluator.errors import EvaluatorError
 from evaluator.result import Table
-
-BOTH = "/compare?by=condition&a=without_replanning&b=with_replanning"
 
 
 @pytest.fixture
@@ -90,72 +83,9 @@ def test_runs_without_a_common_trial_show_only_the_numbers_that_differ(
     assert "Numbers that differ" not in again
 
 
-def test_two_conditions_are_paired_by_start(shared_run: RunFolder, browser: Any) -> None:
-    read = read_run(shared_run, SummaryCache(None))
-    assert choices(read) == {"condition": ("without_replanning", "with_replanning")}
-    table, flips = within_tables(read, "condition", "without_replanning", "with_replanning")
-    recorded, twin = cells(table), cells(table, 1)
-    assert (recorded["without_replanning"], recorded["with_replanning"]) == (0.5, 1.0)
-    assert (recorded["difference"], recorded["pairs"]) == (-0.5, 2)
-    assert recorded["low"] < -0.5 < recorded["high"]
-    assert recorded["p"] == pytest.approx(2 * (binom.cdf(0, 1, 0.5) - 0.5 * binom.pmf(0, 1, 0.5)))
-    assert twin["pairs"] == 1  # the twin could not decide one of them
-    assert len(flips.rows) == 1
-    back, _ = within_tables(read, "condition", "with_replanning", "without_replanning")
-    assert cells(back)["difference"] == 0.5
-    assert cells(back)["low"] == pytest.approx(-recorded["high"])
-    seen = words(browser.get(BOTH).text)
-    assert "Starts that end differently: 1 of 2" in seen
-    assert "recorded success: no difference is shown." in seen
-    assert "−0.500" in seen
-
-
-def test_an_address_that_only_says_by_what_shows_the_first_two(browser: Any) -> None:
-    text = browser.get("/compare?by=condition").text
-    assert words(text) == words(browser.get(BOTH).text)
-
-
-def test_a_start_that_was_tried_twice_or_elsewhere_is_no_pair(shared_run: RunFolder) -> None:
-    read = read_run(shared_run, SummaryCache(None))
-    names = ("without_replanning", "with_replanning")
-    twice = replace(read, rows=[*read.rows, replace(read.rows[0], episode="again")])
-    table = within_tables(twice, "condition", *names)[0]
-    assert cells(table)["pairs"] == 1
-    assert "3 trials have no partner" in table.note
-    far = [
-        replace(row, start_positions_m={"cube": (0.4 + 0.1 * place, 0.0, 0.0)})
-        for place, row in enumerate(read.rows)
-    ]
-    with pytest.raises(EvaluatorError, match="4 trials could not be paired"):
-        within_tables(replace(read, rows=far), "condition", *names)
-    for first, second in (("with_replanning", "with_replanning"), ("with_replanning", "x")):
-        with pytest.raises(EvaluatorError, match="choose two different ones"):
-            within_tables(read, "condition", first, second)
-
-
-def test_two_engines_are_held_against_the_same_trials(
-    runs: tuple[RunFolder, ...], synthetic: ModuleType
-) -> None:
-    run = runs[0]
-    for trial in synthetic.TRIALS[:3]:
-        synthetic.write_replay(run, trial, "planned", trial.recorded, engine="perfect")
-    address = "/compare?by=engine&a=perfect&b=bullet"
-    seen = words(synthetic.browser_of(run).get(address).text)
-    assert "Trials that flip: 1 of 3" in seen
-    read = read_run(run, SummaryCache(None))
-    assert choices(read)["engine"] == ("bullet", "perfect")
-    accuracy = cells(within_tables(read, "engine", "perfect", "bullet")[0])
-    assert (accuracy["perfect"], accuracy["bullet"]) == (1.0, pytest.approx(2 / 3))
-
-
 def test_what_cannot_be_compared_is_said(browser: Any, own_run: RunFolder, synthetic: Any) -> None:
     assert browser.get("/compare").status_code == 200
     assert browser.get("/compare?with=..%2F..%2Fetc").status_code == 404
-    for query in ("by=condition&a=x&b=y", "by=planet&a=x&b=y", "by=engine&a=%3Cscript%3E&b="):
-        answer = browser.get(f"/compare?{query}")
-        assert answer.status_code == 200
-        assert "<script>x" not in answer.text
-        assert "choose two " in words(answer.text)
     alone = words(synthetic.browser_of(own_run).get("/compare").text)
     assert "nothing to hold this run against" in alone
 

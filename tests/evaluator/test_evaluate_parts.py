@@ -12,7 +12,6 @@ from bridge.errors import UsageError
 from bridge.task.record import check_record
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_csv, compare_run
-from evaluator.compare.spreadsheet import compare_trials
 from evaluator.report.wording import measurement_text
 from evaluator.result import load_results
 from evaluator.statistics.sequential import sequence_of
@@ -47,7 +46,6 @@ def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
         "reliability of the success probability",
         "sim estimated again with fresh seeds",
         "stage funnel",
-        "recorded rate with",
         "final states",
         "label against localised predicate",
     )
@@ -104,29 +102,6 @@ def test_a_stated_probability_is_judged(write_table: Callable[[str], Path]) -> N
     assert results.get("reliability.brier").value == pytest.approx((0.01 + 0.04) / 2)
     assert results.get("reliability.brier_of_base_rate").value == 0.25
     assert not any("reliability" in text for text in comparison.missing)
-
-
-def test_starts_that_only_the_twin_has_help_the_real_rate(
-    write_table: Callable[[str], Path],
-) -> None:
-    lines = [line(i, i < 6, i < 6) for i in range(10)]
-    lines += [line(100 + i, None, i < 60) for i in range(100)]
-    results = trials(write_table, lines).results()
-    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
-    assert rate.value == pytest.approx(0.58, abs=0.03)
-    saved = results.get("proxy.trials_saved.cube.without_replanning.x")
-    assert saved.value is not None
-    assert saved.value > 0
-    assert results.get("proxy.random_starts_p.cube.without_replanning.x").value > 0.5
-
-
-def test_starts_that_were_picked_get_no_estimate(write_table: Callable[[str], Path]) -> None:
-    lines = [line(i, True, True) for i in range(12)]
-    lines += [line(100 + i, None, i < 5) for i in range(100)]
-    results = trials(write_table, lines).results()
-    rate = results.get("proxy.recorded_rate.cube.without_replanning.x")
-    assert rate.value is None
-    assert "no random part of the twin's" in str(rate.reason_if_undefined)
 
 
 def test_subtasks_make_a_funnel(write_table: Callable[[str], Path]) -> None:
@@ -233,30 +208,6 @@ def test_units_mixed_in_one_cell_are_undefined_and_named(maker: Any) -> None:
     assert "t1 in objects and t2 in subtasks" in str(rate.reason_if_undefined)
 
 
-def test_a_streamed_table_gives_the_same_numbers(write_table: Callable[[str], Path]) -> None:
-    lines = [line(i, i % 3 > 0, i % 4 > 0, verdict="accepted") for i in range(60)]
-    lines += [line(1000 + i, i % 5 > 0, i % 4 > 0, condition="with_replanning") for i in range(60)]
-    path = write_table(HEADER + "\n".join(lines) + "\n")
-    whole, streamed = compare_trials(path), compare_trials(path, stream_above=0)
-    theirs = {m.id: m for m in whole.measurements}
-    same = 0
-    for mine in streamed.measurements:
-        other = theirs[mine.id]
-        if mine.id.startswith(("paired.", "power.paired.")):
-            continue
-        assert (mine.value, mine.k, mine.n, mine.interval) == (
-            other.value,
-            other.k,
-            other.n,
-            other.interval,
-        ), mine.id
-        same += 1
-    assert same > 40
-    assert streamed.rows == ()
-    assert any("streamed" in item.reason for item in streamed.exclusions)
-    assert not any(table.id == "trials" for table in streamed.tables)
-
-
 def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
     write_table: Callable[[str], Path],
     tmp_path: Path,
@@ -308,14 +259,13 @@ def test_whatever_the_trials_say_the_results_fit_the_schema(
     """One task, constant sides, all success, nothing known: a number or a reason, never a crash."""
     path = tmp_path_factory.mktemp("any") / "trials.csv"
     path.write_text(text)
-    for comparison in (compare_trials(path, goal=0.5), compare_trials(path, stream_above=0)):
-        results = comparison.results()
-        check_record(results.to_record(), name="results", package="evaluator")
-        ids = [measurement.id for measurement in results.measurements]
-        assert len(ids) == len(set(ids))
-        for m in results.measurements:
-            if m.interval is not None:
-                assert m.interval.low < m.interval.high or m.unit == "count", m.id
+    results = compare_csv(path, goal=0.5).results()
+    check_record(results.to_record(), name="results", package="evaluator")
+    ids = [measurement.id for measurement in results.measurements]
+    assert len(ids) == len(set(ids))
+    for m in results.measurements:
+        if m.interval is not None:
+            assert m.interval.low < m.interval.high or m.unit == "count", m.id
 
 
 def test_a_thousand_improved_pairs_are_evidence_and_no_overflow(

@@ -14,7 +14,7 @@ from bridge.exchange.table_text import TableError
 from bridge.exchange.trials_csv import TrialRecord, read_trials, write_trials
 from bridge.exchange.trials_rates import read_rates
 from evaluator.compare import compare_csv, compare_run
-from evaluator.compare.spreadsheet import compare_trials, record_from_row, row_from_record
+from evaluator.compare.spreadsheet import record_from_row, row_from_record
 
 PAPER = Path(__file__).resolve().parents[2] / "docs" / "examples" / "paper_table_rates.csv"
 
@@ -229,7 +229,6 @@ def test_trials_of_which_nobody_says_where_they_come_from_are_not_called_real(
         f"trial_id,task,recorded,stand_in\na,t,success,{marks[0]}\nb,t,failure,{marks[1]}\n"
     )
     assert compare_csv(path).recorded_word == word
-    assert compare_trials(path, stream_above=0).recorded_word == word
     assert compare_csv(write_table("trial_id,task\na,t\n")).stand_in is None
 
 

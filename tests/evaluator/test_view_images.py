@@ -163,7 +163,7 @@ def test_other_methods_stand_beside_the_twin_on_the_views_of_a_run(
     maker: Any, tmp_path: Path
 ) -> None:
     maker.run.derived_dir.mkdir(parents=True, exist_ok=True)
-    recorded, _, mask = write_views(maker.run.derived_dir)
+    recorded, _, _ = write_views(maker.run.derived_dir)
     other = np.clip(recorded.astype(int) + 3, 0, 255).astype(np.uint8)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / f"wrist_{STAMP}.png").write_bytes(png(other))
@@ -175,9 +175,6 @@ def test_other_methods_stand_beside_the_twin_on_the_views_of_a_run(
     assert found["twin"].value == results.get("views.all.psnr_db").value
     assert found["other"].value > found["twin"].value
     assert "every 8th frame" in found["other"].definition
-    masked = results.get("image.other.psnr_objects_db")
-    error = (recorded[mask] / 255.0 - other[mask] / 255.0) ** 2
-    assert masked.value == pytest.approx(-10 * np.log10(error.mean()), abs=1e-9)
     table = next(t for t in results.tables if t.id == "image_methods")
     assert [row[0] for row in table.rows] == ["twin", "other"]
     assert {view.method for view in comparison.views} == {"twin", "other"}

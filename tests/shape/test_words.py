@@ -117,12 +117,6 @@ WORDS = {
         names="remarks?|worth",
         under=("evaluator",),
     ),
-    "standing": Word(
-        use="session summary, update",
-        files="standing|news",
-        names="standing|news",
-        under=("evaluator/live",),
-    ),
     "ledger": Word(
         use="dropped (logged), drop log",
         text=r"\bdeclared (lost|loss|losses)\b|\bledger",

@@ -9,16 +9,15 @@ quietly change (16 bits to 8, transparency, grey to colour) is looked for in the
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from bridge.errors import BridgeError, GstError, PathNotFoundError
-from bridge.media.color import JPEG_MAGIC, MAX_PIXELS, decode_color, open_image
-from bridge.media.image_quality import ImageShapeError, as_float
+from bridge.media.color import JPEG_MAGIC, decode_color, open_image
+from bridge.media.image_quality import as_float
 from evaluator.compare.images.scores import (
     NUM_WORST,
     Variant,
@@ -42,19 +41,8 @@ from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Exclusion
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-READ = (".png", ".jpg", ".jpeg", ".npy")
-NOT_READ = {
-    ".exr": "high dynamic range",
-    ".hdr": "high dynamic range",
-    ".pfm": "high dynamic range",
-    ".tif": "TIFF",
-    ".tiff": "TIFF",
-    ".bmp": "BMP",
-    ".webp": "WebP",
-    ".npz": "an archive of arrays",
-}
-"""Images we do not read, named rather than passed over."""
-WANTED = "Wanted: 8-bit RGB as PNG or JPEG, or arrays (height, width, 3) of uint8 or 0..1 floats"
+READ = (".png", ".jpg", ".jpeg")
+WANTED = "Wanted: 8-bit RGB as PNG or JPEG"
 
 
 class ImageRefusedError(EvaluatorError):
@@ -75,9 +63,7 @@ class ImageSet:
     where: str
     """Folder or episode, for messages."""
     load: Mapping[str, Callable[[], np.ndarray]]
-    """Gives (height, width, 3), uint8 or float in 0..1, or raises a ``GstError``."""
-    refused: Mapping[str, str] = field(default_factory=dict)
-    """Views whose image is there and cannot be read at all, with the reason."""
+    """Gives (height, width, 3) of uint8, or raises a ``GstError``."""
     stored: str
     """For the stamp."""
 
@@ -89,60 +75,39 @@ def folder_set(name: str, folder: Path) -> ImageSet:
         folder: Where its images are; a path below it without its ending names the view.
 
     Raises:
-        PathNotFoundError: When there is no such folder.
-        EvaluatorError: When it holds no image.
+        EvaluatorError: When it holds no image, or two of one name.
     """
     if not folder.is_dir():
         raise PathNotFoundError(path=folder, what="folder of images", hint="Name a folder.")
-    found = list_files(folder)
-    refused = {
-        view: str(ImageRefusedError(name=paths[0].name, found=f"is {NOT_READ[_ending(paths[0])]}"))
-        for view, paths in list_files(folder, tuple(NOT_READ)).items()
-        if view not in found
-    }
-    for view, paths in found.items():
-        if len(paths) > 1:
-            names = " and ".join(path.name for path in paths)
-            refused[view] = f"two images of one name ({names}); keep one of them"
-    load = {view: partial(read_image, paths[0]) for view, paths in found.items()}
-    load = {view: call for view, call in load.items() if view not in refused}
-    if not load and not refused:
-        message = f"{folder} holds no image. {WANTED}."
-        raise EvaluatorError(message)
-    endings = sorted({_ending(paths[0]).lstrip(".") for paths in found.values()})
-    return ImageSet(
-        name=name,
-        where=str(folder),
-        load=load,
-        refused={view: reason for view, reason in refused.items() if view not in load},
-        stored=f"stored as {', '.join(endings)}" if endings else "stored in no known way",
-    )
-
-
-def list_files(folder: Path, endings: tuple[str, ...] = READ) -> dict[str, list[Path]]:
-    """Return the files with certain endings by view; hidden ones are nobody's images."""
-    found: dict[str, list[Path]] = {}
+    found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         hidden = any(part.startswith(".") for part in relative.parts)
-        if not hidden and _ending(path) in endings and path.is_file():
-            found.setdefault(relative.with_suffix("").as_posix(), []).append(path)
-    return found
-
-
-def _ending(path: Path) -> str:
-    return path.suffix.lower()
+        if not hidden and path.suffix.lower() in READ and path.is_file():
+            view = relative.with_suffix("").as_posix()
+            if view in found:
+                message = f"{folder} has {found[view].name} and {path.name}; keep one of them."
+                raise EvaluatorError(message)
+            found[view] = path
+    if not found:
+        message = f"{folder} holds no image. {WANTED}."
+        raise EvaluatorError(message)
+    endings = sorted({path.suffix.lower().lstrip(".") for path in found.values()})
+    return ImageSet(
+        name=name,
+        where=str(folder),
+        load={view: partial(read_image, path) for view, path in found.items()},
+        stored=f"stored as {', '.join(endings)}",
+    )
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read one image of shape (height, width, 3), uint8 or float in 0..1.
+    """Read one image of shape (height, width, 3) and 8 bits.
 
     Raises:
         ImageRefusedError: When it is not what can be compared; the message says what it is.
     """
     try:
-        if path.suffix.lower() == ".npy":
-            return _read_array(path)
         data = path.read_bytes()
         if data.startswith(PNG_MAGIC):
             return _read_png(path.name, data)
@@ -154,19 +119,6 @@ def read_image(path: Path) -> np.ndarray:
         found = f"cannot be read ({error.strerror or error})"
         raise ImageRefusedError(name=path.name, found=found) from error
     raise ImageRefusedError(name=path.name, found="is neither PNG nor JPEG inside")
-
-
-def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Read a mask: white is inside; grey or colour, PNG or JPEG.
-
-    Raises:
-        ImageRefusedError: When it cannot be read.
-    """
-    try:
-        return np.asarray(decode_color(path.read_bytes())[..., 0] > 127)
-    except (BridgeError, OSError) as error:
-        found = f"cannot be read as a mask ({error})"
-        raise ImageRefusedError(name=path.name, found=found) from error
 
 
 def _read_png(name: str, data: bytes) -> np.ndarray:
@@ -195,52 +147,8 @@ def _read_jpeg(name: str, data: bytes) -> np.ndarray:
     return decode_color(data)
 
 
-def _read_array(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ImageRefusedError(
-            name=path.name, found="is not an array of numbers in NumPy's format"
-        ) from error
-    if not isinstance(array, np.ndarray):
-        raise ImageRefusedError(name=path.name, found="is an archive of arrays")
-    found = _wrong_shape(array.shape)
-    if not found and array.size > 3 * MAX_PIXELS:
-        found = f"has {array.shape[0]} x {array.shape[1]} pixels, more than a camera"
-    if not found and array.dtype != np.uint8 and array.dtype.kind != "f":
-        bits = 8 * array.dtype.itemsize
-        found = f"holds {array.dtype} values of {bits} bits, whose white nobody has said"
-    if found:
-        raise ImageRefusedError(name=path.name, found=found)
-    if array.dtype == np.uint8:
-        return np.array(array)
-    values = np.array(array, dtype=np.float64)
-    if not np.isfinite(values).all():
-        count = int((~np.isfinite(values)).sum())
-        raise ImageRefusedError(name=path.name, found=f"holds {count} values that are not finite")
-    low, high = float(values.min()), float(values.max())
-    if low < 0 or high > 1:
-        found = (
-            f"holds values from {low:.3g} to {high:.3g}, outside 0..1 (high dynamic range, or not "
-            "clamped); clamp or tone-map it as the method's own evaluation does"
-        )
-        raise ImageRefusedError(name=path.name, found=found)
-    return values
-
-
-def _wrong_shape(shape: tuple[int, ...]) -> str:
-    if len(shape) == 3 and shape[2] == 3 and min(shape) > 0:
-        return ""
-    if len(shape) == 3 and shape[2] == 4:
-        return "has four channels; draw it over the background and drop the transparency"
-    if len(shape) == 3 and shape[0] == 3:
-        return f"has its channels first, as {shape}; transpose it to (height, width, 3)"
-    return f"has shape {shape}"
-
-
 SCOPE = "images"
 """What exclusions are from."""
-EMPTY_MASK = "no pixel of the mask is above 127: write what is inside as 255; scored without it"
 Scored = dict[Variant, ImageScore]
 
 
@@ -249,11 +157,6 @@ class Reference:
     """The recorded images that methods are compared with."""
 
     images: ImageSet
-    masks: Mapping[str, ImageSet] = field(default_factory=dict)
-    """Boolean images by the name of the mask."""
-    asked: frozenset[str] = frozenset()
-    """Masks that somebody gave for these views: a view without one is named. An object that is not
-    seen has no mask in a run's own views, and that is no lack."""
     split: str
     """Which images were held out, as far as anyone said."""
 
@@ -278,8 +181,6 @@ class _View:
     scores: Mapping[str, Scored]
     reasons: Mapping[str, str]
     """Why a method has no score, by method; by "" where the recorded image is unusable."""
-    unmasked: Mapping[str, str] = field(default_factory=dict)
-    """Why a mask that somebody gave does not count here, by its name."""
 
 
 def compare_methods(
@@ -287,16 +188,13 @@ def compare_methods(
 ) -> MethodReport:
     """Score every method on every view of the reference.
 
-    Args:
-        nets: For LPIPS; none leaves it out.
-
     Raises:
         EvaluatorError: When no method has a single view that can be scored, or no view is common.
     """
     left_out = [gone for method in methods for gone in _unpaired(reference.images, method)]
     wanted = [
         view
-        for view in sorted({*reference.images.load, *reference.images.refused})
+        for view in sorted(reference.images.load)
         if any(view in method.load for method in methods)
     ]
     found = spread(
@@ -309,11 +207,6 @@ def compare_methods(
         for method, reason in seen.reasons.items()
     ]
     scored = [method for method in methods if any(method.name in v.scores for v in views.values())]
-    left_out += [
-        Exclusion(episode=f"mask {name}: {view}", scope=SCOPE, reason=reason)
-        for view, seen in views.items()
-        for name, reason in seen.unmasked.items()
-    ]
     left_out += _without_scores(methods, scored, left_out)
     common = [v for v, seen in views.items() if all(m.name in seen.scores for m in scored)]
     if not scored or not common:
@@ -344,16 +237,15 @@ def _name(method: str, view: str) -> str:
 
 def _unpaired(reference: ImageSet, method: ImageSet) -> list[Exclusion]:
     """Name images without a counterpart, on either side."""
-    theirs, ours = {*method.load, *method.refused}, {*reference.load, *reference.refused}
+    theirs, ours = set(method.load), set(reference.load)
     missing = [(view, f"no image of this name in {method.where}") for view in sorted(ours - theirs)]
     extra = [
         (view, f"the reference has no such image ({reference.where})")
         for view in sorted(theirs - ours)
     ]
-    refused = [(view, reason) for view, reason in sorted(method.refused.items()) if view in ours]
     return [
         Exclusion(episode=_name(method.name, view), scope=SCOPE, reason=reason)
-        for view, reason in (*missing, *extra, *refused)
+        for view, reason in (*missing, *extra)
     ]
 
 
@@ -363,10 +255,7 @@ def _score_view(
     scores: dict[str, Scored] = {}
     reasons: dict[str, str] = {}
     try:
-        if view in reference.images.refused:
-            raise EvaluatorError(reference.images.refused[view])
         recorded = reference.images.load[view]()
-        masks, unmasked = _masks(reference, view, recorded)
     except GstError as error:
         return _View(size=(0, 0), scores={}, reasons={"": f"recorded image: {error}"})
     for method in methods:
@@ -375,32 +264,11 @@ def _score_view(
         try:
             rendered = method.load[view]()
             refuse_swapped(as_float(recorded), as_float(rendered))
-            scores[method.name] = score_variants(recorded, rendered, masks, nets=nets)
+            scores[method.name] = score_variants(recorded, rendered, {}, nets=nets)
         except GstError as error:
             reasons[method.name] = str(error)
     size = (recorded.shape[0], recorded.shape[1])
-    return _View(size=size, scores=scores, reasons=reasons, unmasked=unmasked)
-
-
-def _masks(
-    reference: Reference, view: str, recorded: np.ndarray
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Load the masks of one view, and say which were asked for and lack; it is scored without."""
-    found, lacking = {}, {}
-    for name, masks in reference.masks.items():
-        if view not in masks.load:
-            lacking[name] = f"no mask of this name in {masks.where}; scored without it"
-            continue
-        mask = masks.load[view]()
-        if mask.shape != recorded.shape[:2]:
-            raise ImageShapeError(
-                found=f"the mask is {mask.shape}, the recorded image {recorded.shape[:2]}"
-            )
-        if mask.any():
-            found[name] = mask
-        else:
-            lacking[name] = EMPTY_MASK
-    return found, {name: why for name, why in lacking.items() if name in reference.asked}
+    return _View(size=size, scores=scores, reasons=reasons)
 
 
 def _without_scores(

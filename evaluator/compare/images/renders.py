@@ -5,27 +5,21 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from bridge.episode.provenance import software
-from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.errors import GstError, UsageError
 from bridge.exchange.csv_export import seconds_text
 from bridge.media.color import decode_color
 from evaluator.compare.images.methods import (
     ImageSet,
-    MethodReport,
     Reference,
     compare_methods,
     folder_set,
-    list_files,
-    read_mask,
 )
-from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, Images, images_of, open_nets
+from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, images_of, open_nets
 from evaluator.compare.images.tables import (
     StampedMeasurement,
     StampedValue,
     cell_of,
-    rounded,
     stamped_table,
 )
 from evaluator.compare.images.views import (
@@ -40,7 +34,6 @@ from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
 from evaluator.measurements import slug
 from evaluator.metrics.image_protocol import UNSTATED, ImageOptions
-from evaluator.metrics.image_scores import METRICS
 from evaluator.metrics.lpips import PerceptualNet
 from evaluator.result import Table
 from evaluator.run_reader.episodes import DerivedFile
@@ -49,17 +42,13 @@ HEADLINE = ("psnr_db", "ssim_zero", "lpips_vgg_01")
 """Metrics of the first table, by the conventions of 3D Gaussian splatting papers."""
 _NOTE = (
     "Means over the views that every method has. SSIM with zeros beyond the border and LPIPS of "
-    "images in 0..1, as papers on 3D Gaussian splatting compute them; the next table has the other "
+    "images in 0..1, as papers on 3D Gaussian splatting compute them; results.json has the other "
     "conventions, which give other numbers. LPIPS is not computed without a backbone."
 )
 
 
-def method_tables(report: MethodReport, origin: str) -> tuple[Table, ...]:
-    """Return the headline table, and every view of every method."""
-    return _headline(report.numbers, origin), _per_view(report)
-
-
 def _headline(numbers: Mapping[str, Sequence[StampedMeasurement]], origin: str) -> Table:
+    """Lay the methods out, by the metrics of papers."""
     rows = []
     for method, found in numbers.items():
         raw = {number.metric.id: number for number in found if number.variant == RAW}
@@ -81,29 +70,8 @@ def _cell(found: Mapping[str, StampedMeasurement], metric: str) -> StampedValue:
     return StampedValue(value="not computed", stamp=found["psnr_db"].stamp)
 
 
-def _per_view(report: MethodReport) -> Table:
-    columns = [m for m in METRICS if any(m in view.values for view in report.views)]
-    shown = sorted(report.views, key=lambda v: (v.values.get("psnr_db", float("inf")), v.view_id))
-    return Table(
-        id="image_views",
-        title="Every view of every method, worst first",
-        columns=("view", "method", *(METRICS[metric].column for metric in columns)),
-        rows=tuple(
-            (view.view_id, view.method, *(rounded(view.values.get(m)) for m in columns))
-            for view in shown
-        ),
-        note="Raw. Protocols stand with the numbers in results.json. No PSNR: identical images.",
-    )
-
-
 def compare_folders(options: ImageOptions) -> Comparison:
-    """Compare folders of renders with a folder of recorded images, without any run.
-
-    Raises:
-        UsageError: When the reference or the renders are not named.
-        PathNotFoundError: When a folder is not there.
-        EvaluatorError: When nothing in them can be compared.
-    """
+    """Compare folders of renders with a folder of recorded images, without any run."""
     if options.reference is None or not options.renders:
         message = "images alone need --reference FOLDER and --renders METHOD=FOLDER."
         raise UsageError(message)
@@ -140,11 +108,8 @@ def compare_renders(
 
     Args:
         options: Whose folders; without any the report is empty.
-        sources: Every recorded episode by its id.
-        nets: For LPIPS; none leaves it out.
 
     Raises:
-        PathNotFoundError: When a folder is not there.
         EvaluatorError: When the run has no views, or nothing can be compared.
     """
     if not options.renders:
@@ -153,7 +118,7 @@ def compare_renders(
     if options.reference is not None:
         return _beside_folder(options, options.reference, nets)
     found, _ = newest_views(files, sources)  # what is left out, compare_views says
-    recorded, twin, masks = _sets_of(found, sources)
+    recorded, twin = _sets_of(found, sources)
     if not twin.load:
         message = (
             "the run has no rendered views to compare others with. Make them with robot-gst "
@@ -162,10 +127,7 @@ def compare_renders(
         raise EvaluatorError(message)
     split = agreed_setting([file.derived.settings for file in found], "holdout") or options.split
     names = other_names(recorded.load)
-    given = {name: _renamed(mask, names) for name, mask in _given_masks(options).items()}
-    reference = Reference(
-        images=recorded, masks={**masks, **given}, asked=frozenset(given), split=split
-    )
+    reference = Reference(images=recorded, split=split)
     others = [_renamed(method, names) for method in _methods(options, taken=(TWIN,))]
     return _report(reference, [twin, *others], nets)
 
@@ -174,8 +136,7 @@ def _beside_folder(
     options: ImageOptions, folder: Path, nets: Sequence[PerceptualNet]
 ) -> ViewReport:
     images = folder_set(folder.resolve().name, folder)
-    masks = _given_masks(options)
-    reference = Reference(images=images, masks=masks, asked=frozenset(masks), split=options.split)
+    reference = Reference(images=images, split=options.split)
     return _report(reference, _methods(options, taken=()), nets)
 
 
@@ -191,7 +152,7 @@ def _report(
         missing.append("split of renders: nobody said which images were held out (--split TEXT)")
     return ViewReport(
         measurements=tuple(n.measurement for found in report.numbers.values() for n in found),
-        tables=method_tables(report, f"{origin}; recorded: {reference.images.where}"),
+        tables=(_headline(report.numbers, f"{origin}; recorded: {reference.images.where}"),),
         exclusions=report.exclusions,
         missing=tuple(missing),
         views=report.views,
@@ -213,22 +174,6 @@ def _methods(options: ImageOptions, *, taken: Sequence[str]) -> list[ImageSet]:
     return found
 
 
-def _given_masks(options: ImageOptions) -> dict[str, ImageSet]:
-    """Return the folder of masks under the name that ids give it; nothing without one."""
-    folder = options.masks
-    if folder is None:
-        return {}
-    if not folder.is_dir():
-        raise PathNotFoundError(path=folder, what="folder of masks", hint="Name a folder.")
-    masks = ImageSet(
-        name=folder.name,
-        where=str(folder),
-        load={view: partial(read_mask, paths[0]) for view, paths in list_files(folder).items()},
-        stored="masks",
-    )
-    return {slug(folder.resolve().name): masks}
-
-
 def other_names(views: Iterable[str]) -> dict[str, str]:
     """Return what else a view of the run may be called, where only one view is called so."""
     found: dict[str, list[str]] = {}
@@ -244,42 +189,25 @@ def other_names(views: Iterable[str]) -> dict[str, str]:
 
 def _renamed(method: ImageSet, names: Mapping[str, str]) -> ImageSet:
     """Call the images of a method as the run calls its views."""
-    return replace(
-        method,
-        load={names.get(view, view): call for view, call in method.load.items()},
-        refused={names.get(view, view): reason for view, reason in method.refused.items()},
-    )
+    return replace(method, load={names.get(view, view): call for view, call in method.load.items()})
 
 
 def _sets_of(
     files: Sequence[DerivedFile], sources: Mapping[str, Source]
-) -> tuple[ImageSet, ImageSet, dict[str, ImageSet]]:
-    """Return recorded images, the twin's renders, and masks of the views of a run."""
+) -> tuple[ImageSet, ImageSet]:
+    """Return recorded images, and the twin's renders, of the views of a run."""
     recorded, rendered = {}, {}
-    masks: dict[str, dict[str, partial[np.ndarray]]] = {}
-    refused = {}
     for file in files:
         try:
             images = images_of(file.episode, opened(sources.get(file.derived.source_episode)))
-        except GstError as error:
-            refused[file.path.stem] = str(error)
+        except GstError:  # the twin's own views name it
             continue
         for key in images.color[RENDERED].keys() & images.color[RECORDED].keys():
             view = f"{key[0]}/{key[1]}"
             recorded[view] = partial(decode_color, images.color[RECORDED][key])
             rendered[view] = partial(decode_color, images.color[RENDERED][key])
-            for name in images.masks_of(key):
-                masks.setdefault(name, {})[view] = partial(_mask, images, name, key)
     where = "the run's views"
     return (
-        ImageSet(name="recorded", where=where, load=recorded, refused=refused, stored="recorded"),
+        ImageSet(name="recorded", where=where, load=recorded, stored="recorded"),
         ImageSet(name=TWIN, where=where, load=rendered, stored="stored in the run's views"),
-        {
-            name: ImageSet(name=name, where=where, load=load, stored="masks")
-            for name, load in masks.items()
-        },
     )
-
-
-def _mask(images: Images, name: str, key: tuple[str, int]) -> np.ndarray:
-    return images.masks_of(key)[name]

@@ -104,13 +104,7 @@ def score_variants(
     """Score one pair in every way but re-posed.
 
     Args:
-        recorded: Recorded image in RGB: bytes, or 0 to 1.
-        rendered: The image held against it: bytes, or 0 to 1.
-        masks: Pixels that count, by the name of the mask.
         nets: Networks that compute LPIPS where a variant asks for it; none without.
-
-    Raises:
-        ImageShapeError: When the sizes differ.
     """
     ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None), (AFFINE, None)]
     ways += [(variant, mask) for name, mask in masks.items() for variant in masked(name)]
@@ -174,12 +168,7 @@ def shrunk_u8(
 
 
 def open_nets(backbones: Mapping[NetName, Path]) -> tuple[PerceptualNet, ...]:
-    """Load the networks of LPIPS that were asked for; without one, torch stays out.
-
-    Raises:
-        LpipsWeightsError: When a backbone or the linear heads cannot be used.
-        MissingDependencyError: When torch is not installed.
-    """
+    """Load the networks of LPIPS that were asked for; without one, torch stays out."""
     if not backbones:
         return ()
     try:
@@ -272,11 +261,7 @@ class Images:
 def score_views(
     images: Images, *, nets: Sequence[PerceptualNet] = ()
 ) -> tuple[list[ViewScore], list[str]]:
-    """Score every rendered image of a views episode; what cannot be scored is a reason.
-
-    Args:
-        nets: For LPIPS; none leaves it out.
-    """
+    """Score every rendered image of a views episode; what cannot be scored is a reason."""
     rendered = sorted(images.color[RENDERED])
     # A network uses all cores and much memory by itself.
     done = spread(partial(_score, images, nets), rendered, threads=1 if nets else None)

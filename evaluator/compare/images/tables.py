@@ -62,11 +62,7 @@ def stamped_measurements(
     episodes: Sequence[str] = (),
     **part: str,
 ) -> list[StampedMeasurement]:
-    """Measure the mean of every metric that a variant can have.
-
-    Args:
-        part: Of the ids: which views, or whose renders.
-    """
+    """Measure the mean of every metric that a variant can have."""
     metrics = [*PLAIN_METRICS, *(LPIPS_METRICS if protocol.nets and variant.learned else ())]
     return [
         _stamped(quantities, metric, variant, scores, protocol, episodes, part)
@@ -158,11 +154,7 @@ def stamped_table(
     *,
     note: str,
 ) -> Table:
-    """Lay out rows of stamped values, with n and protocol behind the values.
-
-    Raises:
-        ValueError: When a row has another number of cells than columns.
-    """
+    """Lay out rows of stamped values, with n and protocol behind the values."""
     laid = []
     for front, values in rows:
         if len(front) != len(heads) or len(values) != len(columns):
@@ -200,11 +192,7 @@ _ALIGNED = tuple(
 
 
 def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
-    """List every view with its raw scores, and PSNR after each alignment.
-
-    Args:
-        scores: One for each view, in the order of the rows.
-    """
+    """List every view with its raw scores, and PSNR after each alignment."""
     others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]
     learned = [m for m in METRICS.values() if any(m.id in s.scores[RAW].values for s in scores)]
     others += [metric for metric in learned if metric not in PLAIN_METRICS]

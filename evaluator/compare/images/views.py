@@ -140,7 +140,6 @@ def compare_views(
 
     Args:
         sources: Every recorded episode by its id; views made from other bytes are left out.
-        nets: For LPIPS; none leaves it out.
         cache: What earlier evaluations scored; without one every view is.
     """
     cache = SummaryCache(None) if cache is None else cache

@@ -73,7 +73,6 @@ def panel(
     """Add axes that leave these margins [in] to the edges of the figure.
 
     Args:
-        figure: Gets the axes.
         left: Margin for the labels of the vertical axis [in].
         bottom: Margin for the labels of the horizontal axis [in].
         right: Margin [in].
@@ -87,7 +86,6 @@ def framed(figure: "Figure", box_in: tuple[float, float, float, float]) -> "Axes
     """Add axes at (left, bottom, width, height) [in] with two quiet spines.
 
     Args:
-        figure: Gets the axes.
         box_in: Left and bottom edge from the figure's corner, width and height [in].
     """
     width, height = (float(side) for side in figure.get_size_inches())
@@ -105,11 +103,7 @@ def framed(figure: "Figure", box_in: tuple[float, float, float, float]) -> "Axes
 
 
 def grid(axes: "Axes", which: str = "both") -> None:
-    """Draw hairlines behind the data.
-
-    Args:
-        which: The axis whose ticks get lines: ``x``, ``y`` or ``both``.
-    """
+    """Draw hairlines behind the data."""
     axes.grid(visible=True, axis=which, color=LIGHT["line"], linewidth=0.6)  # type: ignore[arg-type]
 
 
@@ -117,7 +111,6 @@ def percent_axis(axes: "Axes", which: str, label: str) -> None:
     """Run an axis from 0 to 100 %, with room for marks at both ends.
 
     Args:
-        axes: Axes whose data are in percent.
         label: What the axis shows, without its unit.
     """
     name = f"{label} (%)"
@@ -143,7 +136,6 @@ def legend(axes: "Axes", *, above_in: float = 0.05, columns: int = 2) -> None:
     """Put the legend above the axes, where no data can lie under it.
 
     Args:
-        axes: Axes whose artists have labels.
         above_in: Distance from the upper edge of the axes [in].
     """
     height = axes.get_position().height * float(axes.figure.get_size_inches()[1])  # type: ignore[union-attr]

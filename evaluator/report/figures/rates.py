@@ -104,7 +104,6 @@ def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:
 
     Args:
         measurements: Everything measured; gains in percentage points are drawn.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     found: dict[str, dict[str, Measurement]] = {}
     for measurement in measurements:
@@ -186,7 +185,6 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
 
     Args:
         groups: Success rates per task, condition and policy; only those with both rates are drawn.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     drawn = [group for group in groups if all(rate.value is not None for rate in group.pair)]
     if not drawn:
@@ -277,7 +275,6 @@ def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
 
     Args:
         groups: Success rates per task, condition and policy; one with neither rate is left out.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     known = [
         group

@@ -36,7 +36,6 @@ def tasks(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
 
     Args:
         groups: Success rates per task, condition and policy; only those with both rates are drawn.
-        word: What the recorded side is called: stand-in, real or recorded.
     """
     by_task: dict[str, list[RateGroup]] = {}
     for group in groups:
