@@ -39,7 +39,7 @@ BYTECODE = ("-W", "ignore", "-m", "compileall", "-qq", "-j", "0", "-x", SELDOM_I
 EXTRAS = {
     "demo": "demo",
     "test": "all,dev",
-    "test no-torch": "demo,video,realsense,ur,dev",
+    "test no-torch": "demo,cluster,video,realsense,ur,dev",
 }
 DEMO = {
     "open3d": (401, 903),
@@ -51,6 +51,7 @@ DEMO = {
     "scipy": (35, 118),
 }
 TEST = {
+    "ray": (79, 240),
     "numba": (62, 208),
     "opencv-python-headless": (61, 153),
     "atheris": (35, 110),

@@ -31,11 +31,11 @@ from splat.scans import QUIET, shelf_folder, shelf_scan
 
 from bridge.episode.run_folder import RunFolder
 from bridge.sources.folder.messages import read_index
+from twin.naming.scene_file import BACKGROUND_KEY, read_semantics
+from twin.naming.things import SemanticScene
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.rebuild.run import rebuild
 from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.semantics.result import SemanticScene
-from twin.scene.semantics.store import BACKGROUND_KEY, read_semantics
 from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
 from twin.scene.store.folder import read_scene
 

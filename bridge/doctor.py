@@ -40,6 +40,7 @@ EXTRAS = {
     "dashboard": Extra(
         "review pages, Rerun view", ("starlette", "uvicorn", "rerun-sdk", "simplejpeg")
     ),
+    "cluster": Extra("replays on Ray", ("ray",), is_optional=True),
     "standin": Extra(
         "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
     ),

@@ -83,7 +83,6 @@ GONE: dict[str, str] = {
         ("replay --engines-must-agree", "gate --engines-must-agree"),
         "--engine both replays in both and says where they differ.",
     ),
-    "replay --ray": "--workers N replays in N processes of this machine.",
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",

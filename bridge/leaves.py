@@ -114,6 +114,12 @@ LEAVES: dict[str, Leaf] = {
             ),
         ),
     ),
+    "cluster": Leaf(
+        modules=("twin.ray_cluster",),
+        extra="cluster",
+        purpose="replays on Ray",
+        entries={"runner": "twin.ray_cluster:RayRunner"},
+    ),
     "ur": Leaf(
         modules=("bridge.sources.ur",),
         extra="ur",

@@ -13,13 +13,13 @@ from scipy import ndimage
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
+from twin.naming.things import Mask, MaskSet
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.settings import InitialiseConfig
 
 DATA = Path(os.environ.get("GST_SHARED_DATA", ROOT.parent / "shared" / "data"))

@@ -1,11 +1,12 @@
 """What the core asks of soft bodies; the leaf ``soft`` answers."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 
+@runtime_checkable
 class SoftShape(Protocol):
     """A soft body at rest, in the frame of its object."""
 
@@ -14,6 +15,7 @@ class SoftShape(Protocol):
         """Its nodes."""
 
 
+@runtime_checkable
 class SoftHealth(Protocol):
     """Whether a soft body is still what it was."""
 
@@ -29,6 +31,7 @@ class SoftHealth(Protocol):
         """Say about what is wrong; empty when nothing is."""
 
 
+@runtime_checkable
 class SoftBodies(Protocol):
     """The soft part of a world, on the clock of the rigid one."""
 

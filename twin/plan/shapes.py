@@ -20,13 +20,13 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
+from twin.naming.scene_file import BACKGROUND_KEY, SEMANTICS_FILE, read_semantics
 from twin.plan.problem import Keypoint, Problem, Shape
 from twin.replay.rebuilt_scene import MOST_OFF, RebuiltScene, read_rebuilt_scene
 from twin.robot.model import load_robot
 from twin.scene.gaussians import read_ply
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import shape_mesh
-from twin.scene.semantics.store import BACKGROUND_KEY, SEMANTICS_FILE, read_semantics
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
 from twin.scene.store.folder import SCENE_FILE, SPLATS, UnreadableSceneError, read_record

@@ -60,6 +60,10 @@ class MotionReplay:
         """All take about as long."""
         return 1.0
 
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        return (self.run_path,)
+
     def path(self, sha256: str) -> Path:
         """Of the derived episode."""
         key = hash_settings({**self.settings(), "source": sha256, "id": self.calibration_id})

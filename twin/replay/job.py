@@ -77,6 +77,12 @@ class ReplayJob:
         bodies = 1 + len(self.task.soft_objects)
         return (1 + self.config.samples) * bodies * self.duration_s
 
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        scene = () if self.run_path is None else (self.run_path,)
+        robot = (Path(self.robot).resolve(),) if self.robot.endswith(".toml") else ()
+        return (self.episode_path, self.folder, *scene, *robot)
+
     def engines(self) -> tuple[Engine, ...]:
         """What replays it, the engine that decides first; a kinematic replay moves no bodies."""
         return self.config.engines()[: None if self.config.mode == "dynamic" else 1]

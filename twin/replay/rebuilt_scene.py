@@ -21,6 +21,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import BridgeError
 from bridge.task.task_file import ObjectModel, Task
 from twin.errors import TwinError
+from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import PosteriorDraw, ReplayConfig
 from twin.replay.scene import ReplayScene
@@ -29,7 +30,6 @@ from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
-from twin.scene.store.npz import UnreadableArraysError
 
 
 class UnreadablePosteriorError(TwinError):

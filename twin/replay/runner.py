@@ -14,6 +14,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
+from bridge.leaves import load_leaf
 from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.task_file import Task
@@ -83,6 +84,10 @@ class Preparation:
     def episode_path(self) -> Path:
         """Of the recorded episode."""
         return RunFolder.open(self.run_path).episodes_dir / f"{self.episode_id}.mcap"
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What a process on another machine must see."""
+        return (self.run_path, self.episode_path())
 
     def cost(self) -> float:
         """How long it takes, compared with others."""
@@ -258,10 +263,13 @@ def _trajectory_of(name: str) -> str:
 
 
 def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
-    """Replay all trial episodes of a run, in this process or in several."""
+    """Replay all trial episodes of a run: in this process, in several, or on a Ray cluster."""
     run.refuse_empty()
     workers = config.workers or default_size()
-    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
+    if config.ray:
+        runner: Runner = load_leaf("cluster", "runner")(config.ray, workers)
+    else:
+        runner = ProcessPool(workers) if workers > 1 else Serial()
     with runner:
         return replay_trajectories(run, config, output, runner)
 
@@ -290,7 +298,7 @@ def replay_trajectories(
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
-        run.derived_dir.mkdir(parents=True, exist_ok=True)
+        run.derived_dir.mkdir(parents=True, exist_ok=True)  # each node is asked whether it is there
     told: set[tuple[str, str, str]] = set()  # one cause spoils all replays of a plan
     with output.progress("replay", len(todo)) as advance:
         for done, row in enumerate(_replayed(todo, runner, output), start=1):

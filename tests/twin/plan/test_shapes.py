@@ -13,6 +13,8 @@ from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import SCANNED, Task, load_task
+from twin.naming.scene_file import write_semantics
+from twin.naming.things import Instance, SemanticScene
 from twin.plan.loop.nominal import SINGLE, PlanProposer
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.steer import tried_in
@@ -22,8 +24,6 @@ from twin.robot.model import load_robot
 from twin.scene.gaussians import GaussianCloud, write_ply
 from twin.scene.localise.result import LocalisedObject, missing
 from twin.scene.objects.decompose import shape_mesh
-from twin.scene.semantics.result import Instance, SemanticScene
-from twin.scene.semantics.store import write_semantics
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import mesh_ply
 from twin.scene.store.folder import (

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bridge.task.check import TABLE, nearest
+from twin.naming.colours import COLOUR_NAMES
+from twin.naming.words import SAME_COLOURS, SAME_NOUNS, colour_of, singular
 from twin.plan.ground.vocabulary import GroundingError, Thing, Vocabulary
 from twin.plan.ground.words import (
     ALL,
@@ -18,8 +20,6 @@ from twin.plan.ground.words import (
     Token,
     printable,
 )
-from twin.scene.semantics.colour import COLOUR_NAMES
-from twin.scene.semantics.language import SAME_COLOURS, SAME_NOUNS, colour_of, singular
 
 APART = 1.25
 """A thing is large beside one that it is so many times larger than, by volume."""

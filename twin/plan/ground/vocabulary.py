@@ -8,15 +8,8 @@ import numpy as np
 
 from bridge.task.task_file import BASKET, ObjectModel, Task
 from twin.errors import TwinError
-from twin.scene.semantics.colour import colour_name
-from twin.scene.semantics.language import (
-    KIND_NAMES,
-    colour_of,
-    kind_of,
-    label_of,
-    spoken_name,
-    words_of,
-)
+from twin.naming.colours import colour_name
+from twin.naming.words import KIND_NAMES, colour_of, kind_of, label_of, spoken_name, words_of
 
 KINDS = (
     "alternative",
@@ -66,7 +59,7 @@ class Thing:
     label: str
     """What the segmenter, or the task, calls it."""
     colour: str
-    """One of the names of ``twin.scene.semantics.colour``, or empty."""
+    """One of the names of ``twin.naming.colours``, or empty."""
     movable: bool
     container: bool
     size_m: tuple[float, float, float] | None = None

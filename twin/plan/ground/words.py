@@ -1,6 +1,6 @@
 """The closed words of the grammar, and how an instruction is cut into words.
 
-Nouns and colours are those of the scene and of the lexicon (``twin.scene.semantics.language``).
+Nouns and colours are those of the scene and of the lexicon (``twin.naming.words``).
 """
 
 import re

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from bridge.errors import UsageError
+from twin.naming.things import FeatureMap, Mask, MaskSet
 from twin.scene.foundation.loading import (
     HALF,
     IMAGENET,
@@ -26,7 +27,6 @@ from twin.scene.foundation.loading import (
     network_input,
     read_normalisation,
 )
-from twin.scene.semantics.result import FeatureMap, Mask, MaskSet
 
 SAM3_KIND = WeightsKind(
     name="SAM 3",

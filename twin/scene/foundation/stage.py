@@ -12,6 +12,8 @@ from bridge.episode.streams import RgbdFrame
 from bridge.errors import UsageError
 from bridge.task.task_file import Task
 from bridge.terminal import Advance
+from twin.naming.things import MaskSet, SemanticScene
+from twin.naming.words import spoken_name
 from twin.scene.foundation import models
 from twin.scene.foundation.loading import (
     Placement,
@@ -37,9 +39,7 @@ from twin.scene.semantics.features import (
     lift_reduced,
     save_features,
 )
-from twin.scene.semantics.language import spoken_name
 from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.semantics.result import MaskSet, SemanticScene
 from twin.scene.settings import ModelConfig
 
 MIN_SHOWN_PX = 64

@@ -11,6 +11,13 @@ from jaxtyping import Bool, Float
 from bridge.episode.streams import RgbdFrame
 from bridge.task.task_file import Task
 from bridge.terminal import Advance, Output
+from twin.naming.scene_file import (
+    BACKGROUND_KEY,
+    SEMANTICS_FILE,
+    read_semantics,
+    write_semantics,
+)
+from twin.naming.things import MaskSet, SemanticScene, SemanticsError
 from twin.scene.foundation.stage import ModelFindings, ask_models, embed_things
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import FrameChoice, load, spread
@@ -20,14 +27,7 @@ from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default, scene_from_masks
 from twin.scene.semantics.features import FEATURES_FILE, SceneFeatures, save_features
 from twin.scene.semantics.lift import Viewpoint
-from twin.scene.semantics.result import MaskSet, SemanticScene, SemanticsError
 from twin.scene.semantics.segment import SOURCE
-from twin.scene.semantics.store import (
-    BACKGROUND_KEY,
-    SEMANTICS_FILE,
-    read_semantics,
-    write_semantics,
-)
 from twin.scene.settings import ModelConfig
 
 MAX_VIEWPOINTS = 24

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, UInt16
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from twin.naming.colours import lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.semantics.colour import lab_from_srgb, without_shading
 from twin.scene.semantics.lift import Observation
 
 

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from twin.scene.semantics.colour import lab_from_srgb, without_shading
+from twin.naming.colours import lab_from_srgb, without_shading
 from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
 
 

@@ -10,15 +10,16 @@ from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
+from twin.naming.colours import colour_name
+from twin.naming.things import Instance, MaskSet, SemanticScene
+from twin.naming.words import kind_of, label_of
 from twin.scene.frames.rgbd import NEAR_M
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.associate import AssociateConfig, SmoothConfig, associate, smooth_shares
-from twin.scene.semantics.colour import colour_name
-from twin.scene.semantics.language import NAMED, Numbered, kind_of, label_of, numbered
+from twin.scene.semantics.language import NAMED, Numbered, numbered
 from twin.scene.semantics.lift import Viewpoint, observe, visible_weight
 from twin.scene.semantics.part_segmentation import Parts, PartsConfig, find_parts
-from twin.scene.semantics.result import Instance, MaskSet, SemanticScene
 from twin.scene.semantics.segment import (
     SOURCE,
     SegmentConfig,

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from bridge.whole_file import write_whole
+from twin.naming.things import FeatureMap, SemanticsError
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.semantics.lift import Viewpoint, lift_features
-from twin.scene.semantics.result import FeatureMap, SemanticsError
 
 FEATURES_FILE = "features.npz"
 FORMAT_VERSION = 1

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt16
 
 from bridge.geometry.camera import Camera
+from twin.naming.things import FeatureMap, MaskSet, SemanticsError
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
-from twin.scene.semantics.result import FeatureMap, MaskSet, SemanticsError
 
 MIN_WEIGHT = 0.05
 """A Gaussian that gives a frame less than this share of one pixel is not seen in it."""

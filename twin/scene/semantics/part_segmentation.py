@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from twin.scene.semantics.language import kind_of
+from twin.naming.words import kind_of
 from twin.scene.semantics.shape_descriptors import (
     HeightMap,
     HeightMapCavity,

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from twin.naming.colours import without_shading
 from twin.scene.semantics.cluster import (
     SurfacePoints,
     Voxels,
@@ -22,7 +23,6 @@ from twin.scene.semantics.cluster import (
     neighbour_pairs,
     numbered,
 )
-from twin.scene.semantics.colour import without_shading
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from bridge.geometry import se3
+from twin.naming.colours import colour_name, lab_from_srgb, without_shading
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.cluster import (
     SurfacePoints,
@@ -24,7 +25,6 @@ from twin.scene.semantics.cluster import (
     split_by_colour,
     split_by_valleys,
 )
-from twin.scene.semantics.colour import colour_name, lab_from_srgb, without_shading
 from twin.scene.semantics.height_tree import branches
 from twin.scene.semantics.patches import PatchConfig, cut_into_patches
 from twin.scene.semantics.shape_descriptors import ShapeDescriptors, measure_shape

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from twin.scene.semantics.result import UNKNOWN_SHAPE
+from twin.naming.things import UNKNOWN_SHAPE
 
 CONTAINER_RATIO = 1.8
 """Convex hull over filled volume; more, with a cavity that opens upwards, is a container."""

@@ -12,10 +12,10 @@ from jaxtyping import Float, Float32, Int, Int32
 from scipy import ndimage
 
 from bridge.errors import refuse_outside
+from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
-from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_BYTES = 64_000_000
 _NAMES = ("nodes_m", "tets", "mass_fraction", "spacing_m")

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy import ndimage
 
-from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
+from twin.npz import UnreadableArraysError, read_npz, write_npz
 
 MAX_VOXELS = 16_000_000
 """Larger files are refused."""

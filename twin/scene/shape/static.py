@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bridge.errors import refuse_outside
+from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView, ShapeError, VoxelBox, gather
 from twin.scene.shape.sdf import MAX_VOXELS, SdfGrid, distances_of_solid
-from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 FREE, SURFACE, UNSEEN = 0, 1, 2
 MIN_POINTS = 100

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+from twin.naming.words import kind_of
 from twin.plan.ground.goals import Grounding
 from twin.plan.ground.grammar import ground
 from twin.plan.ground.vocabulary import GroundingError, Thing, Vocabulary
-from twin.scene.semantics.language import kind_of
 
 KEYS = ("object", "container", "support", "reference", "first", "second")
 

@@ -9,6 +9,7 @@ import pytest
 
 from bridge.episode.run_folder import RunFolder
 from bridge.task.task_file import load_task
+from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.config import ReplayConfig
@@ -17,7 +18,6 @@ from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration
-from twin.scene.store.npz import UnreadableArraysError
 
 TASK = load_task("sloth_into_basket")
 

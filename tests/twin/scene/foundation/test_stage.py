@@ -16,6 +16,7 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
 from bridge.terminal import Output
+from twin.naming.things import Instance, SemanticScene
 from twin.scene.foundation.loading import WeightsError
 from twin.scene.foundation.models import ClipEmbedder
 from twin.scene.foundation.stage import (
@@ -32,7 +33,6 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.rebuild.run import rebuild
 from twin.scene.semantics.language import query
-from twin.scene.semantics.result import Instance, SemanticScene
 from twin.scene.settings import FitConfig, FrameConfig, InitialiseConfig, ModelConfig, RebuildConfig
 
 CAMERA = Camera(width=96, height=80, fx=90.0, fy=90.0, cx=48.0, cy=40.0)

@@ -14,11 +14,11 @@ import open3d
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from twin.naming.things import Mask, MaskSet
 from twin.scene.fit.initialise import fuse
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.semantics.lift import Viewpoint
-from twin.scene.semantics.result import Mask, MaskSet
 from twin.scene.settings import InitialiseConfig
 
 CAMERA = Camera(width=320, height=240, fx=285.0, fy=285.0, cx=160.0, cy=120.0)

@@ -7,12 +7,12 @@ import pytest
 from table_scene import World, make_world, table
 
 from bridge.geometry import se3
+from twin.naming.scene_file import UnreadableSemanticsError, read_semantics
+from twin.naming.things import Mask, MaskSet
 from twin.scene.foundation.things import add_semantics
 from twin.scene.gaussians import concatenate, moved_cloud
 from twin.scene.semantics.features import FeatureBasis, SceneFeatures
 from twin.scene.semantics.language import query
-from twin.scene.semantics.result import Mask, MaskSet
-from twin.scene.semantics.store import UnreadableSemanticsError, read_semantics
 
 T_ABOVE = se3.transform_from(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.1, 0.1, 0.02]))
 

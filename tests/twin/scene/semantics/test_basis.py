@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from twin.naming.things import FeatureMap
 from twin.scene.semantics.features import fit_basis
-from twin.scene.semantics.result import FeatureMap
 
 
 def maps_of(values: np.ndarray, num_maps: int = 3) -> list[FeatureMap]:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from skimage.color import rgb2lab
 
-from twin.scene.semantics.colour import COLOUR_NAMES, colour_name, lab_from_srgb
+from twin.naming.colours import COLOUR_NAMES, colour_name, lab_from_srgb
 
 
 @pytest.mark.parity

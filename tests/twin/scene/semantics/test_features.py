@@ -4,13 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twin.naming.things import FeatureMap, SemanticsError
 from twin.scene.semantics.features import (
     FeatureBasis,
     SceneFeatures,
     fit_basis,
     save_features,
 )
-from twin.scene.semantics.result import FeatureMap, SemanticsError
 
 
 def low_rank_maps(channels: int = 12, rank: int = 3, seed: int = 0) -> list[FeatureMap]:

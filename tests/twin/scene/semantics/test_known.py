@@ -8,19 +8,12 @@ from table_scene import World
 
 from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import load_task
+from twin.naming.things import SemanticScene
+from twin.naming.words import kind_of, label_of, names_of
 from twin.scene.gaussians import as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
-from twin.scene.semantics.language import (
-    MIN_SPLATS,
-    NAMED,
-    kind_of,
-    label_of,
-    names_of,
-    numbered,
-    query,
-)
-from twin.scene.semantics.result import SemanticScene
+from twin.scene.semantics.language import MIN_SPLATS, NAMED, numbered, query
 
 
 def masks(labels: np.ndarray, **keys: tuple[int, ...]) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ import table_scene
 from table_scene import World, iou
 
 from bridge.geometry.camera import Camera
+from twin.naming.things import FeatureMap, Mask, MaskSet, SemanticsError
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_from_masks
@@ -16,7 +17,6 @@ from twin.scene.semantics.lift import (
     render_labels,
     visible_weight,
 )
-from twin.scene.semantics.result import FeatureMap, Mask, MaskSet, SemanticsError
 
 SMALL = Viewpoint(
     camera=Camera(width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0), T_base_camera=np.eye(4)

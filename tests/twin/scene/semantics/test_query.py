@@ -3,8 +3,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from twin.scene.semantics.language import Query, kind_of, query, words_of
-from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
+from twin.naming.things import Instance, SemanticScene, SemanticsError
+from twin.naming.words import kind_of, words_of
+from twin.scene.semantics.language import Query, query
 
 SIZES_M = {
     "red cube": (0.04, 0.04, 0.04),

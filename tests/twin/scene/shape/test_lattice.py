@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from solid_shapes import ball_shape, grid, shape_of
 
+from twin.npz import UnreadableArraysError, write_npz
 from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.lattice import Lattice, lattice, tet_volumes_m3
 from twin.scene.shape.reconstruct import ObjectShape
-from twin.scene.store.npz import UnreadableArraysError, write_npz
 
 
 @pytest.fixture(scope="module")

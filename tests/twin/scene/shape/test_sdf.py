@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twin.npz import UnreadableArraysError, read_npz, write_npz
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
-from twin.scene.store.npz import UnreadableArraysError, read_npz, write_npz
 
 VOXEL, RADIUS = 0.004, 0.04
 

@@ -9,6 +9,7 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
+from twin.npz import UnreadableArraysError
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.shape.from_training import (
     from_outside_m,
@@ -18,7 +19,6 @@ from twin.scene.shape.from_training import (
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import FREE, SURFACE, UNSEEN, StaticConfig, StaticSdf, static_sdf
-from twin.scene.store.npz import UnreadableArraysError
 
 TASK, POSES = cast_views.TASK, cast_views.POSES
 COARSE = StaticConfig(voxel_m=0.012, height_m=0.3)

@@ -14,8 +14,8 @@ from bridge.errors import InvalidRecordError, PathNotFoundError
 from bridge.geometry import se3
 from bridge.whole_file import write_whole
 from twin.errors import UnreadableFileError
-from twin.scene.semantics.result import Instance, SemanticScene, SemanticsError
-from twin.scene.store.npz import UnreadableArraysError, read_npz
+from twin.naming.things import Instance, SemanticScene, SemanticsError
+from twin.npz import UnreadableArraysError, read_npz
 
 SEMANTICS_FILE = "semantics.npz"
 FORMAT_VERSION = 1

@@ -1,0 +1,172 @@
+"""Which words mean the same, what things look like and what parts they have."""
+
+import re
+from collections.abc import Iterable
+
+from twin.naming.colours import COLOUR_NAMES
+
+SHAPE_WORDS = {
+    "open container": (
+        "container", "basket", "box", "bin", "tray", "bowl", "bucket", "crate", "cup", "mug",
+        "pot",
+    ),
+    "cube": ("cube", "block", "brick", "box", "dice"),
+    "box": ("box", "block", "brick", "carton", "package", "case"),
+    "flat box": ("box", "book", "card", "plate", "board", "tablet"),
+    "cylinder": ("cylinder", "can", "cup", "mug", "bottle", "tube", "jar"),
+    "ball": ("ball", "sphere", "orange", "apple"),
+    "toy": ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll"),
+}  # fmt: skip
+"""What a thing of a shape may be called."""
+ANY_THING = ("object", "thing", "item", "stuff")
+ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
+KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal", "plush"), "other": ()}
+"""What every thing of a kind may be called, see ``kind_of``."""
+TYPICAL_COLOURS = {
+    "duck": ("yellow", "orange"),
+    "sloth": ("brown", "beige", "grey"),
+    "teddy": ("brown", "beige"),
+    "orange": ("orange",),
+    "apple": ("red", "green"),
+}
+"""A shape alone does not tell a duck from a sloth; its colour may."""
+PART_WORDS = {
+    "rim": ("rim", "edge", "lip"),
+    "floor": ("floor", "bottom", "inside", "cavity"),
+    "walls": ("wall", "side"),
+    "handle": ("handle", "grip", "ear"),
+    "body": ("body", "torso", "belly", "trunk"),
+    "head": ("head", "face", "beak"),
+    "limbs": ("limb", "leg", "arm", "foot", "hand", "paw", "wing"),
+}
+SAME_COLOURS = {
+    "gray": "grey", "silver": "grey", "charcoal": "grey",
+    "violet": "purple", "lilac": "purple", "mauve": "purple",
+    "tan": "beige", "cream": "beige", "ivory": "beige", "khaki": "beige",
+    "turquoise": "cyan", "teal": "cyan", "aqua": "cyan",
+    "crimson": "red", "scarlet": "red", "ruby": "red", "vermilion": "red",
+    "navy": "blue", "azure": "blue", "cobalt": "blue",
+    "emerald": "green", "olive": "green", "lime": "green", "jade": "green",
+    "golden": "yellow", "gold": "yellow", "amber": "yellow",
+    "chocolate": "brown", "magenta": "pink",
+}  # fmt: skip
+SAME_NOUNS = {
+    "duckling": "duck", "ducky": "duck", "duckie": "duck", "plushie": "plush", "plushy": "plush",
+    "hamper": "basket", "receptacle": "container", "vessel": "container", "pail": "bucket",
+    "cuboid": "block", "die": "dice",
+}  # fmt: skip
+"""Nouns that are another word for one of the lexicon."""
+SMALL_WORDS = ("the", "a", "an", "all", "of", "on", "in", "any", "every", "my", "this", "that")
+SIZES = ("small", "little", "tiny", "large", "big", "open", "flat", "tall")
+
+
+def words_of(text: str) -> list[str]:
+    """Lower-case words, plurals made singular, possessives cut, articles left out."""
+    cleaned = "".join(c if c.isalnum() else " " for c in text.lower().replace("'s", " "))
+    words = (singular(word) for word in cleaned.split() if word not in SMALL_WORDS)
+    return [SAME_NOUNS.get(word, word) for word in words]
+
+
+def singular(word: str) -> str:
+    """Cut a plural ending: ducks, boxes, berries; glass stays."""
+    irregular = {"feet": "foot", "dice": "dice", "teddies": "teddy", "duckies": "ducky"}
+    if word in irregular:
+        return irregular[word]
+    if word.endswith("ies") and len(word) > 4:
+        return word[:-3] + "y"
+    if word.endswith(("xes", "ches", "shes", "sses")):
+        return word[:-2]
+    if word.endswith("s") and not word.endswith(("ss", "us")) and len(word) > 3:
+        return word[:-1]
+    return word
+
+
+def colour_of(word: str) -> str | None:
+    """The colour a word names, or None."""
+    word = SAME_COLOURS.get(word, word)
+    return word if word in COLOUR_NAMES else None
+
+
+def part_of(word: str) -> str | None:
+    """The part a word names, or None."""
+    return next((part for part, names in PART_WORDS.items() if word in names), None)
+
+
+def spoken_name(key: str) -> str:
+    """An id of a task file as a person would say it: ``duck_1`` is a duck."""
+    return re.sub(r"[_\d]+", " ", key).strip()
+
+
+def shape_in(label: str) -> str | None:
+    """The longest shape whose name ends a label of the default segmenter, or None.
+
+    What is called open, and may be a container, is one.
+    """
+    words = words_of(label)
+    if "open" in words and words[-1] in SHAPE_WORDS["open container"]:
+        return "open container"
+    ends = [shape for shape in SHAPE_WORDS if label == shape or label.endswith(" " + shape)]
+    return max(ends, key=len, default=None)
+
+
+def names_of(label: str) -> set[str]:
+    """Nouns that a label answers to: its own words, its kind, what its shape may be called."""
+    names = set(words_of(label)) | set(ANY_THING) | set(KIND_NAMES[kind_of(label)])
+    shape = shape_in(label)
+    if shape is not None:
+        colours = {colour_of(word) for word in words_of(label)} - {None}
+        names |= {
+            name
+            for name in SHAPE_WORDS[shape]
+            if name not in TYPICAL_COLOURS or not colours or colours & set(TYPICAL_COLOURS[name])
+        }
+    return names
+
+
+def known_words() -> set[str]:
+    """Every noun the lexicon has."""
+    nouns: Iterable[tuple[str, ...]] = (*SHAPE_WORDS.values(), ANY_THING, ANIMALS)
+    return {name for group in nouns for name in group}
+
+
+def kind_of(label: str) -> str:
+    """Which parts to look for: "container", "animal" or "other"."""
+    shape, words = shape_in(label), words_of(label)
+    if shape == "open container" or (
+        shape is None and _any_of(words, SHAPE_WORDS["open container"])
+    ):
+        return "container"
+    if shape == "toy" or (shape is None and _any_of(words, ANIMALS)):
+        return "animal"
+    return "other"
+
+
+def _any_of(words: list[str], names: tuple[str, ...]) -> bool:
+    return any(word in names for word in words)
+
+
+def label_of(key: str, colour: str, *, is_open: bool, shape: str = "") -> str:
+    """What a known object is called: its name in the task, with its colour.
+
+    A box that is open says so, because "box" alone may be either. A name that is nothing but a
+    colour gets its shape: "red" is a red cube.
+
+    Args:
+        is_open: Whether it has a cavity that opens upwards.
+        shape: One of ``SHAPE_WORDS``; empty where nobody knows.
+    """
+    name = spoken_name(key)
+    words = words_of(name)
+    if shape and words and all(colour_of(word) is not None for word in words):
+        name = f"{name} {shape}"
+        words = words_of(name)
+    either = (
+        bool(words)
+        and words[-1] in SHAPE_WORDS["box"]
+        and words[-1] in SHAPE_WORDS["open container"]
+    )
+    if is_open and either and "open" not in words:
+        name = f"open {name}"
+    if any(colour_of(word) is not None for word in words):
+        return name
+    return f"{colour} {name}"

@@ -1,0 +1,276 @@
+"""Pieces of work as tasks of a Ray cluster, which needs a token.
+
+Ray 2.60 without a token runs anybody's code, and its control service listens on every interface
+even where a loopback address was asked for (measured), so a cluster without one is refused.
+"""
+
+import ipaddress
+import os
+import secrets
+import socket
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from bridge.episode import provenance
+from bridge.errors import GstError, MissingDependencyError, UsageError
+from bridge.process_pool import (
+    ATTEMPTS,
+    Answer,
+    Failed,
+    Function,
+    Item,
+    do,
+    lost,
+)
+from twin.errors import TwinError
+from twin.physics.config import ENGINES
+
+LOCAL = "local"
+LOOPBACK = "127.0.0.1"
+WINDOW = 2
+"""Tasks per processor that are handed over before the first are back: one waits while one runs."""
+MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
+NICENESS = "RAY_worker_niceness"
+"""Ray gives way to everything else on a machine (15) unless told otherwise."""
+HIDDEN_LINES = "RAY_DEDUP_LOGS_SKIP_REGEX"
+"""Ray tells of each lost process on standard output, in the middle of what a program reads there;
+what was lost is in the answers."""
+ENVIRONMENT = (MODE, TOKEN, TOKEN_PATH, NICENESS, HIDDEN_LINES)
+ANSWER_S = 5.0
+"""How long the head of a cluster may take to accept a connection."""
+LOOK_S, EMPTY_LOOKS = 60.0, 5
+"""How often a cluster from which nothing comes is asked for its processors, and how often it may
+have none: one that makes nodes when they are asked for needs some minutes."""
+TOKEN_FILE = Path(".ray") / "auth_token"
+"""Below the home folder; where Ray itself looks last."""
+
+
+class RayClusterError(TwinError):
+    """The cluster cannot be reached or used."""
+
+
+@runtime_checkable
+class NeedsPaths(Protocol):
+    """Work that reads and writes files by their path."""
+
+    def needed_paths(self) -> tuple[Path, ...]:
+        """What must be there."""
+
+
+class RayRunner:
+    """Does pieces of work as Ray tasks; see ``bridge.process_pool.Runner``."""
+
+    def __init__(self, address: str, workers: int) -> None:
+        """Connect later."""
+        self._address, self._workers = address, workers
+        self._ray: Any = None
+        self._first: list[Any] = []
+        self._before: dict[str, str | None] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> "RayRunner":
+        """Connect, or start a cluster on the loopback address; refuses one without a token."""
+        self._before = {name: os.environ.get(name) for name in ENVIRONMENT}
+        if self._address == LOCAL:
+            # Ray leaves its logs behind, a hundred files for each start.
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="gst-ray-", ignore_cleanup_errors=True
+            )
+        try:
+            self._ray = _connect(
+                self._address, self._workers, None if self._folder is None else self._folder.name
+            )
+        except BaseException:
+            self._restore()
+            raise
+        # Ray starts processes with the first tasks: they import while this process does.
+        first = self._ray.remote(num_cpus=1)(code_version)
+        self._first = [first.remote() for _ in range(self._processors())]
+        return self
+
+    def run(
+        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+    ) -> Iterator[tuple[Item, Answer | Failed]]:
+        """See ``Runner``; Ray itself begins what lost its node once more."""
+        ray = self._ray
+        most = WINDOW * self._processors()
+        task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_task)
+        todo = deque(sorted(items, key=cost, reverse=True))
+        running: dict[Any, Item] = {}
+        while todo or running:
+            while todo and len(running) < most:
+                item = todo.popleft()
+                running[task.remote(function, item, code_version())] = item
+            for reference in self._done(list(running)):
+                item = running.pop(reference)
+                try:
+                    yield item, ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    yield item, lost(f"Ray lost it: {_first_line(error)}")
+
+    def _done(self, running: list[Any]) -> list[Any]:
+        """Wait until something is done; give up after minutes without a processor."""
+        empty = 0
+        while empty < EMPTY_LOOKS:
+            done, _ = self._ray.wait(running, num_returns=1, timeout=LOOK_S)
+            if done:
+                return list(done)
+            empty = 0 if self._ray.cluster_resources().get("CPU", 0) else empty + 1
+        message = (
+            f"the Ray cluster at {self._address} has had no processor for "
+            f"{LOOK_S * EMPTY_LOOKS / 60:.0f} minutes: all its nodes ended, or none was started "
+            "beside its head. What was done is kept. Start a node, then run the command again."
+        )
+        raise RayClusterError(message)
+
+    def _processors(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def __exit__(self, *_: object) -> None:
+        """Leave; a cluster started here ends, any other one goes on."""
+        if self._ray is not None:
+            self._first.clear()
+            self._ray.shutdown()
+            self._ray = None
+        self._restore()
+
+    def _restore(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _connect(address: str, workers: int, folder: str | None) -> Any:
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == LOCAL:
+        os.environ[TOKEN] = _own_token()
+        os.environ.pop(TOKEN_PATH, None)
+        os.environ.setdefault(NICENESS, "0")  # as processes without Ray have
+        settings |= {"num_cpus": workers, "include_dashboard": False, "_temp_dir": folder}
+    else:
+        _check_token()
+        _check_somebody_listens(address)
+    if address == LOCAL or is_loopback(address):
+        # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
+        settings["_node_ip_address"] = LOOPBACK
+    os.environ[MODE] = "token"
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault(HIDDEN_LINES, ".*")
+    try:
+        import ray  # noqa: PLC0415  # seconds, and only with --ray
+    except ImportError as error:
+        raise MissingDependencyError(package="ray", extra="cluster", purpose="--ray") from error
+    try:
+        ray.init(address=address, **settings)
+    except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        ray.shutdown()
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. It must have been started "
+            f"with {MODE}=token and the same token as here; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
+    return ray
+
+
+@cache
+def _own_token() -> str:
+    """The token of clusters started here: one for each process, which Ray reads only once."""
+    return secrets.token_hex(32)
+
+
+def _check_token() -> None:
+    """Refuse to speak to a cluster that lets anybody in."""
+    if os.environ.get(MODE, "token") != "token":
+        message = f"{MODE} is {os.environ[MODE]!r}: --ray only speaks to a cluster with tokens."
+        raise UsageError(message)
+    if os.environ.get(TOKEN) or os.environ.get(TOKEN_PATH):
+        return
+    if not (Path.home() / TOKEN_FILE).is_file():
+        message = (
+            f"--ray needs the cluster's token: set {TOKEN_PATH} to the file that holds it "
+            f"(or put it at ~/{TOKEN_FILE}). docs/scale.md says how to make one."
+        )
+        raise UsageError(message)
+
+
+def _check_somebody_listens(address: str) -> None:
+    """Ray itself tries for minutes, and tells its tries to the terminal."""
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        message = f"--ray {address!r} is not an address: give HOST:PORT of the head, or {LOCAL}."
+        raise UsageError(message)
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        message = (
+            f"no Ray cluster to use at {address}: {_first_line(error)}. Start its head there: "
+            "ray start --head, with a token; see docs/scale.md."
+        )
+        raise RayClusterError(message) from error
+
+
+def is_loopback(address: str) -> bool:
+    """Say whether HOST:PORT can only be this machine."""
+    host = address.rpartition(":")[0].strip("[]") or address
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def code_version() -> str:
+    """What decides the bytes of a replay, besides its job."""
+    # A second, while which processes of a cluster start.
+    from twin.physics.engines import engine_version  # noqa: PLC0415
+    from twin.replay.job import REPLAY_VERSION  # noqa: PLC0415
+
+    engines = []
+    for engine in ENGINES:
+        with suppress(MissingDependencyError):
+            engines.append(engine_version(engine))
+    about = provenance.software()
+    return f"{about['version']}, replays {REPLAY_VERSION}, {', '.join(engines)}"
+
+
+def _task(function: Function, item: Any, version: str) -> Answer | Failed:
+    """One piece of work on some node."""
+    problem = _out_of_place(item, version)
+    return do(function, item) if problem is None else Failed(message=problem, known=True)
+
+
+def _out_of_place(item: Any, version: str) -> str | None:
+    """Say why a node cannot do a piece of work; None when it can."""
+    node = socket.gethostname()
+    if version != code_version():
+        return (
+            f"node {node} runs robot-gst {code_version()}, not {version} as here: install the same "
+            "version on every node"
+        )
+    paths = item.needed_paths() if isinstance(item, NeedsPaths) else ()
+    for path in paths:
+        if not path.exists():
+            return (
+                f"node {node} does not see {path}: every node reads and writes the run folder "
+                "under the same path, so share it between them"
+            )
+    return None
+
+
+def _first_line(error: BaseException) -> str:
+    if isinstance(error, GstError):
+        return str(error)
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if lines else type(error).__name__).rstrip(".")
