@@ -268,7 +268,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     assert again is not None
     assert again.calibration_id != before
     damaged = {**known.record, "posterior": {"tasks": {TASK.name: {"draws": [{"weight": 1.0}]}}}}
-    with pytest.raises(UnreadablePosteriorError, match="bias_m"):
+    with pytest.raises(UnreadablePosteriorError, match="finger_pair_friction"):
         posterior_of(Calibration(record=damaged, cameras={}), TASK)
 
 
