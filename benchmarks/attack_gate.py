@@ -102,8 +102,8 @@ def prepare(folder: Path, task_name: str) -> Stage:
     from bridge.robots.default import ARM_JOINTS, MAX_WIDTH_M, ROBOT_NAME
     from bridge.robots.robot import resolve_mesh
     from bridge.task.task_file import load_task
+    from twin.gate.live import LiveView
     from twin.gate.twin_process import Look, look
-    from twin.scene.localise.live import LiveView
 
     path = folder / "run"
     run = RunFolder.open(path) if path.is_dir() else RunFolder.create(path)

@@ -114,8 +114,8 @@ def ask(episode: Any, config: Any, twin: Any, calibration: Any = None) -> tuple[
     from bridge.episode import streams
     from bridge.task.find import chosen_task_file
     from twin.gate.gate import JudgedTasks
+    from twin.gate.live import LiveView
     from twin.gate.service import make_gate
-    from twin.scene.localise.live import LiveView
 
     ((stamp_ns, plan),) = streams.plans(episode)
     perception = LiveView(config.cell, calibration)

@@ -73,8 +73,8 @@ def ask(path: Path, settings: Any, run: Any, tasks: Any, twin: Any) -> Any:
     from bridge.episode import streams
     from bridge.episode.reader import Episode
     from bridge.episode.topics import JOINT_STATES, PLAN, cell_topic, is_truth
+    from twin.gate.live import LiveView
     from twin.gate.service import make_gate
-    from twin.scene.localise.live import LiveView
     from twin.scene.store.calibration import read_calibration
 
     episode = Episode.open(path)

@@ -34,10 +34,12 @@ def replay(
         output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
+    from twin.calibrate.physics.imported import replay_imported
     from twin.replay.runner import replay_run
     from twin.replay.summary import describe_run
 
-    summary = replay_run(RunFolder.open(run), config, output)
+    folder = RunFolder.open(run)
+    summary = replay_run(folder, config, output, replay_imported(folder, config, output))
     output.result(summary, describe_run(summary))
     if summary["skipped_episodes"] or any(row["error"] for row in summary["rows"]):
         return 1
@@ -175,7 +177,7 @@ def calibrate(
         raise UsageError(message)
     if config.posterior:
         from bridge.process_pool import default_size
-        from twin.replay.posterior import calibrate_posterior, describe_posterior
+        from twin.calibrate.posterior import calibrate_posterior, describe_posterior
 
         workers = config.workers or default_size()
         posterior, calibration_id = calibrate_posterior(

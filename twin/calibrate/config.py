@@ -42,7 +42,7 @@ class CalibrateConfig:
     most 8, when no number is given."""
 
     def __post_init__(self) -> None:
-        """Refuse a number of postures nothing can be found from."""
+        """Refuse numbers with which nothing can be found."""
         refuse_outside(
             self,
             {

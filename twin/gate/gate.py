@@ -141,7 +141,7 @@ class UndecidedError(TwinError):
 
 @runtime_checkable
 class Perception(Protocol):
-    """What the gate sees of the cell: ``twin.scene.localise.live.LiveView``, or a fake."""
+    """What the gate sees of the cell: ``twin.gate.live.LiveView``, or a fake."""
 
     def urdf(self) -> str | None:
         """The robot description."""

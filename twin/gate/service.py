@@ -173,7 +173,7 @@ def claim_gate(session: Any, cell: str) -> None:
 def run_gate(path: Path, config: GateConfig, output: Output) -> int:
     """Judge plans until SIGINT or SIGTERM; both end with exit code 0."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
-    from twin.scene.localise.live import LiveView  # noqa: PLC0415
+    from twin.gate.live import LiveView  # noqa: PLC0415
     from twin.scene.store.calibration import read_calibration  # noqa: PLC0415
 
     if not CELL_NAME.match(config.cell):

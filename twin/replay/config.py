@@ -1,8 +1,8 @@
 """Settings of replays, of what their samples vary and of comparisons; imports nothing heavy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -49,17 +49,6 @@ class PosteriorDraw:
     something that the twin does not have."""
     wrong_no: float
     """Chance that one succeeds although this replay fails."""
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> "PosteriorDraw":
-        """Read what ``calibration.json`` keeps of one."""
-        x, y = record["bias_m"]
-        boxes = []
-        for box in record.get("boxes", ()):
-            a, b, c = box["centre_of_mass"]
-            centre = (float(a), float(b), float(c))
-            boxes.append(BoxDraw(**{**box, "centre_of_mass": centre}))
-        return cls(**{**record, "bias_m": (float(x), float(y)), "boxes": tuple(boxes)})
 
 
 UNKNOWN_POSE_M = 0.005

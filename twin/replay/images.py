@@ -7,7 +7,7 @@ the recorded hand lags behind, and would get into their view.
 Cameras that were calibrated are where the calibration has them, the others where ``/tf`` does.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from twin.scene.movable_scene import MovableScene, read_movable_scene
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import carried_camera
 from twin.scene.skinning import Binding, bind, pose_cloud
-from twin.scene.store.calibration import MountedCamera, read_calibration, without_joints
+from twin.scene.store.calibration import read_calibration, without_joints
 from twin.scene.store.folder import read_scene
 
 RATE_HZ = 5.0
@@ -87,20 +87,22 @@ def render_replay(
     for camera_id in streams.camera_ids(episode):
         info = streams.camera_info(episode, camera_id)
         stamps = _stamps(episode, camera_id, result, start_ns, executed=executed)
-        seen = _Eye(tree=tree)
-        if camera_id in places:
-            seen = _calibrated(episode, camera_id, places[camera_id], stamps)
+        seen, lost = tree, frozenset[int]()
+        place, stamps_ns = places.get(camera_id), np.array(stamps, dtype=np.int64)
+        if place is not None:  # objects were localised through it as it is mounted
+            seen = calibrated_tree_at(episode, camera_id, place, stamps_ns)
+            lost = without_joints(episode, place, stamps_ns)
         T_tcp_camera = (
-            _mounting(episode, seen.tree, info.frame_id, result, robot_of(scene.urdf).base_frame)
+            _mounting(episode, seen, info.frame_id, result, robot_of(scene.urdf).base_frame)
             if planned
             else None
         )
         for stamp_ns in stamps:
-            if T_tcp_camera is None and stamp_ns in seen.lost_ns:
+            if T_tcp_camera is None and stamp_ns in lost:
                 continue
             index = int(np.abs(result.stamps_ns - (stamp_ns - start_ns)).argmin())
             if T_tcp_camera is None:
-                T = seen.tree.T_root_frame(info.frame_id, stamp_ns)
+                T = seen.T_root_frame(info.frame_id, stamp_ns)
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
             view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
@@ -114,26 +116,6 @@ def render_replay(
                     data=encode_jpeg(view.image_u8()),
                 ),
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Eye:
-    """Where a camera was."""
-
-    tree: TransformTree
-    lost_ns: frozenset[int] = frozenset()
-    """Instants at which nobody knows."""
-
-
-def _calibrated(
-    episode: Episode, camera_id: str, place: MountedCamera, stamps: Sequence[int]
-) -> _Eye:
-    """A camera as it is mounted: objects were localised through it as it is."""
-    stamps_ns = np.array(stamps, dtype=np.int64)
-    return _Eye(
-        tree=calibrated_tree_at(episode, camera_id, place, stamps_ns),
-        lost_ns=without_joints(episode, place, stamps_ns),
-    )
 
 
 def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:

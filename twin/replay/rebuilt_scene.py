@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -86,9 +87,9 @@ def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, .
     """
     draws = _posterior(calibration, task).get("draws", [])
     try:
-        return tuple(PosteriorDraw.from_record(draw) for draw in draws)
-    except (KeyError, TypeError, ValueError) as error:
-        raise UnreadablePosteriorError(f"the posterior of calibration.json: {error!r}") from error
+        return msgspec.convert(draws, tuple[PosteriorDraw, ...])
+    except msgspec.ValidationError as error:
+        raise UnreadablePosteriorError(f"the posterior of calibration.json: {error}") from error
 
 
 def _posterior(calibration: Calibration, task: Task) -> Mapping[str, Any]:

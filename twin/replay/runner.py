@@ -9,7 +9,7 @@ from typing import Any
 
 from bridge.episode import schema, streams
 from bridge.episode.executions import NO_PLAN, executed_events, whose
-from bridge.episode.reader import Episode
+from bridge.episode.reader import Episode, record_of
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
@@ -17,12 +17,11 @@ from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.leaves import load_leaf
 from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
 from bridge.robots.robot import read_robot, robot_of
+from bridge.task.scripted_motion import RECORD_NAME
 from bridge.task.task_file import Task
 from bridge.terminal import Output
-from twin.calibrate.physics.pushes import motion_of
 from twin.replay.config import ReplayRunConfig
 from twin.replay.failure import with_reasons
-from twin.replay.imported import MotionReplay, motion_replays, run_motion_replay
 from twin.replay.job import WITHOUT, ReplayJob
 from twin.replay.job_row import row_of_existing, row_of_failure
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene, shape_hashes
@@ -189,7 +188,7 @@ def _nothing_to_replay(
         return Prepared(why_not=f"a {info.kind}", was_meant=False)
     joints = [t for t in episode.topics_of_type(schema.JOINT_STATE) if t.endswith(JOINT_STATES)]
     if info.kind == "imported":
-        if motion_of(episode) is not None:
+        if record_of(episode.files[0], RECORD_NAME):
             return Prepared(why_not="replayed as an imported motion", was_meant=False)
         hint = f": {LABEL}" if joints else ""
         why_not = f"nobody said of which task it is a trial{hint}"
@@ -262,22 +261,16 @@ def _trajectory_of(name: str) -> str:
     return name.rsplit(".", 3)[0]
 
 
-def replay_run(run: RunFolder, config: ReplayRunConfig, output: Output) -> dict[str, Any]:
-    """Replay all trial episodes of a run: in this process, in several, or on a Ray cluster."""
-    run.refuse_empty()
-    workers = config.workers or default_size()
-    if config.ray:
-        runner: Runner = load_leaf("cluster", "runner")(config.ray, workers)
-    else:
-        runner = ProcessPool(workers) if workers > 1 else Serial()
-    with runner:
-        return replay_trajectories(run, config, output, runner)
-
-
-def replay_trajectories(
-    run: RunFolder, config: ReplayRunConfig, output: Output, runner: Runner
+def replay_run(
+    run: RunFolder,
+    config: ReplayRunConfig,
+    output: Output,
+    imported: tuple[list[dict[str, Any]], dict[str, str]] = ([], {}),
 ) -> dict[str, Any]:
     """Replay all trial episodes of a run; replays that are there already are kept.
+
+    Args:
+        imported: What ``replay_imported`` found before.
 
     Returns:
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
@@ -288,9 +281,26 @@ def replay_trajectories(
         UsageError: When an episode named in the configuration is not in the run.
         PathNotFoundError: When pictures are asked for and no scene was rebuilt.
     """
-    imported, unusable = _replay_imported(run, config, runner, output)
+    run.refuse_empty()
+    workers = config.workers or default_size()
+    if config.ray:
+        runner: Runner = load_leaf("cluster", "runner")(config.ray, workers)
+    else:
+        runner = ProcessPool(workers) if workers > 1 else Serial()
+    with runner:
+        return _replay_trajectories(run, config, output, runner, imported)
+
+
+def _replay_trajectories(
+    run: RunFolder,
+    config: ReplayRunConfig,
+    output: Output,
+    runner: Runner,
+    imported: tuple[list[dict[str, Any]], dict[str, str]],
+) -> dict[str, Any]:
     scene_hash = _scene_hash(run, config, output)
     jobs, skipped, prepared = _all_jobs(run, scene_hash, config, runner, output)
+    motions, unusable = imported
     skipped |= unusable
     _say_what_is_missing(run, jobs, output)
     if config.render:
@@ -320,31 +330,11 @@ def replay_trajectories(
         "nothing_to_replay": {
             name: each.why_not
             for name, each in prepared.items()
-            if each.why_not and (each.was_meant or not (rows or imported))
+            if each.why_not and (each.was_meant or not (rows or motions))
         },
-        "imported": imported,
+        "imported": motions,
         "rows": rows,
     }
-
-
-def _replay_imported(
-    run: RunFolder, config: ReplayRunConfig, runner: Runner, output: Output
-) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Replay recordings that have no plan; rows, and why others cannot be replayed."""
-    items, skipped = motion_replays(run, _chosen(run, config), config.replay, force=config.force)
-    rows = []
-    with output.progress("imported", len(items)) as advance:
-        for done, (item, answer) in enumerate(
-            runner.run(run_motion_replay, items, MotionReplay.cost), start=1
-        ):
-            if isinstance(answer, Failed):
-                skipped[item.episode_id] = answer.message
-                output.detail(answer.trace)
-            else:
-                rows.append(answer)
-            advance(done, f"{item.episode_id} {item.trajectory}")
-    rows.sort(key=lambda row: (row["episode"], row["trajectory"]))
-    return rows, skipped
 
 
 def _all_jobs(
@@ -355,7 +345,7 @@ def _all_jobs(
     output: Output,
 ) -> tuple[list[ReplayJob], dict[str, str], dict[str, Prepared]]:
     """List what is to be replayed, what cannot be read, and what there is of each other episode."""
-    names = _chosen(run, config)
+    names = chosen_episodes(run, config)
     shapes = shape_hashes(run)
     items = [
         Preparation(
@@ -414,7 +404,8 @@ def _tasks(jobs: Iterable[ReplayJob]) -> list[Task]:
     return [task for index, task in enumerate(found) if task not in found[:index]]
 
 
-def _chosen(run: RunFolder, config: ReplayRunConfig) -> list[str]:
+def chosen_episodes(run: RunFolder, config: ReplayRunConfig) -> list[str]:
+    """Ids of the episodes that are wanted; all where none is named."""
     there = [path.stem for path in run.episodes()]
     unknown = [name for name in config.episode if name not in there]
     if unknown:

@@ -15,7 +15,6 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.task.verdict import SAME_ENGINE
 from twin.replay.failure import NOT_EVALUATED
-from twin.replay.imported import describe_motions
 
 WORDS = {True: "accepted", False: "rejected", None: "undecided"}
 LABELS = ("success", "failure", "unknown")
@@ -148,7 +147,7 @@ def describe_run(summary: Mapping[str, Any]) -> str:
     """The final tables as text."""
     skipped = _skipped_lines(summary.get("skipped_episodes", {}), "cannot be replayed")
     skipped += _skipped_lines(summary.get("nothing_to_replay", {}), "with nothing to replay")
-    imported = describe_motions(summary.get("imported", []))
+    imported = _motion_lines(summary.get("imported", []))
     if not summary["rows"]:
         return "\n".join([*(imported or ["No trial to replay."]), *skipped])
     lines = imported + _count_lines(summary["counts"])
@@ -290,3 +289,19 @@ def _divergence_lines(executions: Rows) -> list[str]:
         lag = "" if entry["lag_s"] is None else f", lag {entry['lag_s'] * 1e3:.0f} ms"
         lines.append(f"  {entry['episode']} {entry['plan']}: {text}{lag}")
     return lines
+
+
+def _motion_lines(rows: Rows) -> list[str]:
+    """Say how many replays there are of imported recordings."""
+    counts: dict[str, int] = {}
+    for row in rows:
+        counts[row["trajectory"]] = counts.get(row["trajectory"], 0) + 1
+    lines = [
+        f"imported recordings, {trajectory} ({words}): {counts[trajectory]} replays"
+        for trajectory, words in (
+            ("planned", "joint schedule"),
+            ("executed", "measured tool"),
+        )
+        if trajectory in counts
+    ]
+    return [*lines, "Compare: robot-gst evaluate RUN"] if lines else []

@@ -13,7 +13,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_jpeg
-from twin.scene.localise.live import LiveFrames, LiveView
+from twin.gate.live import LiveFrames, LiveView
 
 S = 1_000_000_000
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)

@@ -38,8 +38,8 @@ from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate
+from twin.gate.live import LiveView
 from twin.gate.service import GateError, claim_gate, serve_gate, watch_cell
-from twin.scene.localise.live import LiveView
 
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
 S = 1_000_000_000

@@ -23,8 +23,8 @@ from bridge.episode.topics import type_of_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT
+from twin.gate.live import LiveView
 from twin.robot.model import load_robot
-from twin.scene.localise.live import LiveView
 from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
 from twin.scene.store.calibration import Calibration, read_calibration, write_calibration
 

@@ -14,7 +14,7 @@ from bridge.episode.cdr.messages import (
     PoseSample,
     string_to_cdr,
 )
-from twin.scene.localise.live import KEPT_IMAGES, SET_BACK_SAMPLES, LiveView
+from twin.gate.live import KEPT_IMAGES, SET_BACK_SAMPLES, LiveView
 
 
 def ready() -> LiveView:

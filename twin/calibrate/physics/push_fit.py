@@ -160,7 +160,10 @@ def calibrate_pushes(
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))
     if len(fitted) < FEWEST or not held_out:
-        message = f"{len(pushes)} pushes in {run.path}; at least {2 * FEWEST} are needed."
+        message = (
+            f"{len(pushes)} pushes in {run.path}; at least {2 * FEWEST} are needed. Trials of a "
+            "cell teach through --posterior."
+        )
         raise UnusablePushError(message)
     output.say(f"{len(pushes)} pushes: {len(fitted)} identify, {len(held_out)} are held out")
     workers = config.workers or default_size()

@@ -92,3 +92,10 @@ def test_what_is_touched_beside_the_object_that_is_grasped_is_no_grasp(
     plan, result = carried(script)
     stages = tuple(replace(stage, grasp=stage.grasp and "duck") for stage in plan.stages)
     assert grasps_seen(replace(plan, stages=stages), path_of(plan), result) == ()
+
+
+def test_a_grasp_that_misses_is_neither_touched_nor_held(script: SimpleNamespace) -> None:
+    plan, result = carried(script)
+    nothing = {"cube": np.zeros(len(result.stamps_ns), dtype=bool)}
+    (grasp,) = grasps_seen(plan, path_of(plan), replace(result, finger_contact=nothing))
+    assert (grasp["touched"], grasp["held"], grasp["p_object_m"]) == (False, False, None)

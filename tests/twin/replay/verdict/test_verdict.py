@@ -269,3 +269,12 @@ def test_twelve_seconds_take_so_many_steps_and_no_more(
     result = replay_plan(script.plan(scene, pace=1.0), scene, config)
     assert result.stamps_ns[-1] == 12_000_000_000
     assert steps[0] == (12.0 + config.settle_before_s) * config.physics.rate_hz
+
+
+def test_an_unreachable_first_waypoint_gives_a_verdict_too(script: SimpleNamespace) -> None:
+    scene = script.scene()
+    plan = script.plan(scene)
+    tau = (replace(plan.tau[0], p_m=(0.0, 0.0, 3.0)), *plan.tau[1:])
+    verdict = replay_plan(replace(plan, tau=tau), scene, ReplayConfig()).verdict
+    assert (verdict.ik.value, verdict.ik.first_t_ns) == (False, 0)
+    assert verdict.terminal.value is None

@@ -107,3 +107,11 @@ def test_nothing_is_lost_when_nothing_is_seen(
     cloud = room[0]
     scores = replace(even_scores(cloud), pixels=np.zeros(len(cloud), dtype=np.float32))
     assert len(densify(cloud, scores, max_splats=len(cloud), most=0).cloud) == len(cloud)
+
+
+def test_what_no_image_can_resolve_is_not_split(
+    room: tuple[GaussianCloud, list[ImageObservation]],
+) -> None:
+    cloud = room[0]
+    scores = replace(even_scores(cloud), size_px=np.full(len(cloud), 0.2, dtype=np.float32))
+    assert densify(cloud, scores, max_splats=10_000, most=100).num_split == 0

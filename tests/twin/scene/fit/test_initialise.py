@@ -138,3 +138,9 @@ def test_depth_that_is_no_number_is_no_measurement(nothing: float) -> None:
         surface.trusted, FrameSurface(replace(item, depth_m=zero), LIMITS).trusted
     )
     assert np.isfinite(surface.depth_in_color_camera()).all()
+
+
+def test_normals_face_the_camera() -> None:
+    points = FrameSurface(textured_room.frame(2, 6), LIMITS).points()
+    table = (np.abs(points.p_m[:, 2]) < 0.003) & (points.p_m[:, 1] < 0.5)
+    np.testing.assert_allclose(np.median(points.normals[table], axis=0), [0, 0, 1], atol=0.05)

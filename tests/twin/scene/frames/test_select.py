@@ -14,6 +14,7 @@ from bridge.errors import UsageError
 from twin.scene.frames.selection import (
     choose_frames,
     find_sources,
+    path_length_m,
     pick,
     smear_px,
 )
@@ -111,3 +112,13 @@ def test_a_fixed_protocol_learns_from_every_fifth_and_holds_out_the_one_two_afte
 def test_protocols_that_make_no_sense_are_refused(settings: dict[str, int], found: str) -> None:
     with pytest.raises(UsageError, match=found):
         FrameConfig(**settings)  # type: ignore[arg-type]
+
+
+def test_turning_counts_as_path_and_standing_still_hardly_does() -> None:
+    turned = np.stack([textured_room.camera_pose(k, 5) for k in range(5)])
+    turned[:, :3, 3] = 0.0
+    path = path_length_m(turned)
+    assert path[-1] > 0.3
+    assert (np.diff(path) > 0).all()
+    still = path_length_m(np.stack([np.eye(4)] * 3))
+    assert 0 < still[-1] < 1e-4

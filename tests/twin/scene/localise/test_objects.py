@@ -170,3 +170,13 @@ def test_yaw_is_reduced_modulo_the_symmetry(task: Task, quarter: int) -> None:
     yaw = reduce_by_symmetry(turned, long)
     expected = 0.3 if quarter % 2 == 0 else 0.3 - np.pi / 2
     np.testing.assert_allclose(yaw, pose_of(np.array([0.1, 0.2, 0.02, expected])), atol=1e-12)
+
+
+def test_a_lifted_cube_is_reported_as_not_standing_on_the_table(
+    stage: Callable[..., Any], task: Task
+) -> None:
+    poses = {**POSES, "cube": pose_of(np.array([0.5, -0.15, 0.12, 0.2]))}
+    cube = localise_objects(shoot(stage(poses), [SIDE, WRIST]), task)["cube"]
+    assert cube.found
+    assert abs(cube.T_base_object[2, 3] - 0.12) < 0.004
+    assert "+100 mm from standing on the table" in str(cube.reason)

@@ -9,7 +9,11 @@ from hypothesis import strategies as st
 from bridge.task.task_file import load_task
 from twin.scene.localise.objects import TableConfig, fit_table
 from twin.scene.localise.points import (
+    ColourConfig,
     clusters,
+    likeness,
+    linear_image,
+    voxel_mean,
 )
 from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances
 
@@ -75,3 +79,17 @@ def test_the_table_fit_finds_a_tilted_and_lifted_plane() -> None:
     )[0]
     np.testing.assert_allclose(plane, 0.0, atol=5e-4)
     assert fit.tilt_rad == pytest.approx(0.01, abs=4e-3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(shade=st.floats(0.15, 1.0))
+def test_likeness_does_not_depend_on_shading(shade: float) -> None:
+    albedo = linear_image(np.array([[[200, 45, 40]]], dtype=np.uint8))
+    like = likeness(albedo * shade, (200, 45, 40), ColourConfig())
+    np.testing.assert_allclose(like, 1.0, atol=1e-5)
+
+
+def test_voxel_mean_keeps_the_mean_of_each_voxel() -> None:
+    points = np.array([[0.0001, 0, 0], [0.0009, 0, 0], [-0.0005, 0, 0], [0.5, 0.5, 0.5]])
+    means = voxel_mean(points, 0.001)
+    assert sorted(means[:, 0].round(6)) == [-0.0005, 0.0005, 0.5]

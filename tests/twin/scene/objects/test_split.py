@@ -21,6 +21,7 @@ from twin.scene.gaussians import (
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.movable_scene import MovableScene
 from twin.scene.objects.decompose import (
+    SplitConfig,
     fill_footprint,
     shape_mesh,
     split_objects,
@@ -229,3 +230,21 @@ def test_a_toy_that_lies_on_its_side_is_left_as_it_was_found() -> None:
     parts = split_objects(cloud, {"sloth": found}, task)
     np.testing.assert_array_equal(parts.objects["sloth"].T_base_object, T)
     assert len(parts.objects["sloth"].cloud) == 500
+
+
+def test_an_object_that_was_not_found_stays_in_the_background(
+    scene: tuple[GaussianCloud, np.ndarray],
+) -> None:
+    cloud, owner = scene
+    parts = split_objects(cloud, localised(box=POSES["box"]), TASK)
+    assert list(parts.objects) == ["box"]
+    assert len(parts.background) >= (owner == 0).sum() + 0.99 * (owner == -1).sum()
+
+
+def test_a_big_background_gaussian_is_left_where_it_is() -> None:
+    cloud = cloud_of(surface_points("cube", 300), TASK.objects["cube"].color_srgb)
+    scales = cloud.scales_log.copy()
+    scales[0] = np.log(0.2)
+    cloud = GaussianCloud(**{**dict(arrays(cloud)), "scales_log": scales})
+    parts = split_objects(cloud, localised(cube=POSES["cube"]), TASK, SplitConfig())
+    assert len(parts.background) == 1

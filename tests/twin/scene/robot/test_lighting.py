@@ -1,12 +1,13 @@
 """The light on the arm: found from links that turned, taken off their paint, put on again."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.frames.rgbd import PointSet
 from twin.scene.gaussians import as_float32
-from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
+from twin.scene.robot.lighting import EVEN, Lighting, fit_lighting, read_lighting
 from twin.scene.robot.link_surface import SeenLink, link_lighting, on_surface, own_colors
 from twin.scene.settings import InitialiseConfig
 
@@ -79,3 +80,12 @@ def test_light_is_kept_in_the_record_and_older_scenes_are_lit_evenly() -> None:
     record = {"robot": {"lighting": TRUE.to_record()}}
     assert read_lighting(record) == TRUE
     assert read_lighting({"robot": {"links": {}}}) == read_lighting({}) == EVEN
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_posture_says_nothing_of_light(count: int) -> None:
+    """Every piece faces one way: paint alone explains it all."""
+    found = link_lighting({"arm": [box()]}, {"arm": seen(count)})
+    directions = Rotation.random(100, random_state=3).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.brightness(directions), 1.0, atol=0.02)
+    assert fit_lighting([]) == EVEN

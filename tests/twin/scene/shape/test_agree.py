@@ -8,7 +8,7 @@ import pytest
 
 from bridge.geometry import se3
 from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.registration import laid_together
+from twin.scene.shape.registration import laid_together, slope_by_sensor
 
 MOUNT = se3.transform_from(np.array([1.0, 0.002, -0.0015, 0.0025]), np.array([2e-3, -1e-3, 1e-3]))
 """Some millimetres and 7 milliradians that a camera is off on what carries it."""
@@ -46,3 +46,21 @@ def test_a_mount_and_a_depth_that_are_off_do_not_change_the_thickness_of_a_wall(
     assert abs(wall_m(views) - wall) > 0.001
     assert wall_m(mended) == pytest.approx(wall, abs=0.0004)
     assert shift > 0.0005
+
+
+def test_derivatives_by_a_sensors_errors_are_those_of_the_distance() -> None:
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(50, 3)) * 0.1 + [0, 0, 0.5]
+    slope = rng.normal(size=(50, 3))
+    slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+
+    def distance(errors: np.ndarray) -> np.ndarray:
+        deeper = p * (1 + errors[7] + errors[6] / p[:, 2:])
+        turned = deeper @ se3.rotation_from_vector(errors[3:6]).T + errors[:3]
+        return np.einsum("ni,ni->n", slope, turned)
+
+    step = 1e-6
+    numeric = np.stack(
+        [(distance(e) - distance(-e)) / (2 * step) for e in step * np.eye(8)], axis=1
+    )
+    np.testing.assert_allclose(slope_by_sensor(slope, p), numeric, atol=1e-7)

@@ -11,10 +11,12 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.npz import UnreadableArraysError
 from twin.scene.frames.rgbd import TrainingView
+from twin.scene.shape.carve import ShapeError
 from twin.scene.shape.from_training import (
     from_outside_m,
     rim_height_m,
     with_heights,
+    write_static,
 )
 from twin.scene.shape.known import pose_of, surface_distances
 from twin.scene.shape.sdf import SdfGrid
@@ -112,3 +114,19 @@ def test_a_rim_is_as_high_as_it_is_seen_whatever_is_published(views: list[Traini
     seen = with_heights(TASK, {"box": 0.07})
     assert seen.objects["box"].inner_m[2] == pytest.approx(0.07 - box.wall_m)
     assert seen.objects["cube"] == TASK.objects["cube"]
+
+
+def test_a_budget_of_voxels_makes_them_larger(views: list[TrainingView]) -> None:
+    small = static_sdf(views, 0.0, [], StaticConfig(max_voxels=8000))
+    assert small.state.size <= 9000
+    assert small.conservative.voxel_m > 0.008
+
+
+def test_without_views_there_is_no_static_scene_but_a_reason(tmp_path: Path) -> None:
+    with pytest.raises(ShapeError, match="0 points"):
+        static_sdf([], 0.0)
+    (tmp_path / "sdf.npz").write_bytes(b"old")
+    about = write_static(tmp_path, [], None, {})
+    assert about["file"] is None
+    assert "0 points" in about["remark"]
+    assert not (tmp_path / "sdf.npz").exists()

@@ -13,17 +13,8 @@ from bridge.task.plan import Plan, Waypoint
 from bridge.task.task_file import load_task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
-from twin.replay import posterior
-from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
-from twin.replay.monte_carlo import (
-    draw_variation,
-    halving,
-    replay_samples,
-    sample_rng,
-    with_draw,
-    with_probability,
-)
-from twin.replay.posterior import (
+from twin.calibrate import posterior
+from twin.calibrate.posterior import (
     BIAS_M,
     CENTRE_OF_MASS,
     EDGE_SHARE,
@@ -41,6 +32,15 @@ from twin.replay.posterior import (
     log_nearness,
     rigid_movers,
     weighed,
+)
+from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
+from twin.replay.monte_carlo import (
+    draw_variation,
+    halving,
+    replay_samples,
+    sample_rng,
+    with_draw,
+    with_probability,
 )
 from twin.replay.rebuilt_scene import (
     ALL_TASKS,
@@ -268,7 +268,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
     assert again is not None
     assert again.calibration_id != before
     damaged = {**known.record, "posterior": {"tasks": {TASK.name: {"draws": [{"weight": 1.0}]}}}}
-    with pytest.raises(UnreadablePosteriorError, match="bias_m"):
+    with pytest.raises(UnreadablePosteriorError, match="finger_pair_friction"):
         posterior_of(Calibration(record=damaged, cameras={}), TASK)
 
 

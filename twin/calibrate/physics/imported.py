@@ -18,12 +18,15 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError
+from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
+from bridge.terminal import Output
 from twin.calibrate.physics.push_fit import METHOD, load_push
 from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
-from twin.replay.config import ReplayConfig
+from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.rebuilt_scene import calibrated
+from twin.replay.runner import chosen_episodes
 from twin.scene.store.calibration import Calibration, read_calibration
 
 ENGINE = "twin-pybullet"
@@ -162,17 +165,26 @@ def _write(path: Path, item: MotionReplay, push: Push, result: PushResult) -> No
                 writer.write(topic, data, type_name=schema.POSE_STAMPED, log_time_ns=stamp_ns)
 
 
-def describe_motions(rows: list[dict[str, Any]]) -> list[str]:
-    """Say how many replays there are of imported recordings."""
-    counts: dict[str, int] = {}
-    for row in rows:
-        counts[row["trajectory"]] = counts.get(row["trajectory"], 0) + 1
-    lines = [
-        f"imported recordings, {trajectory} ({words}): {counts[trajectory]} replays"
-        for trajectory, words in (
-            ("planned", "joint schedule"),
-            ("executed", "measured tool"),
-        )
-        if trajectory in counts
-    ]
-    return [*lines, "Compare: robot-gst evaluate RUN"] if lines else []
+def replay_imported(
+    run: RunFolder, config: ReplayRunConfig, output: Output
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Replay a run's recordings that have no plan; rows, and why others cannot be replayed."""
+    names = chosen_episodes(run, config)
+    items, skipped = motion_replays(run, names, config.replay, force=config.force)
+    if not items:
+        return [], skipped
+    workers = config.workers or default_size()
+    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
+    rows = []
+    with runner, output.progress("imported", len(items)) as advance:
+        for done, (item, answer) in enumerate(
+            runner.run(run_motion_replay, items, MotionReplay.cost), start=1
+        ):
+            if isinstance(answer, Failed):
+                skipped[item.episode_id] = answer.message
+                output.detail(answer.trace)
+            else:
+                rows.append(answer)
+            advance(done, f"{item.episode_id} {item.trajectory}")
+    rows.sort(key=lambda row: (row["episode"], row["trajectory"]))
+    return rows, skipped

@@ -12,18 +12,17 @@ from kinova_data import episodes
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import pose_track
-from bridge.process_pool import Serial
 from bridge.terminal import Output
 from evaluator.compare import compare_run
+from twin.calibrate.physics.imported import ENGINE, replay_imported
 from twin.calibrate.physics.push_fit import METHOD, end_point_error_m, frictions, load_push
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayRunConfig
-from twin.replay.imported import ENGINE
-from twin.replay.runner import replay_trajectories
+from twin.replay.runner import replay_run
 from twin.replay.summary import describe_run
 from twin.scene.store.calibration import write_physics
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "calibrate" / "physics"))
+sys.path.insert(0, str(Path(__file__).parent))
 import pushed_boxes
 
 BESIDE = Path(__file__).parents[5] / "shared" / "data"
@@ -44,7 +43,8 @@ def run(tmp_path: Path) -> RunFolder:
 
 
 def replay(run: RunFolder, force: bool = False) -> dict[str, Any]:
-    return replay_trajectories(run, ReplayRunConfig(force=force), QUIET, Serial())
+    config = ReplayRunConfig(force=force, workers=1)
+    return replay_run(run, config, QUIET, replay_imported(run, config, QUIET))
 
 
 def test_each_trajectory_becomes_an_episode_that_says_what_it_is(run: RunFolder) -> None:
