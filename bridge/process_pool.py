@@ -107,12 +107,7 @@ class Failed:
 
 
 def do(function: Function, item: Any) -> Answer | Failed:
-    """Do one piece of work; whatever goes wrong with it is its answer.
-
-    Args:
-        function: What it raises becomes ``Failed``.
-        item: Its only argument.
-    """
+    """Do one piece of work; whatever goes wrong with it is its answer."""
     try:
         return function(item)
     except GstError as error:
@@ -133,9 +128,6 @@ class Worker:
 
         Args:
             quiet: Drop what it prints as errors; what it prints otherwise is always dropped.
-
-        Raises:
-            OSError: When the system gives no further process.
         """
         places = os.pathsep.join(place or os.getcwd() for place in sys.path)  # noqa: PTH109
         self.process = subprocess.Popen(

@@ -1,7 +1,6 @@
 """Settings of ``robot-gst design``; imports nothing heavy."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from cyclopts import Parameter
 
@@ -44,8 +43,6 @@ class StudyOptions:
 class Wanted:
     """What is expected, and what the study is to show; shares from 0 to 1."""
 
-    past: Path | None = None
-    """A run, or its results.json: expected rates and the twin's agreement are taken from there."""
     rate: float | None = None
     """Expected success rate of the arm that is compared with."""
     gain: float | None = None
@@ -56,16 +53,12 @@ class Wanted:
     """Expected share of trials in which twin and outcome agree."""
     width: float | None = None
     """Wanted width of the gain's interval, from end to end."""
-    rate_width: float | None = None
-    """Wanted width of the interval of each arm's rate in each task."""
     agrees_above: float | None = None
     """The claim that twin and outcome agree in more than this share of trials."""
     power: float = 0.8
     """Chance with which gain and claim are to be shown."""
     alpha: float = 0.05
     """Chance of a false alarm."""
-    per_task: bool = False
-    """Ask for the gain in every task alone; otherwise over all tasks together."""
     starts: int | None = None
     """Starts of each task, whatever would be needed; what they can show is said."""
 
@@ -79,7 +72,6 @@ class Wanted:
                 "gain": (-1, 1),
                 "correlation": (-1, 1),
                 "width": (0.01, 2),
-                "rate_width": (0.01, 1),
                 "power": (0.05, 0.999),
                 "alpha": (0.0001, 0.5),
                 "starts": (1, 1000),

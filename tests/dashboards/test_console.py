@@ -1,7 +1,6 @@
 """The operator's console: who gets in, what they do not see, and that nothing they say is lost."""
 
 import re
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -9,10 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
 from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
-from serving import serving
 
 from bridge.episode.catalogue import label_episode, outcome_of
 from bridge.episode.metadata import Outcome
@@ -346,61 +343,3 @@ def test_a_recorder_of_another_run_or_none_is_told_and_never_started(
         assert phone.do("start", trial="trial_0001")["status"] == 400
     assert phone.look()["kind"] == "stuck"
     assert phone.do("start", trial="trial_0001")["status"] == 502
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_a_phone_records_a_trial_through_a_server_that_is_killed(
-    run: RunFolder, recorder: LiveRecorder, endpoint: str, tmp_path: Path
-) -> None:
-    options = ("--console", "--connect", endpoint)
-
-    def enter(tab: Browser, name: str, code: object) -> None:
-        tab.ask_when("document.querySelector('#enter')")
-        before = tab.num_loaded
-        tab.ask(
-            f"enter.elements.name.value='{name}'; enter.elements.code.value='{code}'; "
-            "document.querySelector('#enter button').click()"
-        )
-        tab.await_load(before)
-
-    def shows(tab: Browser, kind: str) -> None:
-        tab.ask_when(f"document.querySelector('h1[data-kind={kind}]')")
-
-    press = "document.querySelector('button.main').click()"
-    with chromium(tmp_path) as ann:
-        with serving(run, 0, *options) as (process, record):
-            console = str(record["console"])
-            ann.show(console, width=390, dark=False)
-            enter(ann, "Ann", record["code"])
-            assert process.stderr
-            assert "For another phone: code" in process.stderr.readline()
-            shows(ann, "ready")
-            assert ann.ask("document.querySelector('svg.above polygon').getBBox().width") > 20
-            assert not ann.ask("document.documentElement.scrollWidth > innerWidth")
-            ann.ask(press)
-            shows(ann, "recording")
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            ann.ask(press)  # stop, with nobody there
-            ann.ask_when("told.textContent.includes('NOT DONE YET')")
-            assert recorder.status()["episode"] == "trial_0001"
-        before = ann.num_loaded
-        port = int(console.split(":")[2].partition("/")[0])
-        with serving(run, port, *options) as (_, record):
-            ann.await_load(before)  # its session ended with the server
-            enter(ann, "Ann", record["code"])  # what was pressed is sent then
-            shows(ann, "answer")
-            assert recorder.status()["episode"] is None
-            ann.ask(
-                "answer_ = document.getElementById('answer').elements; answer_[2].click(); "
-                "answer_.reached.value = '0'; answer_.cause.value = 'missed the object'"
-            )
-            ann.ask(press)
-            shows(ann, "ready")
-            assert ann.ask("document.querySelector('h1').textContent").startswith("Trial 2")
-        assert not [text for text in ann.complaints if "Security Policy" in text]
-    outcome = outcome_of(run, Episode.open(run.episodes_dir / "trial_0001.mcap"))
-    assert outcome
-    assert (outcome.result, outcome.detail) == ("failure", "missed the object")
-    assert [stage["result"] for stage in outcome.stages] == ["failure", "unknown"]
