@@ -87,8 +87,6 @@ class SchemaVersionError(EpisodeError):
     def __init__(self, *, path: Path, name: str, found: int, known: int) -> None:
         """Remember both versions."""
         self.name = name
-        self.found_version = found
-        self.known_version = known
         super().__init__(
             path=path,
             found=f"{name} has schema version {found}, this reader knows {known}",

@@ -74,6 +74,9 @@ GONE: dict[str, str] = {
         ("evaluate --live", "evaluate --recorder", "evaluate --connect"),
         "robot-gst evaluate RUN --goal 0.8 says of all trials so far whether to stop or continue.",
     ),
+    "design --past": "Say what is expected: --rate, --gain, --agreement.",
+    "design --rate-width": "--width is that of the gain's interval.",
+    "design --per-task": "A study asks for its gain over all tasks together.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(

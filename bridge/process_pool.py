@@ -107,11 +107,7 @@ class Failed:
 
 
 def do(function: Function, item: Any) -> Answer | Failed:
-    """Do one piece of work; whatever goes wrong with it is its answer.
-
-    Args:
-        function: What it raises becomes ``Failed``.
-    """
+    """Do one piece of work; whatever goes wrong with it is its answer."""
     try:
         return function(item)
     except GstError as error:

@@ -133,7 +133,7 @@ def _kind(
     offset: int,
 ) -> Kind:
     narrowed = selection.query(**{name: text or NOT_KNOWN for name, text in group.parts.items()})
-    trials = index.failures(FailureSelection(**narrowed), limit=limit, offset=offset)
+    trials = index.trials(FailureSelection(**narrowed), limit=limit, offset=offset)
     return Kind(
         group=group,
         words=tuple(

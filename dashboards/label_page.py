@@ -46,7 +46,7 @@ SETS = {
 STRIP = 6
 """Pictures that sum a recording up, from first to last."""
 MAX_LENGTH = {"rater": 80, "cause": 200, "note": 4000}
-TABLES = ("raters", "label_error", "review_causes")
+TABLES = ("raters",)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -170,7 +170,6 @@ class SummaryCache:
 
         Args:
             key: Names what they are made from, so that a changed file has another key.
-            make: Makes them where nothing is kept.
         """
         found = self.find(kind, key)
         if found is None:
@@ -187,11 +186,7 @@ class SummaryCache:
         return found
 
     def keep(self, kind: type[Summary], key: str, made: tuple[Summary, ...]) -> None:
-        """Keep summaries under a key; now and then everything new is written.
-
-        Args:
-            made: The summaries; none is an answer too.
-        """
+        """Keep summaries under a key; now and then everything new is written."""
         if self._folder is None:
             return
         kept = self._of(kind)

@@ -60,7 +60,7 @@ def evaluate(
         against: A run or table with another twin's answers to the same recorded trials: say how
             much better which one is, which trials flip, and which settings differ.
         reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
-            of such files), beside those in RUN/reviews: kappa, and how PPV and r move.
+            of such files), beside those in RUN/reviews: kappa of each two raters.
         interval: Interval of success rates.
         goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
             above or below, at any time, or how many more that may take.

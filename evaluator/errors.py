@@ -28,11 +28,7 @@ class AlikeNamesError(EvaluatorError):
 
     @classmethod
     def of(cls, kind: str, alike: Sequence[Mapping[str, str]]) -> "AlikeNamesError":
-        """Build the question about names that differ only by case or blanks.
-
-        Args:
-            alike: For each name its spellings with where they first stand; all are listed.
-        """
+        """Build the question about names that differ only by case or blanks."""
         (first, place), (second, other), *_ = alike[0].items()
         further = [" and ".join(map(repr, names)) for names in alike[1:]]
         listed = f" So do {'; '.join(further)}." if further else ""

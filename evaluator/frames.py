@@ -9,46 +9,27 @@ Unknown is ``pd.NA``, never "", 0 or False. Importing this module loads pandas.
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from bridge.errors import PathNotFoundError
-from bridge.exchange.trials_csv import TrialRecord, tags_text
 from bridge.exchange.trials_csv import read_trials as read_csv
+from bridge.exchange.trials_csv import tags_text
+from evaluator.columns import INTERVAL, OF_MEASUREMENTS, OF_TRIALS
 from evaluator.measurements import RATES, quantity_of
 from evaluator.result import Measurement, load_results
 
-INTERVAL = ("low", "high", "level", "method")
-MEASUREMENT_TYPES = {
-    "id": "string",
-    "value": "Float64",
-    "unit": "string",
-    "better": "string",
-    **dict.fromkeys(INTERVAL[:3], "Float64"),
-    "method": "string",
-    "k": "Int64",
-    "n": "Int64",
-    "counted": "string",
-    "definition": "string",
-    "reason_if_undefined": "string",
-    "reason_without_interval": "string",
-}
+MEASUREMENT_TYPES = OF_MEASUREMENTS | {"better": str}
 GROUP_TYPES = {
-    **dict.fromkeys(("task", "condition", "policy", "side", "unit"), "string"),
-    "k": "Int64",
-    "n": "Int64",
-    **dict.fromkeys(("rate", *INTERVAL[:3]), "Float64"),
-    "method": "string",
-    "reason_if_undefined": "string",
+    **dict.fromkeys(("task", "condition", "policy", "side", "unit"), str),
+    **dict.fromkeys(("k", "n"), int),
+    **dict.fromkeys(("rate", *INTERVAL[:3]), float),
+    **dict.fromkeys(("method", "reason_if_undefined"), str),
 }
-TRIAL_TYPES = {field.name: "string" for field in fields(TrialRecord)} | {
-    **dict.fromkeys(("k", "n"), "Int64"),
-    **dict.fromkeys(("recorded", "sim_planned", "sim_executed", "verdict", "stand_in"), "boolean"),
-    **dict.fromkeys(("p_success", "progress", "sim_progress"), "Float64"),
-}
+DTYPES: dict[type, str] = {str: "string", int: "Int64", float: "Float64", bool: "boolean"}
 
 
 def read_measurements(run: Path | str) -> pd.DataFrame:
@@ -73,7 +54,7 @@ def read_trials(run: Path | str) -> pd.DataFrame:
         hint = "Make them first: robot-gst evaluate RUN."
         raise PathNotFoundError(path=path, what="trials", hint=hint)
     rows = (asdict(trial) | {"tags": tags_text(trial.tags)} for trial in read_csv(path))
-    return _frame(rows, TRIAL_TYPES)
+    return _frame(rows, OF_TRIALS)
 
 
 def measurements_frame(measurements: Iterable[Measurement]) -> pd.DataFrame:
@@ -95,11 +76,15 @@ def groups_frame(measurements: Iterable[Measurement]) -> pd.DataFrame:
 def _row(measurement: Measurement) -> dict[str, Any]:
     quantity = quantity_of(measurement.id)
     ends = {name: getattr(measurement.interval, name, None) for name in INTERVAL}
-    return {**vars(measurement), **ends, "better": quantity.better if quantity else "none"}
+    ends |= {"better": quantity.better if quantity else "none"}
+    return {**vars(measurement), **ends, "episodes": " ".join(measurement.episodes)}
 
 
-def _frame(rows: Iterable[dict[str, Any]], kinds: dict[str, str]) -> pd.DataFrame:
+def _frame(rows: Iterable[dict[str, Any]], kinds: dict[str, type]) -> pd.DataFrame:
     held = list(rows)
     return pd.DataFrame(
-        {name: pd.array([row[name] for row in held], dtype=kind) for name, kind in kinds.items()}
+        {
+            name: pd.array([row[name] for row in held], dtype=DTYPES[kind])
+            for name, kind in kinds.items()
+        }
     )

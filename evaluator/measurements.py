@@ -141,18 +141,6 @@ PAIRED_GAIN = _new(
     "higher",
     "gain with replanning in percentage points over paired starts: {words}",
 )
-PAIRED_PROGRESS = _new(
-    "paired.progress_pp",
-    "pp",
-    "higher",
-    "share of paired starts that came further with replanning less that of those that came less far, by objects or sub-tasks done: {words}",
-)
-PAIRED_PROGRESS_P = _new(
-    "paired.progress_p_mid",
-    "1",
-    "none",
-    "two-sided sign test with mid-p of the same: {words}",
-)
 MCNEMAR = {
     kind: _new(
         f"paired.mcnemar_p_{kind}.{{side}}",

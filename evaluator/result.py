@@ -243,11 +243,7 @@ def _lines(value: Any, indent: int, deep: int) -> str:
 
 
 def write_results(results: Results, path: Path) -> Path:
-    """Write ``results.json``; a half-written file never carries the final name.
-
-    Args:
-        path: Where the file goes; its folder is made.
-    """
+    """Write ``results.json``; a half-written file never carries the final name."""
     text = _written(results.to_record())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -164,6 +164,10 @@ class _Selected:
         """Return this selection as a query, with some fields changed, from its first page."""
         return {**vars(self), "page": "", **changes}
 
+    def order(self) -> str:
+        """Return the SQL of the order: that of ``severity``."""
+        return SORT[""]
+
     def _where_facets(self) -> tuple[list[str], list[Any]]:
         chosen = [name for name in FACETS if getattr(self, name)]
         return [f"{name}_slug = ?" for name in chosen], [getattr(self, name) for name in chosen]
@@ -187,11 +191,7 @@ class Selection(_Selected):
     """Number of the page, from 1."""
 
     def takes_group(self, task: str, condition: str, policy: str) -> bool:
-        """Say whether a group is selected.
-
-        Args:
-            task: Task of the group; all three are slugs.
-        """
+        """Say whether a group is selected."""
         return (
             self.task in ("", task)
             and self.condition in ("", condition)
@@ -468,19 +468,15 @@ class ReviewIndex:
             raise UnusableIndexError(str(error)) from error
 
     def trials(
-        self, selection: Selection, *, limit: int = -1, offset: int = 0
+        self, selection: Selection | FailureSelection, *, limit: int = -1, offset: int = 0
     ) -> tuple[IndexedTrial, ...]:
-        """Return the trials of a selection in its order.
-
-        Args:
-            limit: At most so many; all of them below 0.
-        """
+        """Return the trials of a selection in its order."""
         where, values = selection.where()
-        text = f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY "
+        text = (
+            f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY {selection.order()}"
+        )
         with self._reading() as db:
-            rows = db.execute(
-                f"{text}{selection.order()} LIMIT ? OFFSET ?", (*values, limit, offset)
-            )
+            rows = db.execute(f"{text} LIMIT ? OFFSET ?", (*values, limit, offset))
             return tuple(map(_trial, rows))
 
     def count(self, selection: Selection) -> int:
@@ -545,17 +541,6 @@ class ReviewIndex:
                 for row in db.execute(text, values)
             )
 
-    def failures(
-        self, selection: FailureSelection, *, limit: int, offset: int = 0
-    ) -> tuple[IndexedTrial, ...]:
-        """Return the trials of a selection of failures, in the order of ``severity``."""
-        where, values = selection.where()
-        text = f"SELECT {', '.join(_COLUMNS)} FROM trials WHERE {where} ORDER BY seq"
-        with self._reading() as db:
-            return tuple(
-                map(_trial, db.execute(f"{text} LIMIT ? OFFSET ?", (*values, limit, offset)))
-            )
-
     def failure_values(self, selection: FailureSelection, name: str) -> tuple[tuple[str, int], ...]:
         """Return what one part can be under the other filters, and how often it is."""
         where, values = selection.where(but=name)
@@ -565,12 +550,7 @@ class ReviewIndex:
             return tuple(db.execute(f"{text} ORDER BY count(*) DESC, {column}", values))
 
     def files(self, *, broken: bool, limit: int = -1) -> tuple[tuple[IndexedFile, ...], int]:
-        """Return the files that are no trials, and how many there are.
-
-        Args:
-            broken: Those that cannot be read; else those that can.
-            limit: At most so many; all of them below 0.
-        """
+        """Return the files that are no trials, and how many there are."""
         where = f"error {'!=' if broken else '='} ''"
         with self._reading() as db:
             rows = db.execute(f"SELECT * FROM files WHERE {where} LIMIT ?", (limit,)).fetchall()

@@ -4,21 +4,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool
 
 from evaluator.compare.notes import made_with
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.trial import Trial
-from evaluator.errors import EvaluatorError
+from evaluator.errors import EvaluatorError, UndefinedStatisticError
 from evaluator.result import Cell, Table
+from evaluator.statistics.agreement import pearson
 from evaluator.statistics.differences import mcnemar, tango_points
-
-SEED, DRAWS = 0, 2000
-LEVEL = 0.95
-FEWEST = 8
-"""Shared trials below which resampling says nothing."""
-MIN_GROUPS = 3
-Numbers = Float64[np.ndarray, " draws"]
+from evaluator.statistics.gate import brier
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,11 +85,7 @@ def against_tables(
     names: tuple[str, str],
     trials: tuple[Sequence[Trial], Sequence[Trial]] = ((), ()),
 ) -> tuple[Table, ...]:
-    """Lay out how much better one twin is, which trials flip, and which settings differ.
-
-    Args:
-        trials: The trials with their replays, of runs; settings are read from those.
-    """
+    """Lay out how much better one twin is, which trials flip, and which settings differ."""
     shared = shared_trials(mine, theirs)
     first, second = names if names[0] != names[1] else (f"{names[0]} (1)", f"{names[1]} (2)")
     rows = _differences(shared, (first, second))
@@ -104,8 +95,7 @@ def against_tables(
         id="against",
         title=f"{first} against {second} on the same {len(shared.rows)} trials",
         note=f"Difference: {first} minus {second}. Accuracy: Tango's interval of pairs, p by "
-        "McNemar's mid-p test. The others: 95 % percentiles of trials drawn anew with both "
-        f"answers, inside their groups; an interval that holds 0 shows no difference.{left}",
+        f"McNemar's mid-p test; an interval that holds 0 shows no difference.{left}",
     )
     return (table, *_flips(shared, (first, second)), *_settings_table(trials, (first, second)))
 
@@ -122,21 +112,11 @@ def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str,
     lines = [_line("accuracy", names, rates, points / 100, n)]
     lines[0]["low"], lines[0]["high"] = tango.low / 100, tango.high / 100
     lines[0]["method"], lines[0]["p"] = tango.method, p
-    draws = _draws(shared)
     for name, of in _statistics(shared).items():
-        everything = np.arange(n)[None, :]
-        values = [float(of(everything, side)[0]) for side in (0, 1)]
-        defined = all(np.isfinite(values))
-        gap = values[0] - values[1] if defined else None
-        line = _line(name, names, [v if np.isfinite(v) else None for v in values], gap, n)
-        if gap is not None and n >= FEWEST:
-            gaps: Numbers = of(draws, 0) - of(draws, 1)
-            gaps = gaps[np.isfinite(gaps)]
-            if len(gaps) > DRAWS // 2 and np.ptp(gaps) > 0:
-                low, high = np.quantile(gaps, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-                line["low"], line["high"] = float(low), float(high)
-                line["method"] = "paired bootstrap"
-        lines.append(line)
+        values = [of(side) for side in (0, 1)]
+        if None not in values:
+            gap = (values[0] or 0.0) - (values[1] or 0.0)
+            lines.append(_line(name, names, values, gap, n))
     return lines
 
 
@@ -144,7 +124,7 @@ def _line(
     name: str,
     names: tuple[str, str],
     values: Sequence[float | None],
-    difference: float | None,
+    difference: float,
     n: int,
 ) -> dict[str, Cell]:
     return {
@@ -160,57 +140,32 @@ def _line(
     }
 
 
-Statistic = Callable[[Int64[np.ndarray, "draws trials"], int], Numbers]
+def _statistics(shared: SharedTrials) -> Mapping[str, Callable[[int], float | None]]:
+    """PPV, Brier score and r over groups, of one of the twins."""
+    recorded = shared.recorded
 
+    def ppv(side: int) -> float | None:
+        accepted = shared.answers(side)
+        return float(recorded[accepted].mean()) if accepted.any() else None
 
-def _statistics(shared: SharedTrials) -> Mapping[str, Statistic]:
-    """PPV, Brier score and r over groups, of drawn trials and one of the twins."""
-    recorded = shared.recorded.astype(float)
-    answers = [shared.answers(side).astype(float) for side in (0, 1)]
-    chances = [[pair[side].p_success for pair in shared.rows] for side in (0, 1)]
-    keys = [(row.task, row.condition, row.policy) for row, _ in shared.rows]
-    places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
-    group = np.array([places[key] for key in keys])
+    def score(side: int) -> float | None:
+        stated = [pair[side].p_success for pair in shared.rows]
+        known = [p for p in stated if p is not None]
+        return brier(known, recorded.tolist()) if len(known) == len(stated) else None
 
-    def ppv(drawn: Int64[np.ndarray, "draws trials"], side: int) -> Numbers:
-        yes, good = answers[side][drawn], recorded[drawn]
-        with np.errstate(invalid="ignore"):
-            return np.asarray((yes * good).sum(axis=1) / yes.sum(axis=1))
+    def r(side: int) -> float | None:
+        keys = [(row.task, row.condition, row.policy) for row, _ in shared.rows]
+        groups = [np.array([key == other for other in keys]) for key in dict.fromkeys(keys)]
+        real, twin = (
+            [float(answers[group].mean()) for group in groups]
+            for answers in (recorded, shared.answers(side))
+        )
+        try:
+            return pearson(real, twin)
+        except UndefinedStatisticError:
+            return None
 
-    def r(drawn: Int64[np.ndarray, "draws trials"], side: int) -> Numbers:
-        means = []
-        for values in (recorded, answers[side]):
-            sums = [(values[drawn] * (group[drawn] == g)).sum(axis=1) for g in range(len(places))]
-            counts = [(group[drawn] == g).sum(axis=1) for g in range(len(places))]
-            means.append(np.array(sums) / np.array(counts))
-        x, y = (m - m.mean(axis=0) for m in means)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(
-                (x * y).sum(axis=0) / np.sqrt((x * x).sum(axis=0) * (y * y).sum(axis=0))
-            )
-
-    found: dict[str, Statistic] = {"PPV": ppv}
-    if all(chance is not None for side in chances for chance in side):
-        stated = np.array(chances, dtype=float)
-
-        def brier(drawn: Int64[np.ndarray, "draws trials"], side: int) -> Numbers:
-            return np.asarray(((stated[side][drawn] - recorded[drawn]) ** 2).mean(axis=1))
-
-        found["Brier score"] = brier
-    if len(places) >= MIN_GROUPS:
-        found["Pearson r over groups"] = r
-    return found
-
-
-def _draws(shared: SharedTrials) -> Int64[np.ndarray, "draws trials"]:
-    """Trials drawn anew inside their groups, so that no group is lost."""
-    rng = np.random.default_rng(SEED)
-    keys = [(row.task, row.condition, row.policy) for row, _ in shared.rows]
-    parts = []
-    for key in dict.fromkeys(keys):
-        members = np.array([i for i, other in enumerate(keys) if other == key])
-        parts.append(members[rng.integers(len(members), size=(DRAWS, len(members)))])
-    return np.concatenate(parts, axis=1)
+    return {"PPV": ppv, "Brier score": score, "Pearson r over groups": r}
 
 
 def _flips(shared: SharedTrials, names: tuple[str, str]) -> tuple[Table, ...]:

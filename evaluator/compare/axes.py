@@ -1,20 +1,16 @@
-"""Agreement along what was varied (lighting, pose, distractor, start region), and of progress."""
+"""Agreement along what was varied: lighting, pose, distractor, start region."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from evaluator.compare.measure import (
     RATE_COLUMNS,
     ends,
-    interval_or_reason,
     rate_row,
     vouched_rate,
 )
 from evaluator.compare.rows import TrialRow
-from evaluator.compare.success import group_rows, trials_in
-from evaluator.errors import UndefinedStatisticError
-from evaluator.result import Cell, Interval, Measurement, Table
-from evaluator.statistics.agreement import kendall, pearson
-from evaluator.statistics.bootstrap import student_interval
+from evaluator.compare.success import trials_in
+from evaluator.result import Cell, Measurement, Table
 from evaluator.statistics.differences import newcombe_difference, tango_points
 
 MOST_VALUES = 40
@@ -91,66 +87,3 @@ def _counts(rows: Sequence[TrialRow], side: str, both: Sequence[TrialRow]) -> tu
     """Successes and trials of one side, over trials where both are known if there are any."""
     known = [row for row in both or rows if getattr(row, side) is not None]
     return trials_in(row for row in known if getattr(row, side)), trials_in(known)
-
-
-def progress_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
-    """Lay out progress scores of both sides per group; none where nobody scored any.
-
-    Args:
-        rows: Trials, with scores from 0 to 1 where there are any.
-    """
-    scored = [r for r in rows if r.progress is not None or r.sim_progress is not None]
-    lines = [(*key, *_progress_line(members)) for key, members in group_rows(scored).items()]
-    if len(lines) > 1:
-        lines.append(("all", "", "", *_progress_line(scored)))
-    if not lines:
-        return ()
-    columns = (
-        *("task", "condition", "policy", f"{word} scored", f"{word} mean", "sim scored"),
-        *("sim mean", "pairs", f"sim - {word}", "low", "high", "r of pairs", "tau-b of pairs"),
-        "why no interval",
-    )
-    note = (
-        "Progress from 0 to 1 as somebody scored it. Differences and correlations are over trials "
-        "that have both scores; the interval is Student's t of their differences. Tau-b uses the "
-        "order of the scores alone."
-    )
-    return (
-        Table(
-            id="progress", title="Progress scores", columns=columns, rows=tuple(lines), note=note
-        ),
-    )
-
-
-def _progress_line(rows: Sequence[TrialRow]) -> tuple[Cell, ...]:
-    real = [row.progress for row in rows if row.progress is not None]
-    sim = [row.sim_progress for row in rows if row.sim_progress is not None]
-    pairs = [
-        (row.progress, row.sim_progress)
-        for row in rows
-        if row.progress is not None and row.sim_progress is not None
-    ]
-    gaps = [theirs - ours for ours, theirs in pairs]
-    interval: Interval | None = None
-    reason: str | None = "no trial has both scores"
-    if gaps:
-        interval, reason = interval_or_reason(student_interval, gaps)
-    return (
-        *(len(real), _mean(real), len(sim), _mean(sim), len(pairs), _mean(gaps), *ends(interval)),
-        *(_correlation(pearson, pairs), _correlation(kendall, pairs)),
-        reason,
-    )
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return sum(values) / len(values) if values else None
-
-
-def _correlation(
-    statistic: Callable[[Sequence[float], Sequence[float]], float],
-    pairs: Sequence[tuple[float, float]],
-) -> float | None:
-    try:
-        return statistic([a for a, _ in pairs], [b for _, b in pairs])
-    except UndefinedStatisticError:
-        return None

@@ -52,12 +52,7 @@ class RuleSummary:
 def apply_rule(
     recorded: Episode, localised: Episode | None, *, plan_id: str, task: Task | None = None
 ) -> RuleSummary | None:
-    """Ask the geometric rule about the plan that was sent; None where there is nothing to ask.
-
-    Args:
-        localised: Its localisation by the twin; the cell's own records count without it.
-        task: Shapes and predicates; the one the episode names without it.
-    """
+    """Ask the geometric rule about the plan that was sent; None where there is nothing to ask."""
     task = recorded_task(recorded) if task is None else task
     plan = _plan(recorded, plan_id)
     if task is None or plan is None:
@@ -112,9 +107,6 @@ def baseline_results(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple
     """Hold the twin's answers against every forecast without a twin, over the same trials.
 
     Nothing is found where no trial has both the twin's answer and an outcome.
-
-    Args:
-        rows: All trials; those whose outcome, twin's answer and forecast are known count.
     """
     names = list(dict.fromkeys(name for row in rows for name, _ in row.baselines))
     measurements: list[Measurement] = []

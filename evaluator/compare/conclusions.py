@@ -37,9 +37,6 @@ def conclusions_table(
     of both sides' own trials (Newcombe), over two groups their mean (Zou and Donner). The ranking
     is settled when the interval of the recorded difference of the best and the next leaves zero
     out.
-
-    Args:
-        rows: The trials behind them; none for a table of rates.
     """
     usable = usable_groups(groups)
     tasks = list(dict.fromkeys(group.task for group in usable))
@@ -155,11 +152,7 @@ def _smallest(members: Sequence[RateGroup], n: int) -> float | None:
 
 
 def direction(low: float | None, high: float | None) -> str:
-    """Say what an interval of the bias settles: optimistic, pessimistic, or neither.
-
-    Args:
-        low: Its lower end; None where there is none.
-    """
+    """Say what an interval of the bias settles: optimistic, pessimistic, or neither."""
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return ""
     if low > 0:

@@ -286,12 +286,7 @@ FITTED_TO = "fitted_to"
 
 
 def compare_imported(recorded: Sequence[Episode], files: Sequence[DerivedFile]) -> Part:
-    """Compare where tool and objects of imported runs end, per task and simulation engine.
-
-    Args:
-        recorded: Recorded episodes; only imported ones are looked at.
-        files: Derived episodes; only imported replays without a plan are looked at.
-    """
+    """Compare where tool and objects of imported runs end, per task and simulation engine."""
     runs, left_out = _runs(recorded, files)
     if not runs:  # nothing imported, or imported without a robot, as an RGB-D folder
         return Part()

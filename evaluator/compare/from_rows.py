@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from bridge.episode.executions import NO_PLAN
 from bridge.task.protocol import VOID_CAUSES
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
-from evaluator.compare.axes import axis_tables, progress_table
+from evaluator.compare.axes import axis_tables
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
 from evaluator.compare.decisions import decisions
@@ -14,7 +14,6 @@ from evaluator.compare.gains import (
     gain_tests,
     pair_starts,
     paired_gain,
-    paired_progress,
     replanning_gains,
     start_distances,
 )
@@ -24,7 +23,7 @@ from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow
 from evaluator.compare.sequences import sequences, stopping_table
-from evaluator.compare.stages import divergence_table, failures_table, stage_results
+from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
     WITH,
@@ -110,7 +109,6 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *varied_agreement(rows, groups),
         *study,
         *paired_gain(pairs),
-        *paired_progress(pairs),
         *start_distances(pairs),
         *never_sent(rows),
         *beside,
@@ -149,9 +147,7 @@ def _tables(
         *found.gate_tables,
         *found.stage_tables,
         *failures_table(rows, word),
-        *divergence_table(rows),
         *axis_tables(rows, word),
-        *progress_table(rows, word),
         *stopping_table(rows, goal),
         trials_table(rows, word),
     )

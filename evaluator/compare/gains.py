@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -21,8 +20,6 @@ from evaluator.measurements import (
     GAIN_RELATIVE_AVERAGE,
     MCNEMAR,
     PAIRED_GAIN,
-    PAIRED_PROGRESS,
-    PAIRED_PROGRESS_P,
     START_DISTANCE,
     TRIALS_NEEDED,
 )
@@ -33,7 +30,6 @@ from evaluator.statistics.differences import (
     mcnemar,
     mean_of_intervals,
     newcombe_difference,
-    sign_test,
     tango_points,
 )
 from evaluator.statistics.intervals import relative_gain
@@ -95,11 +91,7 @@ def pair_starts(rows: Sequence[TrialRow]) -> tuple[list[StartPair], list[Exclusi
 
 
 def start_distance_m(first: TrialRow, second: TrialRow) -> float | None:
-    """Return the largest distance between objects localised in both trials [m].
-
-    Args:
-        second: The other one; without an object localised in both the answer is None.
-    """
+    """Return the largest distance between objects localised in both trials [m]."""
     shared = first.start_positions_m.keys() & second.start_positions_m.keys()
     if not shared:
         return None
@@ -171,53 +163,6 @@ def paired_gain(pairs: Sequence[StartPair]) -> list[Measurement]:
     return measurements
 
 
-def paired_progress(pairs: Sequence[StartPair]) -> list[Measurement]:
-    """Compare how far both trials of a start came, where trials count objects or sub-tasks.
-
-    Only which one came further counts, not by how much: two of three sub-tasks are no share of a
-    distance.
-
-    Args:
-        pairs: The same starts without and with replanning; nothing where none has progress.
-    """
-    known = []
-    for pair in pairs:
-        before, after = progress(pair.before), progress(pair.after)
-        if before is not None and after is not None and pair.before.unit == pair.after.unit:
-            known.append((pair, before, after))
-    if not known:
-        return []
-    improved = sum(after > before for _, before, after in known)
-    worsened = sum(after < before for _, before, after in known)
-    words = f"further in {improved}, less far in {worsened} of {len(known)} paired starts"
-    make = partial(
-        measured,
-        n=len(known),
-        counted="pair",
-        episodes=[r.episode for pair, _, _ in known for r in (pair.before, pair.after)],
-    )
-
-    def p_mid() -> float:
-        if not improved + worsened:
-            reason = f"both trials of all {len(known)} starts came equally far"
-            raise UndefinedStatisticError(statistic="sign test", reason=reason)
-        return sign_test(improved, worsened)[1]
-
-    return [
-        make(
-            PAIRED_PROGRESS.of(words=words), partial(tango_points, improved, worsened, len(known))
-        ),
-        make(PAIRED_PROGRESS_P.of(words=words), p_mid, reason_without_interval="a p-value"),
-    ]
-
-
-def progress(row: TrialRow) -> Fraction | None:
-    """Return which part of a trial's objects or sub-tasks succeeded, None where trials count."""
-    if row.unit == "trial" or row.k is None or not row.n:
-        return None
-    return Fraction(row.k, row.n)
-
-
 def _paired_points(
     side: str, known: Sequence[StartPair], improved: int, worsened: int, words: str
 ) -> Measurement:
@@ -283,11 +228,7 @@ def changes(groups: Sequence[RateGroup]) -> list[Change]:
 
 
 def replanning_gains(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
-    """Measure the gain with replanning per task and side: percentage points and relative.
-
-    Args:
-        groups: Groups of both conditions; a gain needs one of each.
-    """
+    """Measure the gain with replanning per task and side: percentage points and relative."""
     pairs = changes(groups)
     measurements = [m for change in pairs for m in _gain(change, method)]
     measurements.extend(_average_gains(pairs, method))

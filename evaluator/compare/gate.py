@@ -44,11 +44,7 @@ REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
 
 
 def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
-    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict.
-
-    Args:
-        rows: Trials; those without an answer or an outcome do not count.
-    """
+    """Measure k/n agreement, phi, kappa and predictive values, of the replay and of the verdict."""
     measurements = []
     for name, answer_of, words in (
         ("sim_planned", lambda row: row.sim_planned, "planned-in-twin (dynamic, of the sent plan)"),
@@ -78,11 +74,7 @@ def heeded_verdict(row: TrialRow) -> bool | None:
 
 
 def confusion_of(rows: Sequence[TrialRow], answer_of: Answer) -> Confusion:
-    """Count what was said against what was labelled, over trials where both are known.
-
-    Args:
-        answer_of: Reads what the twin said of a trial; None where it said nothing.
-    """
+    """Count what was said against what was labelled, over trials where both are known."""
     return Confusion.count(
         (answer, row.recorded)
         for row in rows

@@ -1,4 +1,4 @@
-"""The task file a trial was recorded with, or the one its name stands for, where there is one."""
+"""The task file a trial was recorded with, where there is one."""
 
 from functools import cache
 from pathlib import Path
@@ -7,15 +7,6 @@ from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.task.find import MissingTaskError, find_task_file
 from bridge.task.task_file import Task
-
-
-@cache
-def known_task(name: str) -> Task | None:
-    """Load a shipped task by name; None for an unknown one."""
-    try:
-        return find_task_file(name).task()
-    except MissingTaskError:
-        return None
 
 
 def recorded_task(episode: Episode) -> Task | None:

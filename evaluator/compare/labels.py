@@ -53,9 +53,6 @@ def perceive_outcome(
 
     The predicate is the one the twin's replays are judged by. None without a localisation, or
     when the task file is not known.
-
-    Args:
-        task: With the success predicate; the one the episode names without it.
     """
     info = recorded.info
     task = recorded_task(recorded) if task is None else task
@@ -147,7 +144,7 @@ def _tool_m(recorded: Episode, seen_ns: int) -> Float[np.ndarray, "3"] | None:
     return None
 
 
-NAMES = {True: "success", False: "failure", None: "open"}
+NAMES = {True: "success", False: "failure"}
 OPEN = "the localised poses leave it open"
 Pair = tuple[TrialRow, PerceivedOutcome]
 
@@ -155,11 +152,7 @@ Pair = tuple[TrialRow, PerceivedOutcome]
 def label_results(
     perceived: Sequence[PerceivedOutcome], rows: Sequence[TrialRow], *, method: str = "wilson"
 ) -> Part:
-    """Count the trials in which label and predicate say the same, and list the others.
-
-    Args:
-        rows: The trials with their labels; these alone enter every other number.
-    """
+    """Count the trials in which label and predicate say the same, and list the others."""
     if not perceived:
         reason = "no trial of a known task was localised after its execution"
         return Part(missing=(f"label against localised predicate: no data ({reason})",))
@@ -175,7 +168,7 @@ def label_results(
         measurements.append(_counts(counted, method))
     return Part(
         measurements=tuple(measurements),
-        tables=(_cross_table(pairs), *_disagreements(pairs)),
+        tables=_disagreements(pairs),
         exclusions=tuple(_left_out(pairs)),
     )
 
@@ -216,31 +209,14 @@ def _counts(pairs: Sequence[Pair], method: str) -> Measurement:
     )
 
 
-def _cross_table(pairs: Sequence[Pair]) -> Table:
-    counts = {(label, says): 0 for label in NAMES for says in NAMES}
-    for row, outcome in pairs:
-        counts[row.recorded, outcome.says] += 1
-    return Table(
-        id="label_predicate",
-        title="Operator's label against the predicate on localised poses",
-        columns=("label", "predicate: success", "predicate: failure", "predicate: open"),
-        rows=tuple(
-            ("unlabelled" if label is None else NAMES[label], *(counts[label, s] for s in NAMES))
-            for label in NAMES
-        ),
-        note="The same predicate that judges replays, asked of the poses localised after the "
-        "execution. Headline numbers use the label.",
-    )
-
-
 def _disagreements(pairs: Sequence[Pair]) -> tuple[Table, ...]:
     rows: list[tuple[Cell, ...]] = [
         (
             row.episode,
             row.task,
             row.condition.replace("_", " "),
-            NAMES[row.recorded],
-            NAMES[outcome.says],
+            NAMES[bool(row.recorded)],
+            NAMES[bool(outcome.says)],
             outcome.detail,
         )
         for row, outcome in _known(pairs)

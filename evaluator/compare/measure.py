@@ -34,7 +34,6 @@ def ends(interval: Interval | None, factor: float = 1.0) -> tuple[float | None, 
     """Return both ends of an interval, in another unit by ``factor``; unknown without one.
 
     Args:
-        interval: What was estimated; None where there is no interval.
         factor: Multiplies both ends, for example 1000 from m to mm.
     """
     return (None, None) if interval is None else (factor * interval.low, factor * interval.high)
@@ -52,11 +51,7 @@ def rate_row(rate: Measurement) -> tuple[Cell, ...]:
 
 
 def average(items: Sequence[Item], read: Callable[[Item], float | None]) -> float | None:
-    """Return the mean of what is known; None when nothing is.
-
-    Args:
-        read: Gives the number of an item; None leaves the item out.
-    """
+    """Return the mean of what is known; None when nothing is."""
     values = [value for item in items if (value := read(item)) is not None]
     return sum(values) / len(values) if values else None
 
@@ -121,11 +116,8 @@ def measured(
     Args:
         compute: Gives the value, or the value with its interval; refuses by
             ``UndefinedStatisticError``.
-        n: How many were counted; None where nothing is counted.
-        reason_without_interval: Said where there is no interval.
         interval_n: What the coverage of the interval depends on, where it is not ``n``.
         coverage_key: Name in ``coverage.HOLDS_FROM``, where one method serves several statistics.
-        instead: What to use where the interval is refused; what its method says without.
     """
     value: float | None = None
     interval: Interval | None = None
@@ -180,9 +172,5 @@ def proportion(
 
 
 def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
-    """Return the interval of k/n by a named method, or None and why it is not printed.
-
-    Args:
-        n: Trials, 1 or more.
-    """
+    """Return the interval of k/n by a named method, or None and why it is not printed."""
     return vouch(RATE_INTERVALS[method](k, n), n)

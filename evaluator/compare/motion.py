@@ -76,16 +76,11 @@ class MotionSummary:
     """The same after the best rigid motion is taken out too; None for a straight motion."""
     relative_mean_m: float | None
     """Mean difference of what both do within a second; None below a second."""
-    relative_mean_rad: float | None
     joint_rms_rad: float | None
     """Over all joints and instants; None without joints of the same names."""
     joint_max_rad: float | None
-    joint_worst: str | None
-    """The joint that reaches it."""
     curve_m: Packed
     """Distance at 101 instants spread evenly over the duration."""
-    joint_curve_rad: Packed
-    """Root mean square over the joints at such instants; empty without joints."""
 
 
 def summarise_motions(
@@ -113,11 +108,7 @@ def summarise_motions(
 
 
 def compare_tracks(mine: Tracks, other: Tracks) -> MotionSummary:
-    """Compare two motions on one clock, or over normalised time where there is none.
-
-    Args:
-        other: The motion held against it; shifted to the same start where its clock is another one.
-    """
+    """Compare two motions on one clock, or over normalised time where there is none."""
     mine = mine.cut()
     if mine.tool is None or other.tool is None:
         raise UndefinedStatisticError(statistic="motion", reason="no tool poses on both sides")
@@ -171,12 +162,9 @@ def _summary(aligned_by: str, errors: PoseErrors) -> MotionSummary:
         without_lag_mean_m=None,
         without_offset_mean_m=None,
         relative_mean_m=None,
-        relative_mean_rad=None,
         joint_rms_rad=None,
         joint_max_rad=None,
-        joint_worst=None,
         curve_m=_curve(errors.stamps_ns, position),
-        joint_curve_rad=packed(),
     )
 
 
@@ -203,10 +191,8 @@ def _with_shape(
     instants = np.arange(int(errors.stamps_ns[0]), int(errors.stamps_ns[-1]) + 1, STEP_NS)
     if len(instants) <= STEPS_PER_S:
         return summary
-    moved, turned = relative_errors(mine.at(instants), other.at(instants), STEPS_PER_S)
-    return replace(
-        summary, relative_mean_m=float(moved.mean()), relative_mean_rad=float(turned.mean())
-    )
+    moved, _ = relative_errors(mine.at(instants), other.at(instants), STEPS_PER_S)
+    return replace(summary, relative_mean_m=float(moved.mean()))
 
 
 def _without_offset_m(
@@ -224,14 +210,11 @@ def _with_joints(
         errors = joint_errors(mine, other)
     except UndefinedStatisticError:
         return summary
-    largest = np.abs(errors.error_rad).max(axis=0)
     over_time = errors.over_time_rad()
     return replace(
         summary,
         joint_rms_rad=float(np.sqrt((over_time**2).mean())),
-        joint_max_rad=float(largest.max()),
-        joint_worst=errors.names[int(largest.argmax())],
-        joint_curve_rad=_curve(errors.stamps_ns, over_time),
+        joint_max_rad=float(np.abs(errors.error_rad).max()),
     )
 
 

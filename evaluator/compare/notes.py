@@ -51,11 +51,7 @@ def notes_table(found: Iterable[Note]) -> tuple[Table, ...]:
 
 
 def with_notes(tables: Iterable[Table], found: Iterable[Note]) -> tuple[Table, ...]:
-    """Put notes before those that are among some tables already.
-
-    Args:
-        found: Notes to add; without any the tables stay as they are.
-    """
+    """Put notes before those that are among some tables already."""
     kept, found = list(tables), list(found)
     if not found:
         return tuple(kept)
@@ -205,17 +201,12 @@ def check_settings(trials: Sequence[Trial], derived: Sequence[DerivedFile]) -> l
     known = list(zip(derived, reasons, strict=True))
     found = list(_passed_over(why for file, why in known if file.derived.kind == "replay"))
     if used:
-        may_count = [file for file, why in known if not why]
-        found += [*_scenes(used, derived), *_settings(used), *_tried(used, may_count)]
+        found += [*_scenes(used, derived), *_settings(used)]
     return [(ABOUT, text) for text in found]
 
 
 def _passed_over(reasons: Iterable[str]) -> Iterable[str]:
-    """Say which replays are shown and never counted, and why.
-
-    Args:
-        reasons: One for each replay; empty for one that may count.
-    """
+    """Say which replays are shown and never counted, and why."""
     for why, count in Counter(reasons).items():
         if why:
             yield f"{count} that never count were {why}"
@@ -270,50 +261,6 @@ def _settings(used: Sequence[DerivedFile]) -> Iterable[str]:
                 "are judged by different twins"
             )
             return
-
-
-def _tried(used: Sequence[DerivedFile], derived: Iterable[DerivedFile]) -> Iterable[str]:
-    """Say that a replay with other settings lies beside one that counts, and why it does not."""
-    beside: dict[tuple[str | None, ...], list[DerivedFile]] = {}
-    for file in derived:
-        if file.derived.kind == "replay" and file.derived.mode == "dynamic":
-            beside.setdefault(_trajectory(file), []).append(file)
-    differ = []
-    for file in used:
-        files = beside.get(_trajectory(file), ())
-        if len(files) > 1:
-            mine = _made_with(file)
-            other = _asked_otherwise(mine, files)
-            if other is not None:
-                differ.append((mine, other))
-    if differ:
-        mine, other = (dict(_leaves(made)) for made in differ[0])
-        name = next((name for name in mine if mine[name] != other.get(name)), "a newer setting")
-        yield (
-            f"{len(differ)} of the {len(used)} that count were also made with other settings "
-            f"({name} {mine.get(name)} in what counts, {other.get(name)} beside it): the newest "
-            "file of each trajectory counts"
-        )
-
-
-def _trajectory(file: DerivedFile) -> tuple[str | None, ...]:
-    """Whose replay it is, of which bytes and in which scene."""
-    made = file.derived
-    return made.source_episode, made.source_sha256, made.plan_id, made.trajectory, made.scene_hash
-
-
-def _asked_otherwise(
-    mine: Mapping[str, Any], files: Iterable[DerivedFile]
-) -> Mapping[str, Any] | None:
-    """What a replay was made with that only the user's wish sets apart, None where there is none.
-
-    A newer program or calibration leaves older files behind, which surprises nobody.
-    """
-    for made in map(_made_with, files):
-        same = all(mine.get(name) == made.get(name) for name in MADE_BY)
-        if made and same and made != mine:
-            return made
-    return None
 
 
 def made_with(file: DerivedFile) -> dict[str, Any]:

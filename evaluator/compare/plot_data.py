@@ -1,4 +1,4 @@
-"""Numbers that only figures need: bands over many motions, intervals of bins, rates in the twin.
+"""Numbers that only figures need: bands over many motions, distributions.
 
 The report draws what it is given; what has to be computed for a figure is computed here.
 """
@@ -7,52 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from evaluator.compare.measure import vouched_rate
-from evaluator.compare.rows import TrialRow
-from evaluator.statistics.gate import reliability_bins
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReliabilityPoint:
-    """One bin of stated probabilities against what happened."""
-
-    low: float
-    high: float
-    mean_probability: float
-    succeeded: int
-    n: int
-    rate: float
-    rate_low: float | None
-    """None where no honest interval exists for so few trials."""
-    rate_high: float | None
-
-
-def reliability_points(rows: Sequence[TrialRow]) -> list[ReliabilityPoint]:
-    """Return the bins of the reliability diagram with Wilson's interval of each."""
-    seen = [
-        (row.p_success, row.recorded)
-        for row in rows
-        if row.p_success is not None and row.recorded is not None
-    ]
-    if not seen:
-        return []
-    found = []
-    for b in reliability_bins([p for p, _ in seen], [outcome for _, outcome in seen]):
-        interval, _ = vouched_rate(b.succeeded, b.n, "wilson")
-        found.append(
-            ReliabilityPoint(
-                low=b.low,
-                high=b.high,
-                mean_probability=b.mean_probability,
-                succeeded=b.succeeded,
-                n=b.n,
-                rate=b.succeeded / b.n,
-                rate_low=None if interval is None else interval.low,
-                rate_high=None if interval is None else interval.high,
-            )
-        )
-    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,11 +62,7 @@ MAX_STEPS = 200
 
 
 def shares_of(name: str, values: Sequence[float]) -> Shares | None:
-    """Return the empirical distribution of finite values, thinned evenly; None without any.
-
-    Args:
-        values: Any numbers; those that are not finite are left out.
-    """
+    """Return the empirical distribution of finite values, thinned evenly; None without any."""
     found = np.sort(np.array([v for v in values if np.isfinite(v)], dtype=np.float64))
     if not found.size:
         return None

@@ -36,9 +36,6 @@ def as_designed(rows: Sequence[TrialRow], protocol: Protocol | None) -> list[Tri
 
     Trials of a table have a condition and no arm; a line of the operator's list that nobody filled
     in is no trial.
-
-    Args:
-        protocol: Its protocol; rows stay as they are without a design.
     """
     if protocol is None or protocol.primary is None:
         return list(rows)

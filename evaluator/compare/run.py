@@ -52,9 +52,6 @@ def compare_run(
     """Pair every recorded trial of a run with its replays and measure the agreement.
 
     A broken episode is left out and named; a missing part is listed, never guessed.
-
-    Args:
-        cache: What earlier evaluations read; without one every file is read.
     """
     cache = SummaryCache(None) if cache is None else cache
     read = read_run(RunFolder.open(run.path), cache, output)
@@ -163,11 +160,7 @@ def compare_read(
     method: str = "wilson",
     goal: float | None = None,
 ) -> Comparison:
-    """Measure everything that the trials of some runs say together.
-
-    Args:
-        reads: The runs; an episode has another id in each.
-    """
+    """Measure everything that the trials of some runs say together."""
     rows = [row for read in reads for row in read.rows]
     rows += more_rows
     summaries = Summaries(

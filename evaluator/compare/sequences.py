@@ -21,11 +21,7 @@ MOST_LOG = math.log(MOST)
 
 
 def sequences(rows: Sequence[TrialRow], pairs: Sequence[StartPair]) -> list[Measurement]:
-    """Say what holds however often somebody looked: each group's rate, and whether pairs improve.
-
-    Args:
-        pairs: The same starts without and with replanning; none leaves those out.
-    """
+    """Say what holds however often one looked: each group's rate, and whether pairs improve."""
     measurements = []
     for key, members in group_rows(rows).items():
         known = in_order([row for row in members if row.recorded is not None])
@@ -51,12 +47,7 @@ def _sequence(key: Key, known: Sequence[TrialRow]) -> Measurement:
 
 
 def stopping_table(rows: Sequence[TrialRow], goal: float | None) -> tuple[Table, ...]:
-    """Say for each group whether its recorded rate is settled against a goal; none without one.
-
-    Args:
-        rows: Trials of all groups; those without an outcome do not count.
-        goal: The success rate that is asked about, 0 to 1; None makes no table.
-    """
+    """Say for each group whether its recorded rate is settled against a goal; none without one."""
     if goal is None:
         return ()
     lines: list[tuple[Cell, ...]] = []

@@ -87,11 +87,7 @@ def with_against(
     options: TableOptions = AS_SAVED,
     output: Output = QUIET,
 ) -> Comparison:
-    """Add the paired comparison with another twin's answers to the same recorded trials.
-
-    Args:
-        source: Where it is from; settings of replays are read there.
-    """
+    """Add the paired comparison with another twin's answers to the same recorded trials."""
     refuse_twice([source, other])
     mine, theirs = (answers_of(path, options, output) for path in (source, other))
     tables = against_tables(

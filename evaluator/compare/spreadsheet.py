@@ -1,7 +1,7 @@
 """A trials CSV, or another benchmark's results, into a ``Comparison``; a run's trials out again."""
 
 from collections.abc import Container, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
@@ -18,38 +18,21 @@ from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.success import unpaired_keys
 from evaluator.result import Exclusion
 
+SHARED = tuple(
+    field.name for field in fields(TrialRecord) if field.name in TrialRow.__dataclass_fields__
+)
+"""What a line of a trials CSV and a trial row call by the same name."""
+
 
 def row_from_record(record: TrialRecord) -> TrialRow:
     """Turn one line of a trials CSV into a trial row."""
-    return TrialRow(
-        episode=record.trial_id,
-        task=record.task,
-        condition=record.condition,
-        policy=record.policy,
-        start_id=record.start_id,
-        cell=record.cell,
-        stand_in=record.stand_in,
-        recorded=record.recorded,
-        unit=record.unit,
-        k=record.k,
-        n=record.n,
-        sim_planned=record.sim_planned,
-        sim_executed=record.sim_executed,
-        verdict=record.verdict,
-        p_success=record.p_success,
-        progress=record.progress,
-        sim_progress=record.sim_progress,
-        tags=record.tags,
-    )
+    return TrialRow(episode=record.trial_id, **{name: getattr(record, name) for name in SHARED})
 
 
 def imported_rows(
     run: RunFolder, recorded_ids: Container[str]
 ) -> tuple[list[TrialRow], list[Exclusion]]:
     """Read the run's imported trials; one that was recorded too is left out and named.
-
-    Args:
-        run: The run folder; without imported trials there are no rows.
 
     Raises:
         TableError: When somebody has changed the file so that a row contradicts itself.
@@ -148,29 +131,10 @@ def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
 
 def record_from_row(row: TrialRow) -> TrialRecord:
     """Turn a trial row into one line of a trials CSV."""
-    k, n = row.k, row.n
+    shared = {name: getattr(row, name) for name in SHARED}
     if row.unit == "trial" and row.recorded is not None:
-        k, n = int(row.recorded), 1
-    return TrialRecord(
-        trial_id=row.episode,
-        task=row.task,
-        condition=row.condition,
-        policy=row.policy,
-        start_id=row.start_id,
-        unit=row.unit,
-        k=k,
-        n=n,
-        recorded=row.recorded,
-        sim_planned=row.sim_planned,
-        sim_executed=row.sim_executed,
-        verdict=row.verdict,
-        p_success=row.p_success,
-        cell=row.cell,
-        stand_in=row.stand_in,
-        progress=row.progress,
-        sim_progress=row.sim_progress,
-        tags=row.tags,
-    )
+        shared |= {"k": int(row.recorded), "n": 1}
+    return TrialRecord(trial_id=row.episode, **shared)
 
 
 def _with_source(

@@ -1,6 +1,5 @@
 """Where trials are lost: the stage funnel, kinds of failure."""
 
-from collections import Counter
 from collections.abc import Sequence
 
 from evaluator.compare.measure import proportion
@@ -96,11 +95,7 @@ def _tables(
 
 
 def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
-    """Count what failed first: in the twin by clause and cause, recorded by stage.
-
-    Args:
-        rows: Trials; only failures count.
-    """
+    """Count what failed first: in the twin by clause and cause, recorded by stage."""
     twin = failure_taxonomy(
         (row.first_failing or "unknown", row.failing_cause or "")
         for row in rows
@@ -121,35 +116,6 @@ def failures_table(rows: Sequence[TrialRow], word: str) -> tuple[Table, ...]:
             rows=tuple(lines),
             note="In the twin: the first clause of the acceptance indicator that is false. "
             "Recorded: the first stage labelled a failure.",
-        ),
-    )
-
-
-def divergence_table(rows: Sequence[TrialRow]) -> tuple[Table, ...]:
-    """Count where planned, executed and recorded part first, by task, control step and cause.
-
-    Args:
-        rows: Trials; those whose executed motion was not compared are passed over.
-    """
-    counts: Counter[tuple[str, ...]] = Counter()
-    for row in rows:
-        if (diverged := row.divergence) is not None:
-            step = diverged.stage or "outside the steps"
-            key = diverged.attribution, diverged.quantity, diverged.body, diverged.between
-            where = (row.task, step, *key)
-            counts[where] += 1
-    if not counts:
-        return ()
-    lines = sorted(counts.items(), key=lambda item: (item[0][0], -item[1], item[0]))
-    return (
-        Table(
-            id="divergences",
-            title="Where planned, executed and recorded part first",
-            columns=("task", "control step", "cause", "quantity", "body", "between", "trials"),
-            rows=tuple((*where, count) for where, count in lines),
-            note=f"Of {sum(row.executed_replay is not None for row in rows)} trials with an "
-            f"executed replay {counts.total()} part, whatever their outcome. Only the first "
-            "quantity beyond its limit is counted: what follows may come from it.",
         ),
     )
 

@@ -85,10 +85,6 @@ def summarise_states(
 
     Objects are localised only after an execution, so only their final states are held against the
     recording. Nothing is found when the plan predicts no object.
-
-    Args:
-        localised: Its localisation by the twin; the cell's own records count without it.
-        task: Says which objects are soft or symmetric; the one the episode names without it.
     """
     sent = read_sent(recorded, plan_id)
     if sent is None:

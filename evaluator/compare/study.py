@@ -54,11 +54,7 @@ class StudyStart:
 def study_starts(
     rows: Sequence[TrialRow], void_causes: Sequence[str] = VOID_CAUSES
 ) -> tuple[list[StudyStart], list[Exclusion]]:
-    """Gather the trials of a study by start; whole starts are left out, never single trials.
-
-    Args:
-        rows: Trials; those outside a study are passed over.
-    """
+    """Gather the trials of a study by start; whole starts are left out, never single trials."""
     mine = [row for row in rows if row.study_arm]
     gathered: dict[tuple[str, str, str], list[TrialRow]] = {}
     for row in mine:

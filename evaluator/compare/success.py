@@ -78,11 +78,7 @@ def answered(
     reason_if_undefined: str,
     method: str = "wilson",
 ) -> Measurement:
-    """Measure the share of yes among the trials whose answer is known.
-
-    Args:
-        answer: Reads yes, no, or None for unknown from a trial.
-    """
+    """Measure the share of yes among the trials whose answer is known."""
     known = [row for row in rows if answer(row) is not None]
     return proportion(
         defined,
@@ -234,11 +230,7 @@ def trial_table(
 
 
 def averages(groups: Sequence[RateGroup], *, method: str = "wilson") -> list[Measurement]:
-    """Average over groups of a condition: macro (groups alike) and pooled (trials alike).
-
-    Args:
-        groups: Groups of any condition; a condition with fewer than two has no average.
-    """
+    """Average over groups of a condition: macro (groups alike) and pooled (trials alike)."""
     measurements = []
     for condition in dict.fromkeys(group.condition for group in groups):
         members = [group for group in groups if group.condition == condition]

@@ -112,12 +112,7 @@ def sum_up(
     output: Output,
     pool: ProcessPool | Serial = SERIAL,
 ) -> Summaries:
-    """Summarise motions, final states and localised success of every trial with a plan sent.
-
-    Args:
-        trials: Trials laid beside their replays; without a plan sent one is passed over.
-        pool: Compares several trials at once; one after the other without.
-    """
+    """Summarise motions, final states and localised success of every trial with a plan sent."""
     found: dict[type[Any], list[Any]] = {part.kind: [] for part in PARTS}
     unknown: list[tuple[Trial, _Job]] = []
     for trial in trials:

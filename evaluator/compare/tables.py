@@ -149,11 +149,7 @@ def gains_table(gains: Sequence[Measurement], word: str) -> tuple[Table, ...]:
 def layout_table(
     groups: Sequence[RateGroup], measurements: Sequence[Measurement], word: str
 ) -> tuple[Table, ...]:
-    """Lay rates out as papers print them: a row per task, sim and recorded without and with.
-
-    Args:
-        groups: Success rates per task, condition and policy; one condition alone makes no table.
-    """
+    """Lay rates out as papers print them: a row per task, sim and recorded without and with."""
     conditions = [name for name in (WITHOUT, WITH) if any(c.condition == name for c in groups)]
     if len(conditions) < 2:
         return ()

@@ -1,7 +1,6 @@
 """Settings of ``robot-gst design``; imports nothing heavy."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -46,8 +45,6 @@ class StudyOptions:
 class Wanted:
     """What is expected, and what the study is to show; shares from 0 to 1."""
 
-    past: Annotated[Path | None, RARE] = None
-    """A run, or its results.json: expected rates and the twin's agreement are taken from there."""
     rate: float | None = None
     """Expected success rate of the arm that is compared with."""
     gain: float | None = None
@@ -58,16 +55,12 @@ class Wanted:
     """Expected share of trials in which twin and outcome agree."""
     width: float | None = None
     """Wanted width of the gain's interval, from end to end."""
-    rate_width: Annotated[float | None, RARE] = None
-    """Wanted width of the interval of each arm's rate in each task."""
     agrees_above: Annotated[float | None, RARE] = None
     """The claim that twin and outcome agree in more than this share of trials."""
     power: float = 0.8
     """Chance with which gain and claim are to be shown."""
     alpha: float = 0.05
     """Chance of a false alarm."""
-    per_task: Annotated[bool, RARE] = False
-    """Ask for the gain in every task alone; otherwise over all tasks together."""
     starts: int | None = None
     """Starts of each task, whatever would be needed; what they can show is said."""
 
@@ -81,7 +74,6 @@ class Wanted:
                 "gain": (-1, 1),
                 "correlation": (-1, 1),
                 "width": (0.01, 2),
-                "rate_width": (0.01, 1),
                 "power": (0.05, 0.999),
                 "alpha": (0.0001, 0.5),
                 "starts": (1, 1000),

@@ -27,8 +27,6 @@ from bridge.whole_file import write_whole
 from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import UndefinedStatisticError
-from evaluator.measurements import AGREED, RATES
-from evaluator.result import Results, load_results
 from evaluator.statistics.intervals import RATE_INTERVALS
 from evaluator.statistics.planning import (
     paired_chances,
@@ -38,7 +36,6 @@ from evaluator.statistics.planning import (
     power_above,
     rate_width,
     trials_above,
-    trials_for_width,
 )
 from evaluator.statistics.power import power_paired
 
@@ -71,10 +68,9 @@ class Expected:
     agreement: float | None
     source: str
 
-    def chances(self, task: str | None = None) -> tuple[float, float]:
-        """Return the chances of a pair to improve and to worsen, in one or over all tasks."""
-        rates = list(self.rates.values()) if task is None else [self.rates[task]]
-        each = [paired_chances(*pair, self.correlation) for pair in rates]
+    def chances(self) -> tuple[float, float]:
+        """Return the chances of a pair to improve and to worsen, over all tasks."""
+        each = [paired_chances(*pair, self.correlation) for pair in self.rates.values()]
         return sum(a for a, _ in each) / len(each), sum(b for _, b in each) / len(each)
 
 
@@ -103,7 +99,7 @@ def design(study: StudyOptions, wanted: Wanted) -> Design:
     if not starts:
         raise UsageError(
             "nothing says how large the study is to be: give --gain with --rate, --width, "
-            "--rate-width, --agrees-above with --agreement, or --starts."
+            "--agrees-above with --agreement, or --starts."
         )
     if starts > 1000:
         raise UsageError(f"{starts} starts of each task would be needed; a study has 1000 at most.")
@@ -201,81 +197,32 @@ def _endpoints(policies: Sequence[PolicyArms], wanted: Wanted) -> list[Endpoint]
 
 
 def _expected(protocol: Protocol, wanted: Wanted) -> Expected:
-    """Gather expectations: what was given, else what a past run shows."""
-    past = None if wanted.past is None else load_results(wanted.past)
-    primary = protocol.primary
-    rates, sources = {}, []
-    for task in protocol.tasks:
-        before = wanted.rate
-        after = None
-        if past is not None and primary is not None and primary.kind == "difference":
-            arms = (primary.against_policy, primary.against_arm), (primary.policy, primary.arm)
-            before, after = (
-                _past_rate(past, task.task, *arm) if given is None else given
-                for arm, given in zip(arms, (wanted.rate, None), strict=True)
-            )
-        first = 0.5 if before is None else before
-        if wanted.gain is not None:
-            after = first + wanted.gain
-        second = first if after is None else after
-        if not 0 <= second <= 1:
-            raise UsageError(
-                f"a rate of {100 * first:.0f} % and a gain of {100 * (second - first):.0f} points "
-                f"make {100 * second:.0f} %: give another --rate or --gain."
-            )
-        rates[task.task] = (first, second)
-        sources.append(f"{task.task} {100 * first:.0f} % and {100 * second:.0f} %")
-    agreement = wanted.agreement
-    if agreement is None and past is not None:
-        agreement = _share(past, AGREED.of(by="sim_planned", words="").id)
-    where = "as given" if past is None else f"from {past.run} where not given"
-    return Expected(
-        rates=rates,
-        correlation=wanted.correlation,
-        agreement=agreement,
-        source=f"expected rates ({where}): {', '.join(sources)}; correlation of both outcomes of "
-        f"a start {wanted.correlation:g}",
-    )
-
-
-def _past_rate(past: Results, task: str, policy: str, arm: str) -> float:
-    name = RATES["recorded"].of(task=task, condition=CONDITION_OF_ARM[arm], policy=policy).id
-    found = _share(past, name)
-    if found is None:
-        there = ", ".join(m.id for m in past.measurements if m.id.startswith("rate.recorded."))
+    """Lay out what is expected of each task."""
+    first = 0.5 if wanted.rate is None else wanted.rate
+    second = first + (wanted.gain or 0.0)
+    if not 0 <= second <= 1:
         raise UsageError(
-            f"{past.run} has no {name}. There are: {there or 'no recorded rates'}. Give --rate and "
-            "--gain."
+            f"a rate of {100 * first:.0f} % and a gain of {100 * (second - first):.0f} points "
+            f"make {100 * second:.0f} %: give another --rate or --gain."
         )
-    return found
-
-
-def _share(past: Results, name: str) -> float | None:
-    """Return a past share as it may be expected again: few trials are no certainty."""
-    for measurement in past.measurements:
-        if measurement.id == name and measurement.k is not None and measurement.n:
-            return (measurement.k + 0.5) / (measurement.n + 1)
-    return None
+    return Expected(
+        rates={task.task: (first, second) for task in protocol.tasks},
+        correlation=wanted.correlation,
+        agreement=wanted.agreement,
+        source=f"expected rates: {100 * first:.0f} % and {100 * second:.0f} %; correlation of both "
+        f"outcomes of a start {wanted.correlation:g}",
+    )
 
 
 def _goals(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[Goal]:
     """Size the study for everything that was asked for."""
-    count = len(protocol.tasks)
-    alpha = wanted.alpha / count if wanted.per_task else wanted.alpha
     difference = protocol.primary is not None and protocol.primary.kind == "difference"
     found: list[Goal] = []
     try:
         if difference and any(a != b for a, b in expected.rates.values()):
-            found.append(_gain_goal(wanted, expected, alpha))
+            found.append(_gain_goal(wanted, expected))
         if difference and wanted.width is not None:
             found.append(_width_goal(wanted, expected))
-        if wanted.rate_width is not None:
-            ends = {rate for pair in expected.rates.values() for rate in pair}
-            needed = max(
-                trials_for_width(rate, wanted.rate_width, method=protocol.interval) for rate in ends
-            )
-            what = f"interval of each rate {100 * wanted.rate_width:g} points wide"
-            found.append(Goal(what=what, counted="trials", needed=needed, starts=needed))
         if wanted.agrees_above is not None:
             found.append(_agreement_goal(protocol, wanted, expected))
     except UndefinedStatisticError as error:
@@ -283,32 +230,18 @@ def _goals(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[Goal]
     return found
 
 
-def _gain_goal(wanted: Wanted, expected: Expected, alpha: float) -> Goal:
-    tasks = list(expected.rates)
-    what = f"gain shown with {100 * wanted.power:g} % power (McNemar's mid-p, {alpha:.3g})"
-    if wanted.per_task:
-        each = [
-            pairs_for_power(*expected.chances(t), power=wanted.power, alpha=alpha) for t in tasks
-        ]
-        return Goal(
-            what=f"{what} in every task", counted="pairs", needed=sum(each), starts=max(each)
-        )
-    needed = pairs_for_power(*expected.chances(), power=wanted.power, alpha=alpha)
-    starts = math.ceil(needed / len(tasks))
+def _gain_goal(wanted: Wanted, expected: Expected) -> Goal:
+    what = f"gain shown with {100 * wanted.power:g} % power (McNemar's mid-p, {wanted.alpha:.3g})"
+    needed = pairs_for_power(*expected.chances(), power=wanted.power, alpha=wanted.alpha)
+    starts = math.ceil(needed / len(expected.rates))
     return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
 
 
 def _width_goal(wanted: Wanted, expected: Expected) -> Goal:
-    tasks = list(expected.rates)
     width = wanted.width or 0.0
     what = f"interval of the gain {100 * width:g} points wide (Tango)"
-    if wanted.per_task:
-        each = [pairs_for_width(*expected.chances(task), width) for task in tasks]
-        return Goal(
-            what=f"{what} in every task", counted="pairs", needed=sum(each), starts=max(each)
-        )
     needed = pairs_for_width(*expected.chances(), width)
-    starts = math.ceil(needed / len(tasks))
+    starts = math.ceil(needed / len(expected.rates))
     return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
 
 
@@ -317,7 +250,7 @@ def _agreement_goal(protocol: Protocol, wanted: Wanted, expected: Expected) -> G
     if expected.agreement is None:
         raise UsageError(
             "--agrees-above needs --agreement, the expected share of trials in which twin and "
-            "outcome agree, or --past with a run that was evaluated."
+            "outcome agree."
         )
     needed = trials_above(
         expected.agreement,
@@ -366,9 +299,6 @@ def _shows(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[str]:
 
 def lock(run_path: Path, made: Design) -> Protocol:
     """Write protocol and order into a run; a protocol that is there is never overwritten.
-
-    Args:
-        run_path: The run folder; made where it is not there.
 
     Returns:
         The protocol as written, with its hash.

@@ -100,7 +100,6 @@ def score_image(
     Args:
         recorded_u8: 8 bits, or float in 0..1.
         replayed_u8: The same; its axes have their own names, so that a wrong size is explained.
-        mask: What to look at; the whole frame without one.
         mode: What the mask does; metrics of whole images are undefined over single pixels.
         alignment: Brightening before the comparison; whole images decide it, whatever the mask.
     """

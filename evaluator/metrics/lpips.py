@@ -77,9 +77,5 @@ class PerceptualNet(Protocol):
 
 
 def net_of(metric: ImageMetric, nets: Sequence[PerceptualNet]) -> PerceptualNet | None:
-    """Return the network that an LPIPS is computed with, where it was given.
-
-    Args:
-        metric: Any image metric; for one that is no LPIPS the answer is None.
-    """
+    """Return the network that an LPIPS is computed with, where it was given."""
     return next((net for net in nets if metric.id.startswith(f"lpips_{net.name}_")), None)

@@ -19,7 +19,7 @@ CLOSE_PP = 10.0
 """A bias smaller than this does not change what one does with a rate [percentage points]."""
 SIMPSON = "Simpson's paradox"
 """What the report begins with, where a note says it."""
-FIGURES = ("tasks", "scatter", "success")
+FIGURES = ("scatter", "success")
 """The picture beside the sentences: the first that was drawn."""
 Row = Mapping[str, Cell]
 

@@ -41,11 +41,6 @@ SOURCES = {
     "rates": "a table of rates",
     "images": "folders of images",
 }
-DRAWN = {
-    "gate_costs": "costs",
-    "funnel": "funnel",
-}
-"""Tables that say what a figure of the page shows; they are folded beside it."""
 SHOWN_ROWS = 200
 """Rows of a table on the page; the whole table lies beside it as CSV."""
 SHOWN_NUMBERS = 16
@@ -137,11 +132,7 @@ def page(
 
 
 def name_shared(report: Path) -> None:
-    """Let a written report name the files in the folder ``shared`` beside it, or none.
-
-    Args:
-        report: The page; one that another version wrote is left as it is.
-    """
+    """Let a written report name the files in the folder ``shared`` beside it, or none."""
     try:
         text = report.read_text()
         names = sorted(path.name for path in (report.parent / SHARED).glob("*.html"))
@@ -169,13 +160,12 @@ def _part(
     numbers = numbers_of(section, results.measurements)
     if not tables and not drawn and not any(m.value is not None for _, m in numbers):
         return None
-    seen = {drawing.id for drawing, svg in drawn if svg is not None}
     return Part(
         section=section,
         numbers=numbers,
         figures=drawn,
         worst=pictures_of(pairs) if section.id == "views" else (),
-        tables=[(table, DRAWN.get(table.id) in seen or is_long(table)) for table in tables],
+        tables=[(table, is_long(table)) for table in tables],
     )
 
 

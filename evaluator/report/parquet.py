@@ -4,7 +4,6 @@ Importing this module loads pyarrow; the evaluator does so only when it writes.
 """
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,73 +14,32 @@ from pyarrow.json import ParseOptions, ReadOptions, read_json
 
 from bridge.exchange.trials_csv import TrialRecord, tags_text
 from bridge.whole_file import part_of
+from evaluator.columns import INTERVAL, OF_MEASUREMENTS, OF_TRIALS
 from evaluator.result import Cell, Measurement, Table
 
-TEXT, WHOLE, NUMBER, ANSWER = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 """Column types in which unknown is null, never "", 0, NaN or False."""
-TRIAL_TYPES = {
-    "trial_id": TEXT,
-    "task": TEXT,
-    "condition": TEXT,
-    "policy": TEXT,
-    "start_id": TEXT,
-    "unit": TEXT,
-    "k": WHOLE,
-    "n": WHOLE,
-    "recorded": ANSWER,
-    "sim_planned": ANSWER,
-    "sim_executed": ANSWER,
-    "verdict": ANSWER,
-    "p_success": NUMBER,
-    "cell": TEXT,
-    "stand_in": ANSWER,
-    "progress": NUMBER,
-    "sim_progress": NUMBER,
-    "tags": TEXT,
-}
-MEASUREMENT_TYPES = {
-    "id": TEXT,
-    "value": NUMBER,
-    "unit": TEXT,
-    "definition": TEXT,
-    "low": NUMBER,
-    "high": NUMBER,
-    "level": NUMBER,
-    "method": TEXT,
-    "k": WHOLE,
-    "n": WHOLE,
-    "counted": TEXT,
-    "reason_if_undefined": TEXT,
-    "reason_without_interval": TEXT,
-    "episodes": TEXT,
-}
-"""``low``, ``high``, ``level`` and ``method`` are the interval; episodes are joined by blanks."""
 
 
 def write_trials(path: Path, trials: Sequence[TrialRecord]) -> Path:
     """Write one row per trial, the columns of ``trials.csv``; outcomes are true, false or null."""
-    names = [field.name for field in fields(TrialRecord)]
-    columns = {name: [getattr(trial, name) for trial in trials] for name in names}
+    columns = {name: [getattr(trial, name) for trial in trials] for name in OF_TRIALS}
     columns["tags"] = [tags_text(tags) or None for tags in columns["tags"]]
-    return _write(path, columns, TRIAL_TYPES)
+    return _write(path, columns, OF_TRIALS)
 
 
 def write_measurements(path: Path, measurements: Sequence[Measurement]) -> Path:
-    """Write one row per measured number, its interval in columns.
-
-    Args:
-        measurements: One for each row; an undefined one has an empty value and its reason.
-    """
+    """Write one row per measured number, its interval in columns."""
     columns: dict[str, list[Any]] = {
-        name: [getattr(item, name, None) for item in measurements] for name in MEASUREMENT_TYPES
+        name: [getattr(item, name, None) for item in measurements] for name in OF_MEASUREMENTS
     }
-    for name in ("low", "high", "level", "method"):
+    for name in INTERVAL:
         columns[name] = [getattr(item.interval, name, None) for item in measurements]
     joined: dict[tuple[str, ...], str] = {}
     for item in measurements:
         joined.setdefault(item.episodes, " ".join(item.episodes))
     columns["episodes"] = [joined[item.episodes] for item in measurements]
-    return _write(path, columns, MEASUREMENT_TYPES)
+    return _write(path, columns, OF_MEASUREMENTS)
 
 
 def write_table(path: Path, table: Table) -> Path:
@@ -91,15 +49,14 @@ def write_table(path: Path, table: Table) -> Path:
     return _write(path, columns, types)
 
 
-def _type_of(values: Sequence[Cell]) -> pa.DataType:
+def _type_of(values: Sequence[Cell]) -> type:
     kinds = {type(value) for value in values if value is not None}
-    by_kind = ((bool, ANSWER), (int, WHOLE), (float, NUMBER))
-    found = next((arrow for kind, arrow in by_kind if kinds == {kind}), TEXT)
-    return NUMBER if kinds == {int, float} else found
+    found = next((kind for kind in (bool, int, float) if kinds == {kind}), str)
+    return float if kinds == {int, float} else found
 
 
-def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, pa.DataType]) -> Path:
-    schema = pa.schema(list(types.items()))
+def _write(path: Path, columns: dict[str, list[Any]], types: dict[str, type]) -> Path:
+    schema = pa.schema([(name, ARROW[kind]) for name, kind in types.items()])
     rows = zip(*(columns[name] for name in types), strict=True)
     text = b"\n".join(msgspec.json.encode(dict(zip(types, row, strict=True))) for row in rows)
     if text:  # pyarrow reads JSON without loading pandas, which pa.array does: 0.4 s

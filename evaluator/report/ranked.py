@@ -36,11 +36,7 @@ TABLES: dict[str, str] = {
 FIGURES: dict[str, str] = {
     "success": "which candidate to use",
     "scatter": "whether the twin's rates may stand in for recorded ones",
-    "tasks": "in which task the twin orders candidates rightly",
     "gains": "whether replanning is worth its time",
-    "costs": "whether to obey the gate, at your price of a refused plan",
-    "reliability": "whether a stated probability may be taken as it is",
-    "funnel": "on which stage to work",
     "motions": "whether to work on the controller or on the calibration",
     "states": "whether the localisation is good enough for the task",
     "views": "whether the scene is good enough to look at",

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -130,31 +130,11 @@ def _write(
 
 def _trial(row: TrialRow, distance_m: float | None, region: str) -> IndexedTrial:
     kind = failure_kind(row)
+    shared = {each.name for each in fields(IndexedTrial)} & vars(row).keys()
     return IndexedTrial(
-        episode=row.episode,
+        **{name: getattr(row, name) for name in shared},
         file="" if row.path is None else row.path.name,
-        task=row.task,
-        condition=row.condition,
-        policy=row.policy,
-        start_id=row.start_id,
-        recorded=row.recorded,
-        unit=row.unit,
-        k=row.k,
-        n=row.n,
-        plan_id=row.plan_id,
-        num_plans=row.num_plans,
-        num_plans_sent=row.num_plans_sent,
-        sim_planned=row.sim_planned,
-        sim_executed=row.sim_executed,
-        verdict=row.verdict,
-        p_success=row.p_success,
-        first_failing=row.first_failing,
-        failing_detail=row.failing_detail,
-        failing_cause=row.failing_cause,
         failed_stage=first_failed_stage(row) if row.recorded is False else "",
-        planned_replay=row.planned_replay,
-        executed_replay=row.executed_replay,
-        began_ns=row.began_ns,
         distance_m=distance_m,
         fail_cause="" if kind is None else kind.cause,
         fail_stage="" if kind is None else kind.stage,

@@ -83,12 +83,8 @@ SECTIONS: tuple[Section, ...] = (
             ("agreement.mmrv_sim_gap", "MMRV, gap of sim rates (swapped)"),
             ("decision.*", ""),
         ),
-        tables=(
-            "agreement_intervals",
-            "axes",
-            "progress",
-        ),
-        figures=("scatter", "tasks"),
+        tables=("agreement_intervals", "axes"),
+        figures=("scatter",),
     ),
     Section(
         id="replanning",
@@ -143,22 +139,19 @@ SECTIONS: tuple[Section, ...] = (
             ("reliability.ece", "Expected calibration error"),
         ),
         tables=("confusion", "gate_*"),
-        figures=("costs", "reliability"),
     ),
     Section(
         id="against",
         title="Another twin, other raters",
-        lead="Which of two twins is right more often on the same trials, and what other labels "
-        "would change.",
-        tables=("against", "flips", "against_settings", "raters", "label_error", "review_causes"),
+        lead="Which of two twins is right more often on the same trials, and how far raters agree.",
+        tables=("against", "flips", "against_settings", "raters"),
     ),
     Section(
         id="stages",
         title="Where trials are lost",
         lead="Which stage ends a trial, and what failed first on each side.",
         numbers=(),
-        tables=("funnel", "failures", "divergences"),
-        figures=("funnel",),
+        tables=("funnel", "failures"),
     ),
     Section(
         id="motion",

@@ -66,11 +66,7 @@ def used_columns(table: View) -> list[int]:
 
 
 def is_number(table: View, index: int) -> bool:
-    """Say whether a column holds numbers, or mostly numbers with their intervals.
-
-    Args:
-        index: Place of the column, from 0.
-    """
+    """Say whether a column holds numbers, or mostly numbers with their intervals."""
     cells = [row[index] for row in table.rows if row[index] is not None]
     if any(isinstance(cell, Figures) for cell in cells):
         return 2 * sum(isinstance(cell, Figures) for cell in cells) > len(cells)
@@ -289,32 +285,10 @@ def _axes(rows: Rows) -> Rows:
     ]
 
 
-def _progress(rows: Rows) -> Rows:
-    gap = next(name for name in rows[0] if name.startswith("sim - "))
-
-    def difference(row: Record) -> Shown:
-        if not _known(row[gap]):
-            return None
-        ends = f"{row['low']:+.2f}, {row['high']:+.2f}" if _known(row["low"]) else ""
-        return Figures(f"{row[gap]:+.3f}", ends)
-
-    def cell(row: Record, name: str) -> Shown:
-        if name == gap:
-            return difference(row)
-        if name.endswith((" mean", " of pairs")):
-            return round(row[name], 3) if _known(row[name]) else None
-        shown: Shown = row[name]
-        return shown
-
-    kept = [name for name in rows[0] if name not in ("low", "high")]
-    return [{name: cell(row, name) for name in kept} for row in rows]
-
-
 _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "conclusions": _conclusions,
     "success": _success,
     "axes": _axes,
-    "progress": _progress,
     "gains": _gains,
     "layout": _layout,
     "gate_baselines": _baselines,

@@ -38,8 +38,8 @@ GROUPS = "success"
 
 HEADLINE_TABLES = ("conclusions", "success", "layout", "study_gains", "gains", "confusion")
 """Those that ``--latex`` writes for a paper."""
-OLD_FIGURES = ("confusion", "order", "bands")
-"""Drawn by the edition before."""
+OLD_FIGURES = ("confusion", "order", "bands", "tasks", "costs", "reliability", "funnel")
+"""Drawn by editions before."""
 
 PARQUET_PACKAGES = ("pyarrow",)
 FIGURE_PACKAGES = ("matplotlib",)

@@ -60,12 +60,7 @@ class RunContents:
 def read_contents(
     run: RunFolder, cache: SummaryCache, output: Output, pool: ProcessPool | Serial = SERIAL
 ) -> RunContents:
-    """Read what is new or has changed in a run; a broken file is left out and named.
-
-    Args:
-        cache: What was read before; a file that has not changed is taken from there.
-        pool: Reads several files at once; one after the other without.
-    """
+    """Read what is new or has changed in a run; a broken file is left out and named."""
     inventory = take_inventory(run, cache, output)
     labels = _labels(run)
     recorded, left_out = _read(

@@ -530,11 +530,7 @@ class DerivedIndex:
         return None if decided is None or " and " in (decided.engine or "") else decided.accepted
 
     def localised(self, *, source: str, source_sha256: str) -> DerivedFile | None:
-        """Find the newest localisation of a recorded episode.
-
-        Args:
-            source_sha256: Its hash as it is now; a localisation of another version does not count.
-        """
+        """Find the newest localisation of a recorded episode."""
         current = _current(self._localised.get(source, []), source_sha256)
         return _newest(current) if current else None
 

@@ -90,11 +90,7 @@ class _Seen:
 
 
 def take_inventory(run: RunFolder, cache: SummaryCache, output: Output) -> Inventory:
-    """Look at every file of a run, and hash those that are new or have changed.
-
-    Args:
-        cache: Hashes found before; a file whose stamp on disk is the same is not hashed again.
-    """
+    """Look at every file of a run, and hash those that are new or have changed."""
     seen = list(_look(run))
     hashes, left_out = _hash(seen, cache, output)
     files: dict[bool, list[RunFile]] = {False: [], True: []}

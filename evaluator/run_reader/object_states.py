@@ -93,11 +93,7 @@ def predicted_states(plan: Plan) -> dict[Key, ObjectState]:
 
 
 def recorded_states(sent: Sent, localised: Episode | None) -> dict[str, ObjectState]:
-    """The poses localised after the execution, from the twin's localisation or the cell's own.
-
-    Args:
-        localised: The twin's localisation of the episode; None takes the cell's own.
-    """
+    """The poses localised after the execution, from the twin's localisation or the cell's own."""
     records = sent.localisations if localised is None else streams.localisations(localised)
     states = {}
     for record in records:

@@ -320,8 +320,6 @@ class Decision:
     """Every one of the twin's best is."""
     regret: Fraction
     """Best recorded rate minus that of the twin's choice, the worst of a tie."""
-    regret_if_lucky: Fraction
-    """The same for the best of a tie."""
 
 
 def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Decision:
@@ -353,5 +351,4 @@ def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Deci
         possibly_right=bool(sim_best & recorded_best),
         confident=sim_best <= recorded_best,
         regret=max(losses),
-        regret_if_lucky=min(losses),
     )

@@ -204,7 +204,6 @@ def weighted_ends(
 
     Args:
         values: The statistic in each resample; anything where it is undefined.
-        weights: Probability of each resample; together 1.
 
     Raises:
         UndefinedStatisticError: When more than 5 % are undefined.

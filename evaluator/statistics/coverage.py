@@ -71,7 +71,6 @@ def vouch(
     Args:
         n: What the method's coverage depends on: trials, pairs, groups, policies; of a difference
             the trials of both groups.
-        key: Name in ``HOLDS_FROM``, where one method serves several statistics; its own without.
         instead: What to use where it is refused; what the method's own entry says without.
     """
     method = interval.method.split(",")[0]
@@ -107,11 +106,7 @@ def _counted_out(method: str, sizes: tuple[int, ...]) -> Coverage | None:
 
 @lru_cache(maxsize=512)
 def rate_coverage(method: str, n: int) -> Coverage:
-    """Count out how often the interval of a rate holds it, over rates 0.05, 0.06 .. 0.95.
-
-    Args:
-        n: Trials, at least 1.
-    """
+    """Count out how often the interval of a rate holds it, over rates 0.05, 0.06 .. 0.95."""
     _, low, high = _ends(RATE_INTERVALS[method], n)
     held = (low <= RATES[:, None] + ROOM) & (high >= RATES[:, None] - ROOM)
     covered = (_chances(n, RATES) * held).sum(axis=1)
@@ -123,11 +118,7 @@ def rate_coverage(method: str, n: int) -> Coverage:
 
 @lru_cache(maxsize=512)
 def newcombe_coverage(n_first: int, n_second: int) -> Coverage:
-    """Count out how often the interval of second - first holds it, over rates 0.05, 0.10 .. 0.95.
-
-    Args:
-        n_first: Trials of one group, at least 1.
-    """
+    """Count out how often the interval of a difference holds it, over rates 0.05, 0.10 .. 0.95."""
     sizes = min(n_first, MOST), min(n_second, MOST)
     (p_first, low_first, high_first), (p_second, low_second, high_second) = (
         _ends(wilson, size) for size in sizes

@@ -292,9 +292,6 @@ def mean_of_intervals(values: Sequence[float], intervals: Sequence[Interval]) ->
 
     Distances to the ends are added as variances are: the mean of one is its own interval, of
     differences with Wilson's ends Newcombe's method carried on (Zou and Donner 2008, equation 2).
-
-    Args:
-        intervals: Of each; together they give the method its name, which must be one.
     """
     if not values:
         raise UndefinedStatisticError(statistic="interval of a mean", reason="there are none")

@@ -54,9 +54,6 @@ def expected_calibration_error(
     equation 3). Biased upwards for few trials: with n = 10 a perfect forecaster has about 0.2.
 
     Range: 0 to 1, 0 is perfect.
-
-    Args:
-        num_bins: Bins of equal width over 0..1.
     """
     bins = reliability_bins(predicted, happened, num_bins=num_bins)
     return sum(abs(b.mean_probability * b.n - b.succeeded) for b in bins) / len(happened)
@@ -65,11 +62,7 @@ def expected_calibration_error(
 def reliability_bins(
     predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
 ) -> list[ReliabilityBin]:
-    """Return the bins that hold trials, in order.
-
-    Args:
-        num_bins: Bins of equal width over 0..1; the last one holds 1 too.
-    """
+    """Return the bins that hold trials, in order."""
     p = _checked("reliability", predicted, happened)
     answers = np.array(happened, dtype=bool)
     places = np.minimum((p * num_bins).astype(int), num_bins - 1)

@@ -147,10 +147,6 @@ class AgreementModel:
     ) -> None:
         """Find the posterior.
 
-        Args:
-            num_nodes: Parameter sets that carry the posterior; by the number of groups without.
-            seed: Scrambles the nodes; another seed shows how exact the quadrature is.
-
         Raises:
             UndefinedStatisticError: Below three groups, or when a side of one has no trial.
         """
@@ -398,9 +394,6 @@ def pooled_others(models: Sequence[AgreementModel]) -> tuple[Estimate, Estimate]
 
     For counts of which there are several, as likely one as another: a mixture of posteriors that
     each hold what they promise holds it too, and is as wide as they lie apart.
-
-    Args:
-        models: Of the same groups, at least one.
     """
     weights = np.concatenate([model.weights for model in models]) / len(models)
     r, bias = (np.concatenate([model.others[side] for model in models]) for side in (0, 1))
@@ -447,11 +440,7 @@ def _population(
 def chosen_is_best(
     draws: Draws, picked: Sequence[int], over: Callable[[np.ndarray], np.ndarray]
 ) -> float:
-    """Return the probability that the twin's choice has the highest recorded rate.
-
-    Args:
-        picked: Places of the candidates that the twin calls best; of several the mean counts.
-    """
+    """Return the probability that the twin's choice has the highest recorded rate."""
     rates = over(draws.recorded)
     top = (rates == rates.max(axis=1, keepdims=True)).astype(np.float64)
     best = (top / top.sum(axis=1, keepdims=True)).mean(axis=0)

@@ -84,15 +84,6 @@ def rate_width(rate: float, num_trials: int, *, method: str = "wilson") -> float
     return float(mass @ np.array([each.high - each.low for each in ends]))
 
 
-def trials_for_width(rate: float, width: float, *, method: str = "wilson") -> int:
-    """Return the trials with which a rate's interval is expected to be no wider than ``width``.
-
-    Raises:
-        UndefinedStatisticError: When 4,000 trials are not enough.
-    """
-    return _halved(lambda n: rate_width(rate, n, method=method) <= width, "trials")
-
-
 def power_above(
     rate: float, limit: float, num_trials: int, *, alpha: float = ALPHA, method: str = "wilson"
 ) -> float:

@@ -83,19 +83,6 @@ class ConfidenceSequence:
     high: float = 1.0
     """Ends only move inwards: what was refuted once stays refuted."""
 
-    def add(self, success: bool) -> Interval:
-        """Take in one trial.
-
-        Raises:
-            UndefinedStatisticError: When no constant rate is left: the rate has changed.
-        """
-        self.k, self.n = self.k + bool(success), self.n + 1
-        now = betting_interval(self.k, self.n, level=self.level)
-        self.low, self.high = max(self.low, now.low), min(self.high, now.high)
-        if self.low > self.high:
-            raise _changed(self.n)
-        return self.interval
-
     @property
     def interval(self) -> Interval:
         """What is left."""
@@ -103,7 +90,7 @@ class ConfidenceSequence:
 
 
 def sequence_of(outcomes: Sequence[bool], *, level: float = LEVEL) -> ConfidenceSequence:
-    """Return the sequence after all these trials; ``add`` one by one, but for all at once.
+    """Return the sequence after all these trials, looked at after each.
 
     Raises:
         UndefinedStatisticError: When after some trial no constant rate was left.

@@ -30,13 +30,7 @@ MOST_DIMENSIONS = len(_GENERATORS) + 1
 def sobol(
     count: int, dimensions: int, rng: np.random.Generator | None = None
 ) -> Float64[np.ndarray, "count dimensions"]:
-    """Return points of the unit cube, below 1.
-
-    Args:
-        count: Points; a power of two fills the cube most evenly.
-        dimensions: From 1 to ``MOST_DIMENSIONS``.
-        rng: Scrambles them; without, the first point is 0.
-    """
+    """Return points of the unit cube, below 1."""
     if not 1 <= dimensions <= MOST_DIMENSIONS or not 0 < count <= 2**BITS:
         message = f"Sobol points: {count} in {dimensions} dimensions of {MOST_DIMENSIONS}"
         raise ValueError(message)

@@ -18,6 +18,7 @@ from bridge.episode import schema
 from bridge.episode.cdr.messages import CompressedColor, JointSample, PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.color import encode_jpeg
@@ -213,6 +214,17 @@ class _Log:
         self.put(topic, schema.COMPRESSED_IMAGE, image.to_cdr(), ns)
 
 
+def copy_messages(source: Episode, writer: EpisodeWriter) -> None:
+    for message in source.messages():
+        writer.write(
+            message.topic,
+            message.data,
+            type_name=message.type_name,
+            log_time_ns=message.log_time_ns,
+            publish_time_ns=message.publish_time_ns,
+        )
+
+
 def write_trial(run: RunFolder, trial: Trial, *, images: bool = True) -> Path:
     """Write one recorded trial."""
     path = run.episodes_dir / f"{trial.id}.mcap"
@@ -308,6 +320,56 @@ def write_replay(
             gap = np.array([0.03 + 0.02 * np.cos(1.5 * t_s)])
             log.joints("/standin/replay/clearance", ("min_clearance_m",), gap, ns)
     return run.derived_dir / name
+
+
+def write_drawn(run: RunFolder, trial: Trial, trajectory: str, steps: range) -> None:
+    """Draw a replay: the twin's cube lags a second behind the recorded one."""
+    path = run.derived_dir / f"{trial.id}.replay.{trajectory}.kinematic.drawn.mcap"
+    with EpisodeWriter(path) as writer:
+        writer.describe(
+            EpisodeInfo(id=trial.id, kind="trial", stand_in=True),
+            derived=Derived(
+                kind="replay",
+                source_episode=trial.id,
+                source_sha256=hash_file(run.episodes_dir / f"{trial.id}.mcap"),
+                plan_id=make_plan(trial).id,
+                trajectory=trajectory,
+                mode="kinematic",
+                engine="splat",
+                seed=0,
+            ),
+        )
+        log = _Log(writer)
+        for step in steps:
+            drawn = picture(step / 20 - 1, 0)
+            log.image("/standin/cam/side/rendered/image", drawn, START_NS + _ns(step / 20))
+
+
+def write_divergence(
+    writer: EpisodeWriter, plan_id: str, between: tuple[str, str], first_t_ns: int
+) -> None:
+    """The cube lies 69 mm apart from an instant of the plan on."""
+    first = {
+        "between": list(between),
+        "quantity": "object_position",
+        "body": "cube",
+        "first_t_ns": first_t_ns,
+        "size": 0.069,
+        "limit": 0.02,
+        "unit": "m",
+        "attribution": "contact",
+        "detail": "cube lies 69 mm apart",
+    }
+    record = {
+        "schema_version": 1,
+        "plan_id": plan_id,
+        "lag_s": None,
+        "first": first,
+        "quantities": [first],
+        "not_compared": [],
+    }
+    topic = "/standin/replay/divergence"
+    writer.write_json(topic, record, type_name=schema.DIVERGENCE, log_time_ns=1)
 
 
 def write_views(run: RunFolder, source: str = "scan") -> Path:

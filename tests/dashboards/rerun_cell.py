@@ -65,14 +65,7 @@ def write_cell_run(folder: Path, synthetic: ModuleType) -> RunFolder:
     with EpisodeWriter(path) as writer:
         opened = Episode.open(recorded)
         writer.describe(opened.info, outcome=opened.outcome)
-        for message in opened.messages():
-            writer.write(
-                message.topic,
-                message.data,
-                type_name=message.type_name,
-                log_time_ns=message.log_time_ns,
-                publish_time_ns=message.publish_time_ns,
-            )
+        synthetic.copy_messages(opened, writer)
         for topic, type_name, data, ns in extra(synthetic.START_NS, urdf(mesh)):
             writer.write(topic, data, type_name=type_name, log_time_ns=ns, publish_time_ns=ns)
     synthetic.write_replay(run, trial, "planned", False)

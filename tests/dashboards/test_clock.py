@@ -38,14 +38,6 @@ def test_a_replay_from_zero_is_laid_from_the_start_of_its_execution(
     assert t_s == pytest.approx([1.0, 3.8])
 
 
-def test_a_replay_on_the_cells_clock_is_left_where_it_is(
-    recording: Recording, synthetic: ModuleType
-) -> None:
-    clock = PageClock.of(recording)
-    t_s = clock.replay_seconds(recording, np.array([synthetic.EXECUTION_NS]))
-    assert t_s == pytest.approx([1.0])
-
-
 def test_a_replay_of_a_plan_that_never_ran_has_no_place(
     recording: Recording, shared_run: RunFolder
 ) -> None:

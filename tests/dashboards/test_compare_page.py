@@ -8,14 +8,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, chromium
-from serving import dashboard
 from visible import words
 
 from bridge.episode.run_folder import RunFolder
 from bridge.terminal import Output
-from dashboards import share_file
-from dashboards.config import ShareConfig
 from dashboards.guard import Admission
 from dashboards.library import Library
 from evaluator.compare.several import with_against
@@ -101,45 +97,3 @@ def test_runs_beside_a_run_are_offered_on_the_loopback_address_alone(
     hidden = synthetic.Browser(app).get("/compare", headers={"Host": "127.0.0.1.example"})
     assert hidden.status_code == 200
     assert "tuesday" not in hidden.text
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_in_a_browser_a_clip_plays_a_flip_leads_to_its_trial_and_a_shared_file_opens(
-    runs: tuple[RunFolder, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("av")
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))  # matplotlib takes seconds
-    config = ShareConfig(trials=("trial_0001",), out=tmp_path / "sent" / "one.html")
-    shared, _ = share_file.share(runs[0], config)
-    with dashboard(runs[0]) as (_, url), chromium(tmp_path / "home") as tab:
-
-        def show(address: str, *, width: int, dark: bool) -> None:
-            tab.show(address, width=width, dark=dark)
-            assert tab.ask("document.documentElement.scrollWidth") <= width
-            assert tab.complaints == []
-            assert all(asked.startswith((url, "data:", "file:")) for asked in tab.asked)
-
-        show(f"{url}failures", width=390, dark=True)
-        tab.ask_when("document.querySelector('.pair img').complete")
-        tab.ask("document.querySelector('.pair').focus()")
-        tab.ask_when("(document.querySelector('.pair video') || {}).currentTime > 0.2")
-        assert tab.ask("document.querySelector('.pair img').hidden") is True
-        assert tab.ask("document.querySelector('video').videoWidth") == 288
-        tab.ask("document.querySelector('.pair').blur()")
-        assert tab.ask("document.querySelector('.pair video')") is None
-        show(tab.ask("document.querySelector('.pair').href"), width=1440, dark=False)
-        assert tab.ask("Number(document.getElementById('clock').value)") == pytest.approx(3.8)
-
-        for width, dark in ((390, True), (1440, False)):
-            show(f"{url}compare?with=tuesday", width=width, dark=dark)
-            assert tab.ask("document.querySelectorAll('.forest circle').length") >= 2
-        show(tab.ask("document.querySelector('td a').href"), width=1440, dark=False)
-        assert tab.ask("document.querySelector('h1').innerText").startswith("trial_0002")
-
-        tab.call("Emulation.setScriptExecutionDisabled", value=True)
-        show(shared.as_uri(), width=390, dark=True)
-        assert tab.picture().startswith(b"\x89PNG")
-        tab.call("Emulation.setScriptExecutionDisabled", value=False)
-        tab.ask("void document.querySelector('video').play()")
-        tab.ask_when("document.querySelector('video').currentTime > 0.2")

@@ -97,24 +97,6 @@ def test_a_whole_recording_is_kept_and_what_is_missing_is_named(run: RunFolder) 
     assert more.missing == [trial(*each) for each in (STARTS[2], *third)]
 
 
-def test_another_policy_on_the_same_start_is_another_trial(run: RunFolder) -> None:
-    record_all(run)
-    wider = DemoConfig(quick=True, policies=("geometric",))
-    missing = look(run, wider).missing
-    assert missing == [
-        trial(seed, "without_replanning", policy="geometric") for seed in (1000, 1001)
-    ]
-    for number, each in enumerate(missing, start=5):
-        record(
-            run,
-            f"trial_{number:04d}",
-            start=(each.start_seed, each.condition),
-            outcome=Outcome(result="failure"),
-            policy="geometric",
-        )
-    assert look(run, wider) == demo.Recorded(has_scan=True, num_known=6)
-
-
 def test_the_demo_tries_the_tasks_it_is_given() -> None:
     usual = [each for group in groups_of(DemoConfig()) for each in group.trials(DemoConfig())]
     # Two tasks, each by the cell's own planner without and with replanning, and by another without.
@@ -285,20 +267,3 @@ def test_ctrl_c_says_how_to_go_on(
     assert robot_gst.run(["demo", path, "--quick"]) == 130
     expected = f"robot-gst: interrupted; continue with: robot-gst demo '{path}' --quick\n"
     assert capsys.readouterr().err == expected
-
-
-@pytest.mark.parametrize("found", [None, "/usr/bin/robot-gst"])
-def test_no_advice_names_a_folder_that_the_user_did_not_name(
-    run: RunFolder,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    found: str | None,
-) -> None:
-    monkeypatch.setattr("bridge.terminal.shutil.which", lambda _: found)
-    monkeypatch.chdir(run.path)
-    demo._close(run, QUICK, Output(), 1.0, {})
-    printed = capsys.readouterr().out.replace(str(run.path), "RUN")
-    assert ".." not in printed
-    assert "/" not in printed.replace("RUN/results/report.html", "").replace("RUN", "")
-    assert ("activate" in printed) == (found is None)
-    assert all(len(line) <= 80 for line in printed.splitlines()[2:])

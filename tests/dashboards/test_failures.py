@@ -21,7 +21,6 @@ from dashboards.comparison import judge
 from evaluator.compare.failures import (
     NO_ANSWER,
     TWIN_SUCCEEDS,
-    FailureKind,
     failure_kind,
     start_regions,
 )
@@ -39,34 +38,19 @@ ROW = TrialRow(
     [
         (True, True, (), None),
         (None, None, (), None),
-        (True, False, (), FailureKind(cause="dropped", stage="carry", bodies="cube and table")),
-        (False, False, (), FailureKind(cause="dropped", stage="carry", bodies="cube and table")),
-        (
-            False,
-            False,
-            (("grasp", False),),
-            FailureKind(cause="dropped", stage="grasp", bodies="cube and table"),
-        ),
-        (
-            False,
-            False,
-            (("grasp", True),),
-            FailureKind(cause="dropped", stage="carry", bodies="cube and table"),
-        ),
-        (
-            False,
-            True,
-            (("grasp", True), ("lift", False)),
-            FailureKind(cause=TWIN_SUCCEEDS, stage="lift", bodies=""),
-        ),
-        (False, None, (), FailureKind(cause=NO_ANSWER, stage="", bodies="")),
+        (True, False, (), "dropped, carry, cube and table"),
+        (False, False, (), "dropped, carry, cube and table"),
+        (False, False, (("grasp", False),), "dropped, grasp, cube and table"),
+        (False, False, (("grasp", True),), "dropped, carry, cube and table"),
+        (False, True, (("grasp", True), ("lift", False)), f"{TWIN_SUCCEEDS}, lift, "),
+        (False, None, (), f"{NO_ANSWER}, , "),
     ],
 )
 def test_a_failure_is_named_by_the_twin_and_its_stage_by_a_label_where_there_is_one(
     recorded: bool | None,
     planned: bool | None,
     stages: tuple[tuple[str, bool], ...],
-    expected: FailureKind | None,
+    expected: str | None,
 ) -> None:
     row = replace(
         ROW,
@@ -78,7 +62,8 @@ def test_a_failure_is_named_by_the_twin_and_its_stage_by_a_label_where_there_is_
         failing_stage="carry",
         failing_bodies=("table", "cube"),
     )
-    assert failure_kind(row) == expected
+    kind = failure_kind(row)
+    assert (kind and f"{kind.cause}, {kind.stage}, {kind.bodies}") == expected
 
 
 def _starts(p_m: np.ndarray, task: str = "pour") -> list[TrialRow]:
@@ -149,7 +134,7 @@ def test_groups_count_every_failure_once(num_parts: int) -> None:
             assert sum(g.twin for g in groups) == sum(t.sim_planned is False for t in kept)
             group = groups[0]
             query = selection.query(**{k: v or NOT_KNOWN for k, v in group.parts.items()})
-            shown = index.failures(FailureSelection(**query), limit=1000)
+            shown = index.trials(FailureSelection(**query), limit=1000)
             assert len(shown) == group.count
             assert list(shown) == [t for t in trials if t in shown]
 
@@ -188,18 +173,6 @@ def test_the_page_groups_the_run_and_leads_to_each_trial(browser: Any) -> None:
             assert browser.get(f"/failures/{kind}/{name}").status_code == 404
 
 
-def test_without_failures_the_page_says_what_to_do(
-    synthetic: ModuleType, own_run: RunFolder, tmp_path: Path
-) -> None:
-    empty = synthetic.browser_of(RunFolder.create(tmp_path / "empty")).get("/failures")
-    assert "robot-gst record" in words(empty.text)
-    fine = RunFolder.create(tmp_path / "fine")
-    synthetic.write_trial(fine, synthetic.TRIALS[3], images=False)
-    text = words(synthetic.browser_of(fine).get("/failures").text)
-    assert "None of 1 trials failed" in text
-    assert "robot-gst label" in text
-
-
 @pytest.fixture
 def drawn(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
     """Return a disagreement whose planned replay was drawn; the twin's cube lags a second."""
@@ -207,27 +180,7 @@ def drawn(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
     trial = synthetic.TRIALS[1]
     synthetic.write_trial(run, trial)
     synthetic.write_replay(run, trial, "planned", False)
-    plan = synthetic.make_plan(trial)
-    source = run.episodes_dir / f"{trial.id}.mcap"
-    path = run.derived_dir / f"{trial.id}.replay.planned.kinematic.drawn.mcap"
-    with synthetic.EpisodeWriter(path) as writer:
-        writer.describe(
-            synthetic.EpisodeInfo(id=trial.id, kind="trial", stand_in=True),
-            derived=synthetic.Derived(
-                kind="replay",
-                source_episode=trial.id,
-                source_sha256=synthetic.hash_file(source),
-                plan_id=plan.id,
-                trajectory="planned",
-                mode="kinematic",
-                engine="splat",
-                seed=0,
-            ),
-        )
-        log = synthetic._Log(writer)  # the same writer as the trials'
-        for step in range(20, 110, 5):
-            ns = synthetic.START_NS + round(step / 20 * 1e9)
-            log.image("/standin/cam/side/rendered/image", synthetic.picture(step / 20 - 1, 0), ns)
+    synthetic.write_drawn(run, trial, "planned", range(20, 110, 5))
     return run
 
 
@@ -260,31 +213,3 @@ def test_picture_and_clip_show_recorded_beside_twin_at_the_moment(drawn: RunFold
     assert len(frames) == len(found.frames)
     moved = [_cube_px(frame[:, :width]) for frame in frames]
     assert moved == pytest.approx([_cube_px(f[:, :width]) for f in found.frames], abs=1.5)
-
-
-def test_a_clip_is_made_once_and_again_when_the_twin_is_drawn_anew(
-    drawn: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("av")
-    (row,) = judge(drawn).rows
-    first = clips.clip(drawn, row)
-    monkeypatch.setattr(clips, "as_video", lambda *_: b"made again")
-    assert clips.clip(drawn, row) == first
-    (path,) = drawn.derived_dir.glob("*.drawn.mcap")
-    path.unlink()
-    assert clips.clip(drawn, row) == b"made again"
-    assert len(list((drawn.results_dir / clips.CLIPS).iterdir())) == 1
-
-
-def test_hostile_names_are_text(synthetic: ModuleType, tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    with synthetic.EpisodeWriter(run.episodes_dir / "x.mcap") as writer:
-        writer.describe(
-            synthetic.EpisodeInfo(id="x", kind="trial", task=HOSTILE, policy=HOSTILE),
-            outcome=synthetic.Outcome(
-                result="failure", stages=({"id": HOSTILE, "result": "failure"},)
-            ),
-        )
-    text = synthetic.browser_of(run).get("/failures").text
-    assert "<script>alert" not in text
-    assert "&lt;script&gt;" in text

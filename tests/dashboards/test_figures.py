@@ -49,17 +49,6 @@ def test_tick_labels_tell_neighbours_apart() -> None:
     assert "0.00" in labels
 
 
-def test_an_axis_maps_its_ends_and_its_middle() -> None:
-    drawn = axis(0.0, 10.0, 40, 240)
-    assert [drawn.px(0), drawn.px(5), drawn.px(10)] == [40, 140, 240]
-
-
-def test_a_gap_in_a_signal_splits_its_line() -> None:
-    plot = time_plot("t", "m", [signal(np.array([0, 1, np.nan, 2, 3.0]))], span_s=(0, 1))
-    assert plot is not None
-    assert len(plot.lines[0].pieces) == 2
-
-
 def test_thinning_keeps_a_single_spike() -> None:
     values = np.zeros(50_000)
     values[31_234] = 7.0
@@ -76,29 +65,6 @@ def test_nothing_to_draw_is_none_and_not_an_empty_plot() -> None:
     assert time_plot("t", "m", [signal(np.full(3, np.nan))], span_s=(0, 1)) is None
     assert stage_chart([("planned", [])], [], span_s=(0, 1)) is None
     assert scatter([]) is None
-
-
-def test_a_constant_signal_is_drawn_inside_the_plot() -> None:
-    plot = time_plot("t", "m", [signal(np.full(4, 2.0))], span_s=(0, 1))
-    assert plot is not None
-    heights = {float(point.split(",")[1]) for point in plot.lines[0].pieces[0].split()}
-    assert len(heights) == 1
-    assert 10 < heights.pop() < plot.height - 24
-
-
-def test_noise_is_not_blown_up_to_a_motion() -> None:
-    noise = signal(np.array([1.0, 1.0001, 1.0]))
-    plot = time_plot("t", "rad", [noise], span_s=(0, 1), least_span=0.05)
-    assert plot is not None
-    assert plot.y.high - plot.y.low >= 0.05
-    assert plot.y.low < 1.0 < plot.y.high
-
-
-def test_a_level_is_always_visible() -> None:
-    plot = time_plot("t", "mm", [signal(np.array([50.0, 60.0]))], span_s=(0, 1), level=2.0)
-    assert plot is not None
-    assert plot.level_px is not None
-    assert 10 <= plot.level_px <= plot.height - 24
 
 
 def test_stage_bars_keep_their_order_and_lose_labels_that_do_not_fit() -> None:
@@ -145,9 +111,3 @@ def test_a_group_in_agreement_lies_on_the_identity_line() -> None:
     upright = (point.y - drawn.axis_y.px(0)) / (drawn.axis_y.px(1) - drawn.axis_y.px(0))
     assert across == pytest.approx(0.7, abs=1e-3)
     assert across == pytest.approx(upright, abs=1e-3)
-
-
-def test_groups_that_coincide_are_drawn_apart() -> None:
-    drawn = scatter([group(0.5, 0.5), group(0.5, 0.5)])
-    assert drawn is not None
-    assert drawn.points[0].x != drawn.points[1].x

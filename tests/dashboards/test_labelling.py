@@ -9,15 +9,10 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import quote
 
-import httpx
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
-from serving import dashboard
 from visible import words
 
-from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.reviews import (
     Review,
@@ -25,7 +20,6 @@ from bridge.exchange.reviews import (
     read_reviews,
     readable_reviews,
     save_review,
-    saved_review,
 )
 from dashboards.comparison import judge
 from dashboards.guard import Admission
@@ -214,17 +208,6 @@ def test_agreement_is_held_back_until_everybody_is_done(pages: Any, run: RunFold
     assert "All 4 trials are labelled" in done
 
 
-def test_names_that_look_alike_on_disk_keep_labels_of_their_own(tmp_path: Path) -> None:
-    trials = ["a/1", "a_1", "a 1", "../a", "ä", "x" * 400, "x" * 401]
-    for trial in trials:
-        for rater in ("Ann Lee", "Ann_Lee"):
-            Review(trial_id=trial, rater=rater, result="success").write(tmp_path)
-    assert len(read_reviews(tmp_path / "reviews")) == 2 * len(trials)
-    assert {path.parent.name for path in tmp_path.rglob("*.json")} == {"reviews"}
-    assert saved_review(tmp_path, "a/1", "Ann Lee").review is not None
-    assert saved_review(tmp_path, "a/1", "Nobody").version == ""
-
-
 def test_a_label_from_a_table_is_shown_to_its_rater_and_can_be_replaced(
     pages: Any, run: RunFolder
 ) -> None:
@@ -297,96 +280,3 @@ def test_a_name_that_no_rater_can_have_is_refused(name: str, pages: Any) -> None
     assert answer.status_code == 200
     assert "Start labelling" in answer.text
     assert pages.post(f"/label?rater={quote(name)}", json=label()).status_code == 400
-
-
-NUM_TRIALS = 100
-ANSWERS = ("y", "2", "u")
-RESULTS = {"y": ("success", ""), "2": ("failure", "dropped it"), "u": ("unknown", "")}
-
-
-@pytest.fixture
-def hundred(tmp_path: Path) -> RunFolder:
-    """Return a run of a hundred trials without pictures."""
-    run = RunFolder.create(tmp_path / "run")
-    for number in range(NUM_TRIALS):
-        name = f"trial_{number:04d}"
-        with EpisodeWriter(run.episodes_dir / f"{name}.mcap") as writer:
-            writer.describe(EpisodeInfo(id=name, kind="trial", task="cube_into_box"))
-    return run
-
-
-def key_for(trial: str) -> str:
-    return ANSWERS[int(trial[-4:]) % 3]
-
-
-def label_by_keyboard(tab: Browser, count: int) -> None:
-    for _ in range(count):
-        tab.press(key_for(tab.ask("document.getElementById('label').dataset.trial")), loads=True)
-
-
-def label_by_http(url: str, acknowledged: dict[str, str], enough: threading.Event) -> None:
-    """Save labels until the server is gone; remember those it said were on disk."""
-    with httpx.Client(base_url=url, headers={"Origin": url.rstrip("/")}) as client:
-        for number in range(NUM_TRIALS):
-            body = label(f"trial_{number:04d}", note=str(number))
-            try:
-                answer = client.post("/label?rater=Bob", json=body)
-            except httpx.HTTPError:
-                return
-            assert answer.status_code == 200
-            acknowledged[f"trial_{number:04d}"] = str(number)
-            if number == 5:
-                enough.set()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_a_hundred_trials_by_keyboard_and_a_server_that_is_killed(
-    hundred: RunFolder, tmp_path: Path
-) -> None:
-    """No mouse; the server dies by SIGKILL in the middle; every label that was given is there."""
-    acknowledged: dict[str, str] = {}
-    enough = threading.Event()
-    with chromium(tmp_path) as tab:
-        with dashboard(hundred) as (process, url):
-            port = int(url.rstrip("/").rpartition(":")[2])
-            tab.show(f"{url}label?rater=Ann", width=390, dark=False)
-            label_by_keyboard(tab, 40)
-            bob = threading.Thread(target=label_by_http, args=(url, acknowledged, enough))
-            bob.start()
-            assert enough.wait(60)
-            process.kill()
-            bob.join()
-        kept = {r.trial_id: r for r in read_reviews(hundred.path / "reviews") if r.rater == "Bob"}
-        assert acknowledged
-        assert {name: kept[name].note for name in acknowledged} == acknowledged
-        here = tab.ask("document.getElementById('label').dataset.trial")
-        before = tab.num_loaded
-        tab.press(key_for(here))
-        with dashboard(hundred, port):
-            tab.await_load(before)  # the page asked again until it was heard
-            label_by_keyboard(tab, NUM_TRIALS - 42)
-            # The last one wrongly, with undo.
-            here = tab.ask("document.getElementById('label').dataset.trial")
-            tab.press("2" if key_for(here) != "2" else "u", loads=True)
-            assert "All 100 trials are labelled" in tab.ask("document.body.innerText")
-            tab.show(f"{url}label?rater=Ann&at={here}", width=390, dark=False)
-            tab.press("z", loads=True)
-            assert tab.ask("document.getElementById('label').dataset.result") == ""
-            tab.press("n")  # stays, for the cause
-            tab.ask_when("!busy && form.dataset.result === 'failure'")
-            tab.press("f")
-            tab.ask_when("!busy && form.dataset.flag === 'yes'")
-            tab.press("m")
-            tab.call("Input.insertText", text="yes, under the box")  # no key of a note is an answer
-            tab.press("Escape")
-            tab.ask_when("!busy && note.defaultValue.startsWith('yes')")
-            tab.press(key_for(here), loads=True)
-    said = {r.trial_id: r for r in read_reviews(hundred.path / "reviews") if r.rater == "Ann"}
-    assert len(said) == NUM_TRIALS
-    for name, review in said.items():
-        assert (review.result, review.cause) == RESULTS[key_for(name)]
-    # The kill may have come while each rater's label was written: its part is no label.
-    assert len(list(hundred.path.rglob("*.part"))) <= 2
-    assert {name for name, review in said.items() if review.note or review.flag} == {here}
-    assert said[here].note == "yes, under the box"

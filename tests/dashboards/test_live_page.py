@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, chromium
 from live_recorder import open_recorder
 from loopback import free_endpoint
-from serving import dashboard
 from test_review_index import HOSTILE
 
 from bridge.episode import schema
@@ -249,28 +247,3 @@ def test_the_page_is_there_without_a_recorder_and_hostile_words_are_text(
         assert "&lt;script&gt;" in text
     finally:
         app.state.studies.end()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_the_page_follows_a_recorder_and_the_server_ends_at_once(
-    shared_run: RunFolder, endpoint: str, tmp_path: Path
-) -> None:
-    wire = WireConfig(mode="router", connect=(), listen=(endpoint,))
-    with (
-        dashboard(shared_run, 0, "--connect", endpoint) as (process, url),
-        chromium(tmp_path / "home") as tab,
-    ):
-        tab.show(f"{url}live", width=390, dark=True)
-        summary = "document.querySelector('[data-part=summary]').innerText"
-        tab.ask_when(f"{summary}.includes('no zenoh peer')")
-        assert tab.complaints == []
-        with open_recorder(tmp_path / "run", wire=wire) as recorder:
-            tab.ask_when(f"{summary}.includes('idle')")
-            recorder.start("t1")
-            tab.ask_when(f"{summary}.includes('t1')")
-            assert tab.ask("document.documentElement.scrollWidth") <= 390
-        assert all(address.startswith(url) for address in tab.asked)
-        process.terminate()
-        _, errors = process.communicate(timeout=20)
-        assert (process.returncode, errors) == (0, "")

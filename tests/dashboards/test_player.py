@@ -1,18 +1,15 @@
 """The player of a trial: opens at the divergence, and shows recorded, twin and difference."""
 
-import base64
 import json
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, Browser, chromium
+from headless import CHROMIUM, NO_CHROMIUM, chromium
 from serving import dashboard
 
 from bridge.episode import schema
-from bridge.episode.metadata import Derived, EpisodeInfo
-from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
@@ -23,7 +20,6 @@ from dashboards.episode_page import EpisodePage, build_page
 ID = "trial_0002"
 DROPPED_S = 1 + 2.8
 """Page time at which the twin drops the cube: the plan starts after one second."""
-CAUSE = "the cube left the gripper during carry"
 
 
 @pytest.fixture
@@ -31,31 +27,10 @@ def run(synthetic: ModuleType, tmp_path: Path) -> RunFolder:
     """Return one trial whose planned replay was drawn too, from 1 s to 4 s."""
     run = RunFolder.create(tmp_path / "run")
     trial = synthetic.TRIALS[1]
-    source = synthetic.write_trial(run, trial)
+    synthetic.write_trial(run, trial)
     synthetic.write_replay(run, trial, "planned", False)
-    plan = synthetic.make_plan(trial)
     for trajectory in ("planned", "executed"):
-        path = run.derived_dir / f"{ID}.replay.{trajectory}.dynamic.drawn.mcap"
-        with EpisodeWriter(path) as writer:
-            writer.describe(
-                EpisodeInfo(id=ID, kind="trial", stand_in=True),
-                derived=Derived(
-                    kind="replay",
-                    source_episode=ID,
-                    source_sha256=hash_file(source),
-                    plan_id=plan.id,
-                    trajectory=trajectory,
-                    mode="kinematic",
-                    engine="splat",
-                    seed=0,
-                ),
-            )
-            log = synthetic._Log(writer)  # the same writer as the trials'
-            for step in range(20, 80, 5):
-                t_s = step / 20
-                drawn = synthetic.picture(t_s - 1, 0)  # the cube lags behind: a difference
-                ns = synthetic.START_NS + round(t_s * 1e9)
-                log.image("/standin/cam/side/rendered/image", drawn, ns)
+        synthetic.write_drawn(run, trial, trajectory, range(20, 80, 5))
     return run
 
 
@@ -115,7 +90,7 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
     run: RunFolder, synthetic: ModuleType
 ) -> None:
     planned = next(p for p in run.derived(f"{ID}.replay.planned.*") if "drawn" not in p.name)
-    write_divergence(run, planned, synthetic.make_plan(synthetic.TRIALS[1]).id)
+    write_touches(planned, synthetic)
     chart = page(run).stages
     assert chart is not None
     lanes = {lane.name: lane for lane in chart.lanes}
@@ -127,19 +102,12 @@ def test_lanes_say_what_is_apart_from_when_on_and_why_plans_were_sent_back(
     assert (touch.label, touch.x) == ("cube", pytest.approx(chart.x.px(1 + 1.5), abs=1.0))
 
 
-def write_divergence(run: RunFolder, planned: Path, plan_id: str) -> None:
+def write_touches(planned: Path, synthetic: ModuleType) -> None:
     """Add touches and a divergence to a replay: it is written again, and is then the newest."""
     opened = Episode.open(planned)
     with EpisodeWriter(planned.with_name(f"{ID}.replay.planned.dynamic.judged.mcap")) as writer:
         writer.describe(opened.info, derived=opened.derived)
-        for message in opened.messages():
-            writer.write(
-                message.topic,
-                message.data,
-                type_name=message.type_name,
-                log_time_ns=message.log_time_ns,
-                publish_time_ns=message.publish_time_ns,
-            )
+        synthetic.copy_messages(opened, writer)
         start_ns = opened.start_ns
         for first_s, last_s, bodies in (
             (1.5, 2.0, ["left_finger", "cube"]),
@@ -158,31 +126,8 @@ def write_divergence(run: RunFolder, planned: Path, plan_id: str) -> None:
             writer.write_json(
                 "/standin/replay/contact", record, type_name=schema.CONTACT, log_time_ns=start_ns
             )
-        quantity = {
-            "between": ["planned", "recorded"],
-            "quantity": "object_position",
-            "first_t_ns": 2_000_000_000,
-            "size": 0.069,
-            "limit": 0.02,
-            "unit": "m",
-            "attribution": "contact",
-            "detail": "cube lies 69 mm apart",
-            "body": "cube",
-        }
-        record = {
-            "schema_version": 1,
-            "plan_id": plan_id,
-            "lag_s": 0.1,
-            "first": quantity,
-            "quantities": [quantity],
-            "not_compared": [],
-        }
-        writer.write_json(
-            "/standin/replay/divergence",
-            record,
-            type_name=schema.DIVERGENCE,
-            log_time_ns=start_ns,
-        )
+        plan_id = synthetic.make_plan(synthetic.TRIALS[1]).id
+        synthetic.write_divergence(writer, plan_id, ("planned", "recorded"), 2_000_000_000)
 
 
 def test_each_joint_is_drawn_as_planned_recorded_and_replayed_and_how_far_apart(
@@ -240,101 +185,3 @@ def test_keys_move_all_pictures_and_they_never_differ_in_time(
         box = tab.ask("document.getElementById('clock').getBoundingClientRect().top")
         assert 0 < box < 900
         assert not tab.complaints
-
-
-TO_A_DISAGREEMENT = (".facet a[href*='show=disagree']", ".trials tbody th a")
-"""What is clicked one after the other, from the first page on."""
-IN_VIEW = """
-((element) => {
-  const { top, bottom, width } = element.getBoundingClientRect();
-  return width > 0 && top >= 0 && bottom <= innerHeight;
-})
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-@pytest.mark.parametrize("skipped", [0, 1])
-def test_instant_and_cause_of_a_disagreement_are_at_most_three_clicks_from_the_first_page(
-    skipped: int, run: RunFolder, tmp_path: Path
-) -> None:
-    clicks = TO_A_DISAGREEMENT[skipped:]  # the worst comes first without a filter too
-    assert len(clicks) <= 3
-    with dashboard(run) as (_, url), chromium(tmp_path) as tab:
-        tab.show(url, width=1440, dark=False)
-        for selector in clicks:
-            tab.click(selector, loads=True)
-        assert tab.ask("document.querySelector('h1').innerText").split()[0] == ID
-        tab.ask_when("frames.every((f) => !f.loading && f.shown === f.wanted)")
-        clock = float(tab.ask("document.getElementById('clock').value"))
-        assert clock == pytest.approx(DROPPED_S)
-        assert tab.ask("document.querySelector('.watch p.small').innerText") == CAUSE
-        for seen in ("#divergence", ".watch p.small", ".watch .frame", ".watch .frame-time"):
-            assert tab.ask(f"{IN_VIEW}(document.querySelector('{seen}'))"), seen
-        assert tab.ask("document.querySelector('.watch .frame').naturalWidth") > 0
-        assert not tab.complaints
-
-
-SAMPLED = """
-new Promise((done) => {
-  const times = [];
-  const look = () => {
-    const labels = [...document.querySelectorAll(".trio figure:not(.beside) .frame-time")];
-    times.push(labels.map((label) => label.value).join(" "));
-    if (playing) requestAnimationFrame(look); else done(times);
-  };
-  setTime(1.5);
-  play(true);
-  look();
-  setTimeout(() => setTime(3.1), 150);
-  setTimeout(() => { setTime(1.9); }, 300);
-  setTimeout(() => play(false), 500);
-})
-"""
-"""What is shown before each repaint while it plays, with two jumps."""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_recorded_and_twin_are_of_one_instant_while_playing_and_nothing_more_is_asked_for(
-    run: RunFolder, tmp_path: Path
-) -> None:
-    with dashboard(run) as (_, url), chromium(tmp_path) as tab:
-        tab.show(f"{url}episode/{ID}", width=1280, dark=False)
-        tab.ask_when("document.documentElement.dataset.pictures === 'here'")
-        asked = len(tab.asked)
-        found = tab.call(
-            "Runtime.evaluate", expression=SAMPLED, awaitPromise=True, returnByValue=True
-        )
-        pairs = [text.split() for text in found["result"]["value"]]
-        assert len({recorded for recorded, _ in pairs}) > 2
-        assert all(recorded == twin for recorded, twin in pairs)
-        assert len(tab.asked) == asked
-        modes = []
-        for _ in range(4):
-            tab.press("v")
-            modes.append(tab.ask("document.querySelector('.beside').dataset.mode"))
-        assert modes == ["wipe", "blink", "overlay", "difference"]
-        pictures = {}
-        tab.ask("setTime(2.5)")
-        tab.ask_when("frames.every((f) => f.shown === f.wanted)")
-        for mode, share in (("difference", 50), ("wipe", 0), ("wipe", 100), ("overlay", 50)):
-            tab.ask(
-                f"document.getElementById('mode').value = '{mode}';"
-                f"document.getElementById('share').value = {share};"
-                "document.getElementById('share').dispatchEvent(new Event('input'))"
-            )
-            pictures[mode, share] = part(tab, ".beside .difference")
-        assert len(set(pictures.values())) == 4
-        assert not tab.complaints
-
-
-def part(tab: Browser, selector: str) -> bytes:
-    """Take a PNG of one element."""
-    box = tab.ask(
-        "(({ x, y, width, height }) => ({ x: Math.round(x + scrollX), y: Math.round(y + scrollY),"
-        " width: Math.round(width), height: Math.round(height), scale: 1 }))"
-        f"(document.querySelector('{selector}').getBoundingClientRect())"
-    )
-    found = tab.call("Page.captureScreenshot", captureBeyondViewport=True, clip=box)
-    return base64.b64decode(found["data"])

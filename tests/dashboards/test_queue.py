@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from visible import words
 
-from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
@@ -92,33 +91,8 @@ def test_the_divergence_that_a_replay_tells_comes_before_its_verdict(
     trial = synthetic.TRIALS[1]
     path = synthetic.write_replay(disagreement, trial, "executed", False)
     plan_id = synthetic.make_plan(trial).id
-    first = {
-        "between": ["planned", "executed"],
-        "quantity": "object_position",
-        "body": "cube",
-        "first_t_ns": 1_500_000_000,
-        "size": 0.069,
-        "limit": 0.02,
-        "unit": "m",
-        "attribution": "contact",
-        "detail": "cube lies 69 mm apart",
-    }
-    record = {
-        "schema_version": 1,
-        "plan_id": plan_id,
-        "lag_s": None,
-        "first": first,
-        "quantities": [first],
-        "not_compared": [],
-    }
     with EpisodeWriter(path.with_name("other.mcap")) as writer:
-        writer.write_json(
-            "/standin/replay/divergence",
-            record,
-            type_name=schema.DIVERGENCE,
-            log_time_ns=1,
-            publish_time_ns=1,
-        )
+        synthetic.write_divergence(writer, plan_id, ("planned", "executed"), 1_500_000_000)
     (row,) = judge(disagreement).rows
     moment = moment_of(disagreement, replace(row, executed_replay="other.mcap"))
     assert moment is not None
@@ -140,17 +114,6 @@ def test_a_picture_is_drawn_once_and_again_when_the_recording_changes(
         os.utime(path, ns=(1, 1))
         assert thumbnail(disagreement, row) == b"drawn again"
     assert [each.read_bytes() for each in folder.iterdir()] == [b"drawn again"]
-
-
-def test_a_run_that_can_only_be_read_still_shows_pictures(
-    disagreement: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError
-
-    monkeypatch.setattr(queue_page, "write_whole", refuse)
-    (row,) = judge(disagreement).rows
-    assert thumbnail(disagreement, row).startswith(b"\xff\xd8")
 
 
 def test_the_queue_page_leads_to_each_trial_and_says_why(browser: Any) -> None:

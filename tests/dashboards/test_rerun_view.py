@@ -17,9 +17,8 @@ from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.streams import events, joint_track, plans
+from bridge.episode.streams import events, joint_track
 from bridge.episode.writer import EpisodeWriter
-from bridge.errors import UsageError
 from bridge.media.palette import rgb
 from bridge.robots.default import ARM_JOINTS
 from bridge.robots.robot import read_robot
@@ -104,14 +103,6 @@ def test_joints_are_the_recorded_ones_at_their_source_time(
         np.testing.assert_array_equal(values, track.position[:, index])
 
 
-def test_a_replay_on_its_own_clock_starts_when_the_execution_did(
-    synthetic: ModuleType, content: dict[str, dict[str, list[object]]]
-) -> None:
-    stamps = content["/replayed/planned/dynamic/clearance_m"]["source_time"]
-    assert min(stamps) == synthetic.EXECUTION_NS
-    assert np.diff(sorted(stamps)).min() == 50_000_000
-
-
 def test_a_moving_camera_has_its_pose_at_every_image_and_its_intrinsics(
     content: dict[str, dict[str, list[object]]],
 ) -> None:
@@ -147,15 +138,6 @@ def test_a_replayed_object_is_outlined_as_the_task_has_it(
     red, green, blue = rgb("twin-planned")
     (color,) = next(row for row in cube["Boxes3D:colors"] if row)
     assert color == (red << 24 | green << 16 | blue << 8 | 255)
-
-
-def test_a_plan_is_a_line_from_when_it_was_published_on(
-    cell_run: RunFolder, content: dict[str, dict[str, list[object]]]
-) -> None:
-    ((stamp_ns, plan),) = plans(Episode.open(cell_run.episodes()[0]))
-    way = content[f"/plans/{plan.id}"]
-    assert way["source_time"] == [stamp_ns]
-    np.testing.assert_allclose(way["LineStrips3D:strips"][0][0], plan.positions_m(), atol=1e-6)
 
 
 def test_events_and_verdicts_are_lines_of_text_at_their_instants(
@@ -197,13 +179,6 @@ def test_an_episode_without_robot_cameras_or_run_is_still_exported(
     assert "/recorded/joints/a" in read_back(done.path)
 
 
-def test_a_replay_can_be_looked_at_alone(cell_run: RunFolder, tmp_path: Path) -> None:
-    path = cell_run.derived("*.replay.executed.*")[0]
-    done = export_rrd(path, tmp_path / "replay.rrd", run_of(path))
-    assert done.sides == ("replayed/executed/dynamic",)
-    assert not [note for note in done.notes if "label" in note]
-
-
 def test_a_failed_export_leaves_no_file(
     cell_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,11 +190,6 @@ def test_a_failed_export_leaves_no_file(
     with pytest.raises(DashboardError, match="on purpose"):
         export_rrd(cell_run.episodes()[0], tmp_path / "x.rrd", cell_run)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_another_ending_than_rrd_is_refused(cell_run: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"should end in \.rrd"):
-        export_rrd(cell_run.episodes()[0], tmp_path / "x.mcap")
 
 
 def test_the_drawn_robot_stands_on_base_link_whatever_is_above_it(tmp_path: Path) -> None:

@@ -63,7 +63,3 @@ def test_the_viewer_listens_on_the_loopback_address_only() -> None:
 def test_a_run_without_episodes_and_a_missing_file_are_wrong_use(tmp_path: Path) -> None:
     assert robot_gst.run(["view", str(RunFolder.create(tmp_path / "empty").path)]) == 2
     assert robot_gst.run(["view", str(tmp_path / "nowhere")]) == 2
-
-
-def test_the_newest_trial_of_a_run_is_shown_not_a_scan(cell_run: RunFolder) -> None:
-    assert rerun_viewer.episode_of(cell_run.path).stem == "trial_0001"

@@ -1,25 +1,18 @@
 """The command listens where it should, says so, and ends when asked; a real browser sees it."""
 
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-from headless import CHROMIUM, NO_CHROMIUM, chromium
-from serving import ROOT, dashboard
+from serving import dashboard
 
-import robot_gst
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.terminal import Output
-from dashboards import demo
 from dashboards.config import DashboardConfig
 from dashboards.demo import DemoConfig, run_demo
 from dashboards.errors import AddressTakenError, NotHereError
@@ -102,30 +95,6 @@ def test_every_listed_file_has_a_page_and_nothing_else_has(tmp_path: Path) -> No
     assert [path.name for path in derived_paths(run, "t1", "replay")] == ["t1.replay.x.mcap"]
 
 
-def test_a_terminated_demo_ends_what_it_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left: list[subprocess.Popen[bytes]] = []
-
-    def start(arguments: list[str], **_: object) -> subprocess.Popen[bytes]:
-        left.append(subprocess.Popen(["sleep", "60"]))
-        return left[-1]
-
-    def answers(*_: object) -> bool:
-        os.kill(os.getpid(), signal.SIGTERM)
-        return False
-
-    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    try:
-        monkeypatch.setattr(demo, "start_command", start)
-        monkeypatch.setattr(demo, "answers", answers)
-        assert robot_gst.run(["demo", str(tmp_path / "run"), "--quiet"]) == 130
-        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert [process.poll() for process in left] == [-signal.SIGTERM]
-
-
 def test_host_headers_are_split_from_their_port() -> None:
     assert host_name("LOCALHOST:80") == "localhost"
     assert host_name("[::1]:80") == "::1"
@@ -142,37 +111,3 @@ def test_a_signal_ends_the_command_with_zero(shared_run: RunFolder, kind: int) -
         _, errors = process.communicate(timeout=20)
         assert process.returncode == 0
         assert "Traceback" not in errors
-
-
-@pytest.mark.slow
-def test_a_taken_port_ends_the_command_with_one(shared_run: RunFolder) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = str(other.getsockname()[1])
-        done = subprocess.run(
-            [sys.executable, "-m", "robot_gst", "dashboard", str(shared_run.path), "--port", port],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-    assert done.returncode == 1
-    assert done.stdout == ""
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_a_real_browser_draws_the_pages_without_complaint(
-    shared_run: RunFolder, tmp_path: Path
-) -> None:
-    with dashboard(shared_run) as (_, url), chromium(tmp_path) as tab:
-        for page in ("", "twin", "episode/trial_0001?t=2.5"):
-            tab.show(url + page, width=1280, dark=False)
-            assert len(tab.picture()) > 20_000
-            time.sleep(0.3)  # a script may complain late
-            dom = tab.ask("document.documentElement.outerHTML")
-            assert set(tab.complaints) <= {"LazyLoadImageIssue"}, page  # pictures may come late
-        # The script of the episode ran: legends hold values, the Go button is gone.
-        assert re.search(r"<output data-value=\"0\">[\d.−]+</output>", dom)
-        assert re.search(r'id="go" hidden=""', dom)

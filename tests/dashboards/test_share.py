@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -17,8 +16,7 @@ from visible import words
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.media.color import decode_color
-from bridge.terminal import Output
-from dashboards import cli, share_file
+from dashboards import share_file
 from dashboards.config import ShareConfig
 from dashboards.share_file import LEVELS, MB, build_share, share
 from evaluator.report.page import name_shared
@@ -75,18 +73,6 @@ def test_the_file_holds_clips_plots_and_tables_and_the_report_names_it(run: RunF
     assert "the cube left the gripper during carry" in seen
     assert "Stand-in" in seen
     assert str(run.path.parent) not in text
-
-
-def test_the_command_says_where_the_file_lies_and_how_large_it_is(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(share_file, "_figure", lambda _: (None, None))
-    config = ShareConfig(trials=("trial_0002",), out=run.path / "sent" / "x.html")
-    assert cli.share(run.path, config=config, output=Output(json=True)) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["size_bytes"] == (run.path / "sent" / "x.html").stat().st_size
-    assert told["trials"] == ["trial_0002"]
-    assert 'href="../report.html"' not in (run.path / "sent" / "x.html").read_text()
 
 
 def test_without_names_the_worst_are_taken_and_a_wrong_name_says_the_nearest(

@@ -125,14 +125,7 @@ def write_space_run(folder: Path, synthetic: ModuleType) -> RunFolder:
             ("/standin/cam/eye/color/image", schema.COMPRESSED_IMAGE, color.to_cdr()),
         ):
             writer.write(topic, data, type_name=type_name, log_time_ns=start, publish_time_ns=start)
-        for message in opened.messages():
-            writer.write(
-                message.topic,
-                message.data,
-                type_name=message.type_name,
-                log_time_ns=message.log_time_ns,
-                publish_time_ns=message.publish_time_ns,
-            )
+        synthetic.copy_messages(opened, writer)
     synthetic.write_replay(run, trial, "planned", False)
     write_localised(run, ID, start)
     write_scene(run)
@@ -282,14 +275,6 @@ def test_nodes_of_a_soft_object_are_read_in_its_own_frame(run: RunFolder) -> Non
     np.testing.assert_allclose(nodes.at(float(nodes.stamps_ns[10])), expected, atol=1e-6)
 
 
-def test_a_soft_object_without_nodes_is_drawn_unbent_and_that_is_noted(
-    run: RunFolder, synthetic: ModuleType
-) -> None:
-    soften(run, np.zeros((4, 3)))  # too few to bend anything
-    header = unpack(synthetic.browser_of(run).get(f"/episode/{ID}/scene").content).header
-    assert "cube: as replayed (planned) drawn without being bent" in header["notes"]
-
-
 def test_without_a_scene_the_ways_are_shown_and_why_there_is_no_more(
     own_run: RunFolder, synthetic: ModuleType
 ) -> None:
@@ -374,22 +359,3 @@ def test_the_page_draws_what_the_rasteriser_draws_and_follows_clock_and_hand(
         assert psnr_db(canvas(tab), later) < MOVED_PSNR_DB  # turned, and the player stood still
         assert float(tab.ask("document.getElementById('clock').value")) == 4.0
         assert not [text for text in tab.complaints if "GPU stall" not in text]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM)
-def test_without_webgl_the_picture_stays_and_the_page_says_so(
-    run: RunFolder, tmp_path: Path
-) -> None:
-    without = (
-        "const given = HTMLCanvasElement.prototype.getContext;"
-        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
-        " return kind === 'webgl2' ? null : given.call(this, kind, ...more); };"
-    )
-    with dashboard(run) as (_, url), chromium(tmp_path) as tab:
-        tab.call("Page.addScriptToEvaluateOnNewDocument", source=without)
-        tab.show(f"{url}episode/{ID}?space=1", width=1280, dark=False)
-        tab.ask_when("document.querySelector('.space.refused .space-view img')?.naturalWidth > 0")
-        said = tab.ask("document.querySelector('.space-state').textContent")
-        assert "no WebGL 2" in said
-        assert not tab.complaints

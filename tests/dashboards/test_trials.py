@@ -208,16 +208,3 @@ def test_a_models_address_with_a_secret_gets_into_no_protocol(tmp_path: Path, ur
 def test_half_a_model_is_no_study(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="--policies model --model URL --model-name NAME"):
         replace(MODEL, **change)
-
-
-@pytest.mark.slow
-def test_two_laboratories_record_into_one_run_at_once(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    built_in = [replace(job, policy="perturbed") for job in jobs()]
-    with (
-        trials._laboratory(run, STUDY, built_in, 0) as (one, first),
-        trials._laboratory(run, STUDY, built_in, 1) as (other, second),
-    ):
-        assert one != other
-        for process in (*first, *second):
-            process.check()

@@ -51,14 +51,6 @@ def test_views_without_scores_are_shown_in_recorded_order(copy: RunFolder) -> No
     assert {view.camera_id for view in page.views} == {"side"}
 
 
-def test_a_run_without_views_names_the_next_command(own_run: RunFolder) -> None:
-    for path in own_run.derived("*.views.*"):
-        path.unlink()
-    page = build_twin(own_run, judge(own_run))
-    assert page.views == ()
-    assert page.next_command == f"robot-gst rebuild {own_run.path}"
-
-
 def test_both_sides_of_a_view_are_images_and_a_third_side_is_refused(
     shared_run: RunFolder,
 ) -> None:

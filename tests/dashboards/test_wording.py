@@ -37,11 +37,6 @@ def test_a_value_is_printed_in_its_unit(value: float, unit: str, expected: str) 
     assert plain(wording.number(value, unit)) == expected
 
 
-def test_a_mean_of_shares_is_a_percentage_like_the_rates_beside_it() -> None:
-    varied = measurement(id="rate.sim_varied.cube.without", value=0.5, n=2)
-    assert plain(wording.measured(varied)) == "50 %"
-
-
 def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     said = {"value": 1.0, "low": 0.5101091635454027, "high": 1.0, "k": 4, "n": 4}
     assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"

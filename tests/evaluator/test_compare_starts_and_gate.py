@@ -114,18 +114,6 @@ def test_every_input_file_is_named_with_its_hash(six_trials: Any) -> None:
     assert all(len(item["sha256"]) == 64 for item in provenance["derived"].values())
 
 
-def test_starts_localised_far_apart_are_not_paired(maker: Any) -> None:
-    for name, condition, x_m in (
-        ("a", "without_replanning", 0.4),
-        ("b", "with_replanning", 0.45),
-    ):
-        maker.trial(name, condition=condition, localised_m=x_m)
-        maker.replay(name)
-    comparison = compare_run(maker.run)
-    assert "50 mm apart, limit 30 mm" in reasons(comparison, "a")
-    assert comparison.results().get("paired.mcnemar_p_mid.recorded").n == 0
-
-
 def test_a_start_used_twice_in_one_condition_is_not_paired(maker: Any) -> None:
     for name in ("a", "b"):
         maker.trial(name)

@@ -16,7 +16,7 @@ from bridge.task.protocol import FILE_NAME, Protocol, read_protocol
 from evaluator.compare.run import compare_run
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.design.plan import ORDER_FILE, Design, design, design_text, lock, trials_command
-from evaluator.result import Results, write_results
+from evaluator.result import Results
 
 STUDY = StudyOptions(task=("pour", "stack"), any_task=True, policies=("act",), blind=True)
 WANTED = Wanted(rate=0.4, gain=0.4)
@@ -150,28 +150,11 @@ def test_the_list_of_a_blinded_operator_names_no_arm(tmp_path: Path, made: Desig
 def test_the_size_follows_from_the_largest_of_what_is_asked() -> None:
     one = design(STUDY, WANTED)
     both = design(STUDY, replace(WANTED, width=0.3))
-    most = design(STUDY, replace(WANTED, width=0.3, rate_width=0.2))
+    most = design(STUDY, replace(WANTED, width=0.3, agreement=0.8, agrees_above=0.75))
     sizes = [each.protocol.tasks[0].starts for each in (one, both, most)]
     assert sizes == sorted(set(sizes))
     assert sizes[2] == max(goal.starts for goal in most.goals)
     assert design(STUDY, replace(WANTED, starts=7)).protocol.tasks[0].starts == 7
-    alone = design(STUDY, replace(WANTED, per_task=True))
-    assert alone.protocol.tasks[0].starts > 2 * sizes[0] - 2
-
-
-def test_a_past_run_gives_what_is_expected(tmp_path: Path, made: Design) -> None:
-    lock(tmp_path / "past", made)
-    results = filled(tmp_path / "past")
-    write_results(results, tmp_path / "past" / "results" / "results.json")
-    again = design(STUDY, Wanted(past=tmp_path / "past", width=0.4))
-    before, after = again.expected.rates["pour"]
-    found = results.get("rate.recorded.pour.without_replanning.act")
-    assert found.k is not None
-    assert found.n is not None
-    assert before == pytest.approx((found.k + 0.5) / (found.n + 1))
-    assert after > before
-    with pytest.raises(UsageError, match=r"has no rate\.recorded\.push"):
-        design(replace(STUDY, task=("push",)), Wanted(past=tmp_path / "past", width=0.4))
 
 
 @pytest.mark.parametrize(

@@ -2,27 +2,22 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bridge.episode.catalogue import label_episode
-from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
+from bridge.episode.metadata import Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_run
 from evaluator.result import write_results
 from evaluator.run_reader import inventory
-from evaluator.run_reader.episodes import DerivedFacts, DerivedFile, DerivedIndex
-from evaluator.run_reader.inventory import RunFile
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # a first evaluation is checked elsewhere
 
@@ -180,13 +175,6 @@ def test_a_replaced_replay_is_noticed(six_trials: Any) -> None:
     )
 
 
-def test_a_newer_replay_of_the_same_plan_wins(six_trials: Any) -> None:
-    settle(six_trials.run)
-    again(six_trials.run)
-    newer = six_trials.replay("a1", accepted=False, tag="b")
-    assert again(six_trials.run).rows[0].planned_replay == newer.name
-
-
 def test_removed_episodes_vanish(six_trials: Any) -> None:
     settle(six_trials.run)
     again(six_trials.run)
@@ -241,36 +229,6 @@ def test_a_broken_file_costs_itself_only_and_is_named_each_time(
         assert any(name.startswith("b1.replay.planned") for name in named)
 
 
-def test_progress_counts_only_what_has_to_be_read(
-    six_trials: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown: list[tuple[str, int, int]] = []
-
-    class Noting(Output):
-        def progress(self, label: str, total: int) -> Any:
-            from contextlib import contextmanager
-
-            @contextmanager
-            def steps() -> Iterator[Callable[[int, str], None]]:
-                yield lambda done, note: shown.append((label, done, total))
-
-            return steps()
-
-    settle(six_trials.run)
-    with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
-        compare_run(six_trials.run, cache=cache, output=Noting())
-    assert {(label, total) for label, _, total in shown if label != "hash files (MB)"} == {
-        ("read episodes", 6),
-        ("read episodes", 12),
-        ("compare motions", 6),
-    }
-    assert shown[-1] == ("compare motions", 6, 6)
-    shown.clear()
-    with SummaryCache(six_trials.run.results_dir / FOLDER) as cache:
-        compare_run(six_trials.run, cache=cache, output=Noting())
-    assert shown == []
-
-
 def test_the_command_keeps_and_forgets(
     six_trials: Any, opened: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,51 +243,3 @@ def test_the_command_keeps_and_forgets(
     assert opened != []
     assert (six_trials.run.results_dir / "results.json").read_bytes() == first
     assert "results/cache" not in capsys.readouterr().err
-
-
-derived_files = st.lists(
-    st.builds(
-        Derived,
-        kind=st.sampled_from(("replay", "localised")),
-        source_episode=st.sampled_from("ab"),
-        source_sha256=st.sampled_from(("", "now", "then")),
-        plan_id=st.sampled_from(("p", "q", None)),
-        trajectory=st.sampled_from(("planned", "executed")),
-        mode=st.sampled_from(("dynamic", "kinematic")),
-    ),
-    max_size=12,
-)
-
-
-@given(made=derived_files)
-def test_the_index_finds_what_looking_at_every_file_finds(
-    tmp_path_factory: pytest.TempPathFactory, made: list[Derived]
-) -> None:
-    folder = tmp_path_factory.mktemp("derived")
-    files = []
-    for number, derived in enumerate(made):
-        path = folder / f"{number:02}.mcap"
-        path.touch()
-        os.utime(path, ns=(number % 5, number % 5))
-        facts = DerivedFacts(info=EpisodeInfo(id="x", kind="trial"), derived=derived)
-        files.append(
-            DerivedFile(file=RunFile(folder=path.parent, name=path.name, sha256=""), facts=facts)
-        )
-    index = DerivedIndex(files)
-    for source in "ab":
-        for plan_id in "pq":
-            for trajectory in ("planned", "executed"):
-                current = [
-                    file
-                    for file in files
-                    if file.derived.kind == "replay"
-                    and file.derived.mode == "dynamic"
-                    and (file.derived.source_episode, file.derived.plan_id) == (source, plan_id)
-                    and file.derived.trajectory == trajectory
-                    and file.derived.source_sha256 in ("", "now")
-                ]
-                newest = max(current, key=lambda file: file.age, default=None)
-                found = index.replay(
-                    source=source, source_sha256="now", plan_id=plan_id, trajectory=trajectory
-                )
-                assert found.file is newest

@@ -12,8 +12,8 @@ from bridge.errors import UsageError
 from bridge.task.record import check_record
 from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_csv, compare_run
+from evaluator.compare.sequences import stopping_table
 from evaluator.report.wording import measurement_text
-from evaluator.result import load_results
 from evaluator.statistics.sequential import sequence_of
 
 HEADER = "trial_id,task,condition,policy,start_id,recorded,sim_planned,verdict,p_success\n"
@@ -52,17 +52,6 @@ def test_a_run_without_data_for_a_part_says_no_data(six_trials: Any) -> None:
     for part in parts:
         assert f"{part}" in missing
     assert missing.count("no data") == len(parts)
-
-
-def test_everything_new_fits_the_schema_and_is_read_back(six_trials: Any) -> None:
-    assert evaluate(six_trials.run.path) == 0
-    results = load_results(six_trials.run.path)
-    check_record(results.to_record(), name="results", package="evaluator")
-    ids = [measurement.id for measurement in results.measurements]
-    assert len(ids) == len(set(ids))
-    rate = results.get("rate.recorded.cube_into_box.without_replanning.scripted")
-    assert rate.interval is not None
-    assert rate.interval.worst_coverage is not None
 
 
 def test_paired_starts_have_a_tango_interval_or_the_reason(six_trials: Any) -> None:
@@ -172,15 +161,6 @@ def test_a_choice_among_conditions_is_judged(six_trials: Any) -> None:
     assert "not a sample" in str(right.reason_without_interval)
 
 
-def test_a_sequence_may_be_looked_at_after_every_trial(six_trials: Any) -> None:
-    results = compare_run(six_trials.run).results()
-    rate = results.get("sequence.recorded.cube_into_box.with_replanning.scripted")
-    assert rate.interval is not None
-    assert rate.interval.method == "betting"
-    evidence = results.get("sequence.replanning_evidence.recorded")
-    assert evidence.value == pytest.approx(1.0)  # one pair: the mixture bets half on each side
-
-
 @pytest.mark.parametrize("method", ["clopper-pearson", "jeffreys"])
 def test_another_interval_is_used_throughout(six_trials: Any, method: str) -> None:
     results = compare_run(six_trials.run, method=method).results()
@@ -219,7 +199,7 @@ def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
     lines += [line(100 + i, i % 2 == 0, True, condition="with_replanning") for i in range(6)]
     path = write_table(HEADER + "\n".join(lines) + "\n")
     assert evaluate(path, out=tmp_path / "out", goal=0.6) == 0
-    table = next(t for t in compare_csv(path, goal=0.6).tables if t.id == "stopping")
+    (table,) = stopping_table(compare_csv(path).rows, 0.6)
     settled, still_open = table.rows
     assert settled[3] == 0.6
     assert 0.6 < settled[5] < settled[6]

@@ -1,15 +1,9 @@
 """Other processes read and compare too, and nothing in the results tells."""
 
-import os
-import signal
-import sys
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -37,16 +31,7 @@ def begun(pool: ProcessPool, number: int) -> ProcessPool:
 
 
 @pytest.fixture(scope="module")
-def jobs() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(Path(__file__).parent))
-    import worker_jobs
-
-    yield worker_jobs
-    sys.path.remove(str(Path(__file__).parent))
-
-
-@pytest.fixture(scope="module")
-def pool(jobs: ModuleType) -> Iterator[ProcessPool]:
+def pool() -> Iterator[ProcessPool]:
     with evaluation_pool(2) as pool:
         yield pool
 
@@ -68,24 +53,6 @@ def nobody(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
     monkeypatch.setattr(process_pool, "Worker", refuse)
     return started
-
-
-@pytest.mark.slow
-def test_two_processes_share_a_list_and_keep_its_order(two: ProcessPool, jobs: ModuleType) -> None:
-    found = list(two.map(jobs.where, range(100), each_s=0.002))
-    assert [number for number, _ in found] == list(range(100))
-    assert {pid for _, pid in found} == {os.getpid(), two.workers[0].process.pid}
-    again = list(two.map(jobs.surroundings, range(100), each_s=0.002))
-    (beside,) = {about for about in again if about[0] != os.getpid()}
-    assert beside == (two.workers[0].process.pid, False, "1")
-
-
-@pytest.mark.slow
-def test_what_would_be_printed_is_told_here(two: ProcessPool, jobs: ModuleType) -> None:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        assert list(two.map(jobs.warn, range(30), each_s=0.002)) == list(range(30))
-    assert sorted(int(str(each.message).split()[1]) for each in said) == list(range(30))
 
 
 def spoil(folder: Path, derived: Path) -> None:
@@ -129,30 +96,6 @@ def test_results_are_the_same_bytes_with_and_without_processes(
     assert results("killed") == alone
     assert len(taken) <= process_pool.AHEAD
     assert two.workers == []
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_or_hangs_costs_nothing(
-    jobs: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(process_pool, "PATIENCE_S", 0.3)
-    with begun(evaluation_pool(3), 2) as pool:
-        processes = [worker.process for worker in pool.workers]
-        processes[0].send_signal(signal.SIGSTOP)
-        work = partial(jobs.signal_elsewhere, os.getpid(), signal.SIGKILL)  # the other one
-        assert list(pool.map(work, range(60), each_s=0.002)) == list(range(60))
-        assert pool.workers == []
-    assert [process.returncode for process in processes] == [-signal.SIGKILL] * 2
-
-
-@pytest.mark.slow
-def test_an_exception_nobody_expected_is_raised_here(two: ProcessPool, jobs: ModuleType) -> None:
-    found = []
-    with pytest.raises(LookupError, match="item 37") as caught:
-        found.extend(two.map(jobs.fail, range(100), each_s=0.002))
-    assert any(entry.name == "fail" for entry in caught.traceback)
-    assert found == list(range(len(found)))
-    assert all(not worker.busy for worker in two.workers)
 
 
 INTERRUPTED = """

@@ -155,52 +155,6 @@ def test_normal_numbers_stand_for_parameters_with_their_prior() -> None:
     assert np.corrcoef(alike.T)[0, 1] == pytest.approx(0.5, abs=0.03)
 
 
-def test_mean_rates_are_those_of_all_nodes_and_draws_are_moved_there(eight: AgreementModel) -> None:
-    like = eight.likelihood
-    logs, rates = like.log_and_rates(eight.phi[:300])
-    assert logs == pytest.approx(like.log(eight.phi[:300]), abs=1e-4)
-    part = like.weights(eight.nodes.mean[:300], Spread(**first(eight.nodes.within, 300)))
-    for group in range(len(EIGHT)):
-        mass = part * like.table[group]
-        for side, rate in enumerate(like.rate_of_cells):
-            wanted = mass @ rate / mass.sum(axis=1)
-            assert rates[:, group, side] == pytest.approx(wanted, abs=1e-4)
-    means = np.stack([eight.draws.recorded.mean(axis=0), eight.draws.sim.mean(axis=0)], axis=1)
-    whole = np.einsum("n,ngs->gs", eight.weights, like.log_and_rates(eight.phi)[1])
-    assert means == pytest.approx(whole, abs=1e-3)
-
-
-def test_what_is_left_out_of_the_grid_carries_nothing() -> None:
-    groups = groups_of(
-        [("a", 0, 5, 1, 7), ("b", 5, 5, 5, 5), ("a", 3, 10, 14, 20), ("c", 9, 9, 0, 9)]
-    )
-    like = Likelihood(groups)
-    nodes = Nodes.of(from_normal(np.random.default_rng(4).standard_normal((40, 8))))
-    found = like.of_task(nodes, np.arange(4), with_rates=True)
-    spread = Spread(**{name: np.repeat(v, 16) for name, v in vars(nodes.within).items()})
-    whole = like.weights(found.centres.reshape(-1, 2), spread)
-    mass = whole @ like.table.T
-    chance = mass / whole.sum(axis=1, keepdims=True)
-    seen = chance.min(axis=1) > 1e-8
-    rates = [(whole @ (like.table * side).T) / mass for side in like.rate_of_cells]
-    _, shares = like.centres(nodes, np.arange(4))
-    logs = np.log(np.maximum(chance, 1e-35)).sum(axis=1) + shares.ravel()
-    assert seen.mean() > 0.5
-    assert found.logs.ravel()[seen] == pytest.approx(logs[seen], abs=1e-3)
-    for side, wanted in enumerate(rates):
-        made = found.rates[..., side].reshape(-1, 4)
-        assert made[seen] == pytest.approx(wanted[seen], abs=1e-4)
-    window = like.window(nodes.mean, nodes.within)
-    assert like.weights(nodes.mean, nodes.within, window).shape[1] <= whole.shape[1]
-    far = np.array([[40.0, -40.0]])  # beyond the grid there is still a place
-    narrow = Spread(first=np.array([0.1]), second=np.array([0.1]), rho=np.array([0.0]))
-    assert like.weights(far, narrow, like.window(far, narrow)).size > 0
-
-
-def first(spread: Spread, count: int) -> dict[str, np.ndarray]:
-    return {name: values[:count] for name, values in vars(spread).items()}
-
-
 def test_rates_that_cannot_be_told_from_one_have_their_place_on_the_grid() -> None:
     at = stats.norm(4, 5)
     chance = integrate.quad(lambda x: expit(x) ** 5 * at.pdf(x), -40, 60, points=(0,))[0]

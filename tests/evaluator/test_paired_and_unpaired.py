@@ -1,10 +1,8 @@
 """Laws and known answers of paired and unpaired comparisons, and of power."""
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -80,35 +78,6 @@ def test_jeffreys_reaches_the_ends_where_it_must() -> None:
     assert jeffreys(0, 10).low == 0
     assert jeffreys(10, 10).high == 1
     assert jeffreys(3, 10).low < 0.3 < jeffreys(3, 10).high
-
-
-def brute_boschloo(k1: int, n1: int, k2: int, n2: int) -> float:
-    """Definition written out: Fisher's p of each table, largest probability over a fine grid."""
-    from math import comb
-
-    def fisher(a: int, b: int) -> float:
-        total = comb(n1 + n2, a + b)
-        xs = range(max(0, a + b - n2), a + 1)
-        return sum(comb(n1, x) * comb(n2, a + b - x) for x in xs) / total
-
-    def one_sided(a: int, b: int) -> float:
-        limit = fisher(a, b) * (1 + 1e-9)
-        tables = itertools.product(range(n1 + 1), range(n2 + 1))
-        region = [(x, y) for x, y in tables if fisher(x, y) <= limit]
-        p = np.linspace(0, 1, 20_001)[1:-1]
-        return max(
-            sum(
-                comb(n1, x) * comb(n2, y) * p ** (x + y) * (1 - p) ** (n1 + n2 - x - y)
-                for x, y in region
-            )
-        )
-
-    return min(1.0, 2 * min(one_sided(k1, k2), one_sided(n1 - k1, n2 - k2)))
-
-
-@pytest.mark.parametrize("table", [(4, 6, 5, 6), (1, 5, 4, 4), (0, 5, 5, 5), (2, 4, 2, 4)])
-def test_boschloo_is_its_definition(table: tuple[int, int, int, int]) -> None:
-    assert boschloo(*table) == pytest.approx(brute_boschloo(*table), abs=1e-6)
 
 
 def test_boschloo_of_the_papers_gains() -> None:

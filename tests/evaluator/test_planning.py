@@ -17,7 +17,6 @@ from evaluator.statistics.planning import (
     power_above,
     rate_width,
     trials_above,
-    trials_for_width,
 )
 from evaluator.statistics.power import power_paired
 
@@ -72,8 +71,6 @@ def test_the_width_of_the_gain_is_its_expectation(n: int) -> None:
 def test_widths_shrink_to_what_is_wanted() -> None:
     needed = pairs_for_width(0.3, 0.1, 0.3)
     assert paired_width(0.3, 0.1, needed) <= 0.3 < paired_width(0.3, 0.1, needed - 2)
-    trials = trials_for_width(0.6, 0.3)
-    assert rate_width(0.6, trials) <= 0.3 < rate_width(0.6, trials - 1)
     mass = stats.binom.pmf(np.arange(13), 12, 0.6)
     ends = [wilson(k, 12) for k in range(13)]
     assert rate_width(0.6, 12) == pytest.approx(mass @ [e.high - e.low for e in ends])

@@ -84,23 +84,6 @@ def test_the_setting_in_which_replays_differ_is_named(two: Any) -> None:
     assert "physics.object_friction 0.5 in 1, 0.9 in 1" in said
 
 
-def test_of_a_replay_with_other_settings_beside_it_the_one_that_counts_is_named(two: Any) -> None:
-    for name in ("a", "b"):
-        two.replay(name, settings=settings(grasp="friction"))
-        two.replay(name, settings=settings(grasp="attach"), tag="b")
-    (said,) = said_of_replays(compare_run(two.run))
-    assert said.startswith("2 of the 2 that count were also made with other settings")
-    assert "grasp attach in what counts, friction beside it" in said
-
-
-@pytest.mark.parametrize("newer", ["replay_version", "calibration_id"])
-def test_what_an_older_program_or_calibration_left_is_not_mentioned(two: Any, newer: str) -> None:
-    for name in ("a", "b"):
-        two.replay(name, settings=settings(grasp="friction"))
-        two.replay(name, settings=settings(grasp="attach") | {newer: "next"}, tag="b")
-    assert said_of_replays(compare_run(two.run)) == []
-
-
 def test_the_report_says_so_beside_the_rates_it_is_about(two: Any, tmp_path: Path) -> None:
     two.replay("a", scene_hash=OLD)
     two.replay("b", scene_hash=NEW)

@@ -7,7 +7,6 @@ import pytest
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome, treatment_of
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.gains import pair_starts, paired_progress
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.study import retry_table, study_results, study_starts
 from evaluator.compare.success import rate_groups, side_rates
@@ -171,25 +170,6 @@ def test_retries_are_counted_by_treatment_and_nothing_else_is() -> None:
         ("stack", "nominal", "without_replanning", 0, 1, 0),
     )
     assert retry_table(recorded[:1]) == ()
-
-
-def test_progress_counts_which_trial_of_a_start_came_further_and_not_how_far() -> None:
-    done = [(1, 3), (0, 2), (2, 2), (3, 1), (0, 1), (1, 2)]  # of 3 sub-tasks, without and with
-    rows = [
-        row(start, arm, k == 3, unit="subtask", k=k, n=3)
-        for start, ks in enumerate(done)
-        for arm, k in zip(("without", "with"), ks, strict=True)
-    ]
-    pairs, left_out = pair_starts(rows)
-    assert not left_out
-    share, test = paired_progress(pairs)
-    expected = tango_difference(4, 1, 6)
-    assert share.value == pytest.approx(100 * 3 / 6)
-    assert share.interval is None or share.interval.low == pytest.approx(100 * expected.low)
-    assert test.value == sign_test(4, 1)[1]
-    further = [replace(each, k=3) if each.k == 2 else each for each in rows]
-    assert paired_progress(pair_starts(further)[0])[1].value == test.value
-    assert paired_progress(pair_starts(FIRST)[0]) == []
 
 
 def test_without_plans_what_was_executed_is_shown_and_enters_no_statistic() -> None:

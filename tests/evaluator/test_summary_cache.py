@@ -2,10 +2,6 @@
 
 import math
 import os
-import signal
-import subprocess
-import sys
-import time
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -61,11 +57,6 @@ class Everything:
 @dataclass(frozen=True, kw_only=True)
 class Other:
     text: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Odd:
-    text: int
 
 
 FULL = Everything(
@@ -142,18 +133,6 @@ def test_a_number_beyond_the_format_costs_only_its_own_place(tmp_path: Path) -> 
     }
     write_rows(path, rows)
     assert read_rows(path, Everything) == {"good": (FULL,)}
-
-
-def test_other_code_and_other_kinds_are_not_believed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "rows.msgpack"
-    write_rows(path, {"k": (FULL,)})
-    with pytest.raises(ValueError, match="holds something else"):
-        read_rows(path, Odd)
-    monkeypatch.setattr(cache_module, "code_version", lambda: b"tomorrow's")
-    with pytest.raises(ValueError, match="another version"):
-        read_rows(path, Everything)
 
 
 def test_no_flipped_bit_changes_an_answer(tmp_path: Path) -> None:
@@ -290,44 +269,3 @@ def test_of_two_evaluations_at_once_the_later_one_stays_whole(tmp_path: Path) ->
         None,
         (Other(text="b"),),
     ]
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from bridge.episode.metadata import EpisodeInfo
-from evaluator.cache import SummaryCache
-from evaluator.run_reader.episodes import RecordedFacts
-
-cache = SummaryCache(Path(sys.argv[1]))
-for number in range(10**9):
-    info = EpisodeInfo(id=f"e{number}", kind="trial", tags=("x" * 2000,))
-    cache.keep(RecordedFacts, f"k{number}", (RecordedFacts(info=info),))
-    if number % 50 == 49:
-        cache.save()
-        print(number, flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_evaluation_leaves_what_it_had_saved(tmp_path: Path) -> None:
-    from evaluator.run_reader.episodes import RecordedFacts
-
-    with subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    ) as child:
-        assert child.stdout is not None
-        saved = [int(child.stdout.readline()) for _ in range(4)][-1]
-        time.sleep(0.013)  # somewhere within the next file
-        child.send_signal(signal.SIGKILL)
-    stray = tmp_path / "RecordedFacts.msgpack.part"
-    stray.write_bytes(b"half")
-    os.utime(stray, (0, 0))
-    said: list[str] = []
-    with SummaryCache(tmp_path, say=said.append) as cache:
-        for number in range(saved + 1):
-            found = cache.find(RecordedFacts, f"k{number}")
-            assert found is not None
-            assert found[0].info.id == f"e{number}"
-    assert said == []
-    assert not stray.exists()

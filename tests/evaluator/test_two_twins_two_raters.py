@@ -54,7 +54,6 @@ def test_a_better_twin_is_shown_to_be_better_by_the_pairs(tmp_path: Path) -> Non
     assert by_name["Brier score"]["difference"] == pytest.approx(
         (1 * 0.81 - 11 * 0.81 + 10 * 0.01) / 20
     )
-    assert by_name["Brier score"]["high"] < 0
     back = against_tables(compare_csv(bad).rows, compare_csv(good).rows, names=("bad", "good"))
     assert cells(back[0])["difference"] == pytest.approx(-0.5)
 
@@ -114,7 +113,7 @@ def test_reviews_are_kept_and_read_in_one_format(tmp_path: Path) -> None:
         read_reviews(path)
 
 
-def test_kappa_and_what_label_error_does(write_table: Callable[[str], Path]) -> None:
+def test_kappa_of_two_raters(write_table: Callable[[str], Path]) -> None:
     comparison = compare_csv(write_table(twin(18)))
     reviews = [
         Review(trial_id=f"t{i}", rater="Ann", result="success" if (i % 2) != (i < 4) else "failure")
@@ -129,10 +128,4 @@ def test_kappa_and_what_label_error_does(write_table: Callable[[str], Path]) -> 
     chance = a.mean() * b.mean() + (1 - a.mean()) * (1 - b.mean())
     assert line["kappa"] == pytest.approx(((a == b).mean() - chance) / (1 - chance))
     assert line["low"] < line["kappa"] < line["high"]
-    labels = [cells(tables["label_error"], i) for i in range(len(tables["label_error"].rows))]
-    by_words = {cell["labels"]: cell for cell in labels}
-    assert by_words["labels of recorded label"]["PPV"] == 0.9
-    noisy = [cell["PPV"] for cell in labels if "wrong at random" in cell["labels"]]
-    assert noisy == sorted(noisy, reverse=True)  # more wrong labels, less PPV
-    assert any("half of what raters disagree on" in words for words in by_words)
     assert any("1 of trials that are not there (elsewhere)" in text for text in found.missing)

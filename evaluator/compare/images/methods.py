@@ -71,9 +71,6 @@ class ImageSet:
 def folder_set(name: str, folder: Path) -> ImageSet:
     """List the images of a folder and its subfolders.
 
-    Args:
-        folder: Where its images are; a path below it without its ending names the view.
-
     Raises:
         EvaluatorError: When it holds no image, or two of one name.
     """
@@ -169,8 +166,6 @@ class MethodReport:
     """By method, over the views that all of them have."""
     views: tuple[ViewQuality, ...]
     exclusions: tuple[Exclusion, ...]
-    common: tuple[str, ...]
-    """The views in every mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,9 +221,7 @@ def compare_methods(
         for method in scored
         for quality in _qualities(reference.images, method, {v: views[v] for v in common})
     ]
-    return MethodReport(
-        numbers=numbers, views=tuple(shown), exclusions=tuple(left_out), common=tuple(common)
-    )
+    return MethodReport(numbers=numbers, views=tuple(shown), exclusions=tuple(left_out))
 
 
 def _name(method: str, view: str) -> str:

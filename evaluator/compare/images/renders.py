@@ -16,12 +16,7 @@ from evaluator.compare.images.methods import (
     folder_set,
 )
 from evaluator.compare.images.scores import RAW, RECORDED, RENDERED, images_of, open_nets
-from evaluator.compare.images.tables import (
-    StampedMeasurement,
-    StampedValue,
-    cell_of,
-    stamped_table,
-)
+from evaluator.compare.images.tables import StampedMeasurement, rounded
 from evaluator.compare.images.views import (
     TWIN,
     Source,
@@ -33,13 +28,13 @@ from evaluator.compare.images.views import (
 from evaluator.compare.rows import Comparison
 from evaluator.errors import EvaluatorError
 from evaluator.measurements import slug
-from evaluator.metrics.image_protocol import UNSTATED, ImageOptions
-from evaluator.metrics.lpips import PerceptualNet
-from evaluator.result import Table
+from evaluator.metrics.image_protocol import UNSTATED, ImageOptions, common_text
+from evaluator.metrics.lpips import LPIPS_NOT_COMPUTED, PerceptualNet
+from evaluator.result import Cell, Table
 from evaluator.run_reader.episodes import DerivedFile
 
-HEADLINE = ("psnr_db", "ssim_zero", "lpips_vgg_01")
-"""Metrics of the first table, by the conventions of 3D Gaussian splatting papers."""
+HEADLINE = {"psnr_db": "PSNR (dB)", "ssim_zero": "SSIM", "lpips_vgg_01": "LPIPS (vgg)"}
+"""Metrics of the table, by the conventions of 3D Gaussian splatting papers."""
 _NOTE = (
     "Means over the views that every method has. SSIM with zeros beyond the border and LPIPS of "
     "images in 0..1, as papers on 3D Gaussian splatting compute them; results.json has the other "
@@ -48,26 +43,29 @@ _NOTE = (
 
 
 def _headline(numbers: Mapping[str, Sequence[StampedMeasurement]], origin: str) -> Table:
-    """Lay the methods out, by the metrics of papers."""
-    rows = []
+    """Lay the methods out, by the metrics of papers, with the protocol of each row."""
+    rows: list[dict[str, Cell]] = []
     for method, found in numbers.items():
         raw = {number.metric.id: number for number in found if number.variant == RAW}
-        rows.append(((method,), [_cell(raw, metric) for metric in HEADLINE]))
-    return stamped_table(
-        "image_methods",
-        "Rendering quality on the same views",
-        ("method",),
-        ("PSNR (dB)", "SSIM", "LPIPS (vgg)"),
-        rows,
-        note=f"{_NOTE} Images: {origin}.",
-    )
+        shown = [raw[metric] for metric in HEADLINE if metric in raw]
+        stamps = [each.stamp for each in shown if each.measurement.value is not None]
+        stamps = stamps or [shown[0].stamp]
+        rows.append(
+            {
+                "method": method,
+                **{head: _cell(raw.get(metric)) for metric, head in HEADLINE.items()},
+                "views": max(stamp.n for stamp in stamps) or None,
+                "protocol": common_text(stamps),
+            }
+        )
+    title = "Rendering quality on the same views"
+    return Table.of(rows, id="image_methods", title=title, note=f"{_NOTE} Images: {origin}.")
 
 
-def _cell(found: Mapping[str, StampedMeasurement], metric: str) -> StampedValue:
-    if metric in found:
-        return cell_of(found[metric])
-    # Without a backbone there is no measurement; the protocol of the row's others still holds.
-    return StampedValue(value="not computed", stamp=found["psnr_db"].stamp)
+def _cell(found: StampedMeasurement | None) -> Cell:
+    if found is None or found.measurement.reason_if_undefined == LPIPS_NOT_COMPUTED:
+        return "not computed"
+    return rounded(found.measurement.value)
 
 
 def compare_folders(options: ImageOptions) -> Comparison:
@@ -105,9 +103,6 @@ def compare_renders(
 
     A view is called ``camera/stamp_ns``; ``camera_stamp_ns`` and the names of ``export tum`` are
     understood too. With a reference of their own, the folders are compared with that instead.
-
-    Args:
-        options: Whose folders; without any the report is empty.
 
     Raises:
         EvaluatorError: When the run has no views, or nothing can be compared.

@@ -101,11 +101,7 @@ def score_variants(
     *,
     nets: Sequence[PerceptualNet] = (),
 ) -> dict[Variant, ImageScore]:
-    """Score one pair in every way but re-posed.
-
-    Args:
-        nets: Networks that compute LPIPS where a variant asks for it; none without.
-    """
+    """Score one pair in every way but re-posed."""
     ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None), (AFFINE, None)]
     ways += [(variant, mask) for name, mask in masks.items() for variant in masked(name)]
     return {
@@ -273,11 +269,7 @@ def score_views(
 
 
 def images_of(views: Episode, source: Episode | None) -> Images:
-    """Collect the images of a views episode.
-
-    Args:
-        source: What it was made from; recorded images are looked for there if it has none.
-    """
+    """Collect the images of a views episode."""
     images = read_images(views)
     if source is not None and not images.color[RECORDED]:
         wanted = {stamp for _, stamp in images.color[RENDERED]}

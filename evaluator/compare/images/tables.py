@@ -10,7 +10,7 @@ from evaluator.compare.images.scores import AFFINE, GAIN, POSE_GAIN, RAW, Varian
 from evaluator.compare.measure import measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
-from evaluator.metrics.image_protocol import ImageMetric, Stamp, common_text
+from evaluator.metrics.image_protocol import ImageMetric, Stamp
 from evaluator.metrics.image_scores import METRICS, PLAIN_METRICS, ImageScore
 from evaluator.metrics.lpips import LPIPS_METRICS, LPIPS_NOT_COMPUTED, PerceptualNet, net_of
 from evaluator.result import Cell, Measurement, Table
@@ -130,59 +130,6 @@ def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
         return ""
     reason = without[0].reasons[metric.id]
     return f"not in the mean: {len(without)} of {len(scores)} images ({reason})"
-
-
-PROTOCOL_COLUMN = "protocol"
-MISSING = "not computed"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StampedValue:
-    """One cell of a table of image numbers."""
-
-    value: float | str | None
-    """A word where there is not a number; None is undefined."""
-    stamp: Stamp
-
-
-def stamped_table(
-    table_id: str,
-    title: str,
-    heads: Sequence[str],
-    columns: Sequence[str],
-    rows: Iterable[tuple[Sequence[Cell], Sequence[StampedValue]]],
-    *,
-    note: str,
-) -> Table:
-    """Lay out rows of stamped values, with n and protocol behind the values."""
-    laid = []
-    for front, values in rows:
-        if len(front) != len(heads) or len(values) != len(columns):
-            message = f"a row of table {table_id} has {len(front)} + {len(values)} cells"
-            raise ValueError(message)
-        # What was not computed has no protocol; a row of nothing else still shows what it would be.
-        made = [value for value in values if not isinstance(value.value, str)] or values
-        stamps = [value.stamp for value in made]
-        numbers = [stamp.n for stamp in stamps if stamp.n]
-        views = max(numbers, default=None)
-        laid.append(
-            (*front, *(rounded(value.value) for value in values), views, common_text(stamps))
-        )
-    return Table(
-        id=table_id,
-        title=title,
-        columns=(*heads, *columns, "views", PROTOCOL_COLUMN),
-        rows=tuple(laid),
-        note=note,
-    )
-
-
-def cell_of(stamped: StampedMeasurement) -> StampedValue:
-    """Return what a table shows of a measurement."""
-    value: float | str | None = stamped.measurement.value
-    if stamped.measurement.reason_if_undefined == LPIPS_NOT_COMPUTED:
-        value = MISSING
-    return StampedValue(value=value, stamp=stamped.stamp)
 
 
 _ALIGNED = tuple(

@@ -68,11 +68,7 @@ class ViewSummary:
 def scored_views(
     images: Images, key: str, cache: SummaryCache, *, nets: Sequence[PerceptualNet] = ()
 ) -> tuple[list[ViewScore], list[str]]:
-    """Score the views of one episode as ``score_views`` does, or take what is kept of them.
-
-    Args:
-        nets: For LPIPS; their weights belong to the key, which names them here.
-    """
+    """Score the views of one episode as ``score_views`` does, or take what is kept of them."""
     key = " ".join([key, *(net.weights for net in nets)])
 
     def make() -> tuple[ViewSummary, ...]:
@@ -136,12 +132,7 @@ def compare_views(
     nets: Sequence[PerceptualNet] = (),
     cache: SummaryCache | None = None,
 ) -> ViewReport:
-    """Compute every image metric of every rendered view, per image and mean.
-
-    Args:
-        sources: Every recorded episode by its id; views made from other bytes are left out.
-        cache: What earlier evaluations scored; without one every view is.
-    """
+    """Compute every image metric of every rendered view, per image and mean."""
     cache = SummaryCache(None) if cache is None else cache
     views, left_out = newest_views(files, sources)
     if not views:
@@ -183,11 +174,7 @@ def compare_views(
 def newest_views(
     files: Sequence[DerivedFile], sources: Mapping[str, Source]
 ) -> tuple[list[DerivedFile], list[Exclusion]]:
-    """Find the newest views of each recorded episode; stale and older ones are left out by name.
-
-    Args:
-        sources: Recorded episodes by id; views of another version of one are stale.
-    """
+    """Find the newest views of each recorded episode; stale and older ones are left out by name."""
     views, stale = _current([file for file in files if file.derived.kind == "views"], sources)
     views, older = _newest(views)
     return views, [*older, *stale]
@@ -316,11 +303,7 @@ def _measure_depth(
 
 
 def agreed_setting(settings: Sequence[Mapping[str, Any]], name: str) -> str:
-    """Return what all views say of one setting, or nothing.
-
-    Args:
-        name: The setting; the answer is empty where one lacks it or says something else.
-    """
+    """Return what all views say of one setting, or nothing."""
     values = [each.get(name) for each in settings]
     if not values or values[0] is None or any(value != values[0] for value in values):
         return ""

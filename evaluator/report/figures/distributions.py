@@ -116,11 +116,7 @@ class Subject:
 
 
 def distributions(subject: Subject, panels: Sequence[Panel]) -> Drawing | NotDrawn:
-    """Draw for each panel which share of the values is at most as large.
-
-    Args:
-        panels: Distributions that share one axis each, from top to bottom; empty ones are left out.
-    """
+    """Draw for each panel which share of the values is at most as large."""
     panels = [panel for panel in panels if panel.groups]
     if not panels:
         return NotDrawn(id=subject.id, reason=subject.reason)

@@ -70,14 +70,7 @@ class NotDrawn:
 def panel(
     figure: "Figure", *, left: float, bottom: float, right: float = 0.12, top: float = 0.12
 ) -> "Axes":
-    """Add axes that leave these margins [in] to the edges of the figure.
-
-    Args:
-        left: Margin for the labels of the vertical axis [in].
-        bottom: Margin for the labels of the horizontal axis [in].
-        right: Margin [in].
-        top: Margin [in].
-    """
+    """Add axes that leave these margins [in] to the edges of the figure."""
     width, height = figure.get_size_inches()
     return framed(figure, (left, bottom, float(width) - left - right, float(height) - bottom - top))
 
@@ -108,11 +101,7 @@ def grid(axes: "Axes", which: str = "both") -> None:
 
 
 def percent_axis(axes: "Axes", which: str, label: str) -> None:
-    """Run an axis from 0 to 100 %, with room for marks at both ends.
-
-    Args:
-        label: What the axis shows, without its unit.
-    """
+    """Run an axis from 0 to 100 %, with room for marks at both ends."""
     name = f"{label} (%)"
     if which == "x":
         axes.set_xlim(-3, 103)
@@ -168,11 +157,7 @@ def words(*parts: str) -> str:
 
 
 def listed(names: Sequence[str], *, at_most: int = 6) -> str:
-    """Name a few and count the rest.
-
-    Args:
-        at_most: How many are named; the rest is only counted.
-    """
+    """Name a few and count the rest."""
     shown = "; ".join(names[:at_most])
     more = len(names) - at_most
     return shown if more <= 0 else f"{shown}; and {more} more"

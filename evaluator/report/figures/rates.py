@@ -1,9 +1,8 @@
-"""Success rates: the twin's against the recorded ones, and what the gate makes of them."""
+"""Success rates: the twin's against the recorded ones, and the gain with replanning."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from evaluator.compare.plot_data import ReliabilityPoint
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.success import WITH
 from evaluator.report.figures.drawing import (
@@ -15,13 +14,12 @@ from evaluator.report.figures.drawing import (
     NotDrawn,
     framed,
     grid,
-    legend,
     listed,
     panel,
     percent_axis,
     words,
 )
-from evaluator.result import Cell, Measurement, Table
+from evaluator.result import Measurement
 from evaluator.statistics.agreement import counted_groups
 
 if TYPE_CHECKING:
@@ -29,82 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-MAX_LINES = 60
-Row = tuple[Cell, ...]
-
-
-def funnel(tables: Sequence[Table]) -> Drawing | NotDrawn:
-    """Draw how many trials reached and passed each stage."""
-    table = next((table for table in tables if table.id == "funnel"), None)
-    if table is None or not table.rows:
-        return NotDrawn(id="funnel", reason="no trial has labelled stages")
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in table.rows:
-        groups.setdefault((str(row[0]), str(row[1])), []).append(row)
-    shown: list[tuple[tuple[str, str], list[Row]]] = []
-    for key, rows in groups.items():
-        if shown and sum(len(rows) + 1 for _, rows in shown) + len(rows) + 1 > MAX_LINES:
-            break
-        shown.append((key, rows))
-    lines = sum(len(rows) + 1 for _, rows in shown)
-    most = max(int(str(row[3] or 0)) for _, rows in shown for row in rows)
-
-    def draw(figure: "Figure") -> None:
-        axes = panel(figure, left=1.0, right=0.7, bottom=0.4, top=0.05)
-        axes.spines["left"].set_visible(False)
-        grid(axes, "x")
-        axes.set_xlim(0, max(most, 1))
-        axes.set_ylim(lines, 0)
-        axes.set_yticks([])
-        axes.locator_params(axis="x", integer=True, nbins=5)
-        axes.set_xlabel("trials")
-        y = 0.0
-        for (task, condition), rows in shown:
-            axes.text(
-                -0.92 / 1.8 * max(most, 1), y + 0.6, words(task, condition), va="center",
-                fontsize=8,
-            )  # fmt: skip
-            y += 1
-            for row in rows:
-                _bar(axes, row, y, max(most, 1))
-                y += 1
-
-    rest = "" if len(shown) == len(groups) else f" The first {len(shown)} of {len(groups)} groups."
-    return Drawing(
-        id="funnel",
-        title="Stage funnel",
-        caption="Pale: trials that reached a stage, every earlier one having succeeded; solid: "
-        f"those that passed it. Counts: passed / reached.{rest}",
-        alt="Passed of reached: "
-        + listed(
-            [f"{words(*map(str, row[:3]))}: {row[4]} of {row[3]}" for row in table.rows], at_most=12
-        ),
-        height_in=0.5 + 0.2 * lines,
-        draw=draw,
-    )
-
-
-def _bar(axes: "Axes", row: Row, y: float, most: int) -> None:
-    reached, passed = (int(str(value or 0)) for value in row[3:5])
-    middle = y + 0.5
-    colour = LIGHT["sim"]
-    axes.barh(middle, reached, height=0.62, color=colour, alpha=0.25, linewidth=0)
-    axes.barh(middle, passed, height=0.62, color=colour, alpha=0.85, linewidth=0)
-    name = str(row[2]).replace("_", " ")
-    name = name if len(name) <= 19 else f"{name[:18]}…"
-    axes.text(-0.03 * most, middle, name, ha="right", va="center", fontsize=7.5)
-    text = f"{passed}/{reached}"
-    if row[5]:
-        text += f" ({row[5]} unknown)"
-    axes.text(1.04 * most, middle, text, va="center", fontsize=7.5, clip_on=False)
-
-
 def gains(measurements: Sequence[Measurement], word: str) -> Drawing | NotDrawn:
-    """Draw every gain with its interval around the line of no gain.
-
-    Args:
-        measurements: Everything measured; gains in percentage points are drawn.
-    """
+    """Draw every gain with its interval around the line of no gain."""
     found: dict[str, dict[str, Measurement]] = {}
     for measurement in measurements:
         if measurement.id.startswith("gain.pp.") and measurement.value is not None:
@@ -181,11 +105,7 @@ MAX_ROWS = 40
 
 
 def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
-    """Draw sim against recorded rates with both intervals and the identity line.
-
-    Args:
-        groups: Success rates per task, condition and policy; only those with both rates are drawn.
-    """
+    """Draw sim against recorded rates with both intervals and the identity line."""
     drawn = [group for group in groups if all(rate.value is not None for rate in group.pair)]
     if not drawn:
         return NotDrawn(id="scatter", reason="no group has both rates")
@@ -271,11 +191,7 @@ def _legend(axes: "Axes", series: Sequence[tuple[str, str]], conditions: bool) -
 
 
 def success(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
-    """Draw both rates of every group, one group below the other, with their intervals.
-
-    Args:
-        groups: Success rates per task, condition and policy; one with neither rate is left out.
-    """
+    """Draw both rates of every group, one group below the other, with their intervals."""
     known = [
         group
         for group in groups
@@ -340,85 +256,3 @@ def _text(rate: Measurement) -> str:
     if rate.k is None or rate.n is None:
         return f"{100 * rate.value:.0f} %"
     return f"{rate.k}/{rate.n}"
-
-
-def reliability(bins: Sequence[ReliabilityPoint]) -> Drawing | NotDrawn:
-    """Draw how often trials succeeded against the probability that was stated for them."""
-    if not bins:
-        return NotDrawn(id="reliability", reason="no trial has p_success and an outcome")
-    side = COLUMN_IN - 0.62
-
-    def draw(figure: "Figure") -> None:
-        axes = framed(figure, (0.5, 1.02, side, side))
-        grid(axes)
-        percent_axis(axes, "y", "trials that succeeded")
-        axes.set_xlim(-3, 103)
-        axes.set_xticks(range(0, 101, 20), [""] * 6)
-        axes.plot([0, 100], [0, 100], color=LIGHT["soft"], linewidth=0.9, dashes=(4, 3))
-        for b in bins:
-            if b.rate_low is not None and b.rate_high is not None:
-                axes.plot(
-                    [100 * b.mean_probability] * 2, [100 * b.rate_low, 100 * b.rate_high],
-                    color=LIGHT["sim"], linewidth=1.4, alpha=0.6,
-                )  # fmt: skip
-            axes.plot(
-                [100 * b.mean_probability], [100 * b.rate], "o", color=LIGHT["sim"], markersize=5
-            )
-        counts = framed(figure, (0.5, 0.42, side, 0.5))
-        counts.bar(
-            [50 * (b.low + b.high) for b in bins], [b.n for b in bins], width=9.2,
-            color=LIGHT["sim"], alpha=0.45, linewidth=0,
-        )  # fmt: skip
-        percent_axis(counts, "x", "stated probability of success")
-        most = max(b.n for b in bins)
-        counts.set_ylim(0, 1.15 * most)
-        counts.set_yticks([0, most])
-        counts.set_ylabel("trials")
-
-    return Drawing(
-        id="reliability",
-        title="Is the stated success probability kept?",
-        caption="Bins of equal width with 95 % Wilson intervals; below: trials per bin. On the "
-        "dashed line a probability is kept; below it the twin promises too much.",
-        alt="Bins of the stated probability: "
-        + listed(
-            [
-                f"mean {100 * b.mean_probability:.0f} %, {b.succeeded} of {b.n} succeeded"
-                for b in bins
-            ],
-            at_most=10,
-        ),
-        height_in=1.02 + side + 0.12,
-        draw=draw,
-    )
-
-
-def costs(tables: Sequence[Table]) -> Drawing | NotDrawn:
-    """Draw what a trial costs with and without the gate, by the price of a refused good plan."""
-    table = next((table for table in tables if table.id == "gate_costs"), None)
-    if table is None or not table.rows:
-        return NotDrawn(id="costs", reason="no executed trial has an advisory verdict")
-    rows = [tuple(float(str(value)) for value in row[:3]) for row in table.rows]
-
-    def draw(figure: "Figure") -> None:
-        axes = panel(figure, left=0.5, bottom=0.4, top=0.36)
-        grid(axes)
-        price = [row[0] for row in rows]
-        axes.plot(price, [row[1] for row in rows], "o-", color=LIGHT["sim"], label="obey the gate")
-        axes.plot(
-            price, [row[2] for row in rows], "s--", color=LIGHT["rec"], label="execute everything"
-        )
-        axes.set_xlabel("price of refusing a good plan (bad executions)")
-        axes.set_ylabel("cost per trial (bad executions)")
-        axes.set_ylim(bottom=0)
-        legend(axes)
-
-    return Drawing(
-        id="costs",
-        title="What the gate costs and avoids",
-        caption=f"Where the circles lie lower, obeying the gate pays. {table.note}",
-        alt="Mean cost per trial, obeying the gate against executing everything: "
-        + listed([f"at price {row[0]:g}: {row[1]:.3g} against {row[2]:.3g}" for row in rows]),
-        height_in=2.6,
-        draw=draw,
-    )

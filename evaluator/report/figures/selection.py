@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 from evaluator.compare.motion import MotionSummary
-from evaluator.compare.plot_data import curve_bands, reliability_points
+from evaluator.compare.plot_data import curve_bands
 from evaluator.compare.rows import Comparison
 from evaluator.memory import Packed
 from evaluator.report.figures.distributions import (
@@ -13,30 +13,18 @@ from evaluator.report.figures.distributions import (
     view_panels,
 )
 from evaluator.report.figures.drawing import Drawing, NotDrawn
-from evaluator.report.figures.rates import (
-    costs,
-    funnel,
-    gains,
-    reliability,
-    scatter,
-    success,
-)
-from evaluator.report.figures.tasks import tasks
+from evaluator.report.figures.rates import gains, scatter, success
 
 FIRST = ("recorded to planned", "recorded to executed")
 
 
 def drawings_of(comparison: Comparison) -> tuple[list[Drawing], list[NotDrawn]]:
     """Return the figures that have data, in the order of the report, and the others."""
-    groups, word, tables = comparison.groups, comparison.recorded_word, comparison.tables
+    groups, word = comparison.groups, comparison.recorded_word
     everything: tuple[Drawing | NotDrawn, ...] = (
         success(groups, word),
         scatter(groups, word),
-        tasks(groups, word),
         gains(comparison.measurements, word),
-        costs(tables),
-        reliability(reliability_points(comparison.rows)),
-        funnel(tables),
         motions(curve_bands(_curves(comparison.motions))),
         distributions(*state_panels(comparison.states)),
         distributions(*view_panels(comparison.views)),

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from bridge.media.image_quality import (
     PADDINGS,
     ImageShapeError,
-    psnr_db,
     ssim,
     ssim_maps,
 )
@@ -136,15 +135,6 @@ def test_swapped_channels_are_recognised_and_grey_ones_cannot_be() -> None:
 def test_eight_bits_and_their_floats_score_the_same() -> None:
     first, second = ((255 * picture(seed)).astype(np.uint8) for seed in (1, 2))
     assert score_image(first, second).values == score_image(first / 255.0, second / 255.0).values
-
-
-def test_psnr_of_masked_pixels_is_that_of_these_pixels() -> None:
-    image = picture()
-    other = image.copy()
-    other[:, 16:] += 0.1
-    mask = np.zeros(image.shape[:2], dtype=bool)
-    mask[:, 16:] = True
-    assert psnr_db(image, other, mask=mask) == pytest.approx(20.0)
 
 
 def test_every_metric_names_its_source_and_implementation() -> None:

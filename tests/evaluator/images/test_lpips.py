@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from own_process import printed
 
 from bridge.errors import MissingDependencyError
 from evaluator.compare.images.scores import open_nets, score_variants
 from evaluator.metrics import lpips_torch
-from evaluator.metrics.lpips import LPIPS_METRICS, metric_id
+from evaluator.metrics.lpips import metric_id
 from evaluator.metrics.lpips_torch import LAYERS, LpipsNet, LpipsWeightsError, read_heads
 
 
@@ -52,57 +51,6 @@ def test_distances_are_those_of_the_lpips_package(
         found = values[metric_id(case["net"], case["input"])]
         # Both compute in float32; the order of sums is the libraries'.
         assert found == pytest.approx(case["value"], rel=2e-5), case
-
-
-def plain_alexnet_distance(
-    state: dict[str, np.ndarray], heads: list[np.ndarray], pair: np.ndarray
-) -> float:
-    """LPIPS with AlexNet by hand, in float64: windows cut out and multiplied."""
-
-    def convolve(x: np.ndarray, index: int, stride: int, padding: int) -> np.ndarray:
-        weight = state[f"features.{index}.weight"].astype(np.float64)
-        bias = state[f"features.{index}.bias"].astype(np.float64)
-        x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-        size = weight.shape[2]
-        windows = np.lib.stride_tricks.sliding_window_view(x, (size, size), axis=(1, 2))
-        windows = windows[:, ::stride, ::stride]
-        return np.maximum(np.einsum("cijhw,ochw->oij", windows, weight) + bias[:, None, None], 0)
-
-    def pool(x: np.ndarray) -> np.ndarray:
-        windows = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))
-        return windows[:, ::2, ::2].max(axis=(-1, -2))
-
-    taps = []
-    for image in pair:
-        x = np.moveaxis(image, -1, 0) + np.array([0.030, 0.088, 0.188])[:, None, None]
-        x = x / np.array([0.458, 0.448, 0.450])[:, None, None]
-        found = [convolve(x, 0, 4, 2)]
-        found.append(convolve(pool(found[-1]), 3, 1, 2))
-        found.append(convolve(pool(found[-1]), 6, 1, 1))
-        found.append(convolve(found[-1], 8, 1, 1))
-        found.append(convolve(found[-1], 10, 1, 1))
-        taps.append([f / (np.sqrt((f**2).sum(0)) + 1e-10) for f in found])
-    return sum(
-        float((((a - b) ** 2) * head).sum(0).mean())
-        for a, b, head in zip(*taps, heads, strict=True)
-    )
-
-
-@pytest.mark.slow
-def test_distances_are_those_of_the_definition_by_hand(
-    golden: ModuleType, backbones: dict[str, Path]
-) -> None:
-    net = LpipsNet.open("alex", backbones["alex"])
-    heads = [head.numpy().astype(np.float64) for head in read_heads("alex")[0]]
-    pair = np.stack(golden.images(1))
-    values = net.distances(*pair).values
-    state = golden.backbone("alex")
-    assert values["lpips_alex_01"] == pytest.approx(
-        plain_alexnet_distance(state, heads, pair), rel=1e-4
-    )
-    assert values["lpips_alex_pm1"] == pytest.approx(
-        plain_alexnet_distance(state, heads, 2 * pair - 1), rel=1e-4
-    )
 
 
 def test_both_ranges_of_input_are_two_numbers_and_no_difference_is_zero(
@@ -233,45 +181,3 @@ def test_heads_come_out_of_an_lpips_wheel_without_importing_it(
     assert [tuple(head.shape) for head in heads] == [(c, 1, 1) for c in taps]
     assert origin.startswith("lpips of unknown version")
     assert "lpips" not in sys.modules
-
-
-def test_the_layers_are_those_of_torchvision() -> None:
-    assert [layer.index for layer in LAYERS["vgg"]] == [
-        0,
-        2,
-        5,
-        7,
-        10,
-        12,
-        14,
-        17,
-        19,
-        21,
-        24,
-        26,
-        28,
-    ]
-    assert [layer.channels_out for layer in LAYERS["vgg"] if layer.tap] == [64, 128, 256, 512, 512]
-    assert len(LPIPS_METRICS) == 4
-
-
-@pytest.mark.slow
-def test_images_are_scored_without_torch(tmp_path: Path) -> None:
-    """Only LPIPS loads torch: an evaluation of renders in its own process never does."""
-    from PIL import Image
-
-    rng = np.random.default_rng(0)
-    for name in ("recorded", "ours"):
-        (tmp_path / name).mkdir()
-        for index in range(2):
-            pixels = rng.integers(0, 255, (40, 48, 3)).astype(np.uint8)
-            Image.fromarray(pixels).save(tmp_path / name / f"{index}.png")
-    code = (
-        "import sys; from pathlib import Path; from evaluator.cli import evaluate; "
-        "from evaluator.metrics.image_protocol import ImageOptions; "
-        f"root = Path({str(tmp_path)!r}); "
-        "images = ImageOptions(reference=root / 'recorded', renders=(f'ours={root}/ours',)); "
-        "evaluate(images=images, out=root / 'out'); "
-        "print([n for n in ('torch', 'torchvision', 'lpips', 'torchmetrics') if n in sys.modules])"
-    )
-    assert printed(code).endswith("[]")

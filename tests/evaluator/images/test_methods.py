@@ -162,13 +162,6 @@ def test_an_opaque_alpha_channel_and_jpeg_are_read(folders: Path) -> None:
     assert "stored as jpg, png" in psnr.definition
 
 
-def test_a_broken_recorded_image_costs_its_view_only(folders: Path) -> None:
-    save(picture(1)[..., 0], folders / "recorded" / "0001.png")
-    comparison = compared(folders)
-    assert "recorded image: 0001.png is grey" in reasons(comparison)["0001"]
-    assert comparison.results().get("image.good.psnr_db").n == 2
-
-
 def test_images_the_reference_does_not_have_are_named(folders: Path) -> None:
     save(picture(7), folders / "poor" / "train" / "0007.png")
     assert "the reference has no such image" in reasons(compared(folders))["poor: train/0007"]
@@ -181,13 +174,6 @@ def test_a_method_with_all_channels_swapped_is_left_out_whole(folders: Path) -> 
     assert "the whole method" in reasons(comparison)["poor"]
     assert comparison.results().get("image.good.psnr_db").n == 3
     assert not any(m.id.startswith("image.poor") for m in comparison.measurements)
-
-
-def test_identical_images_are_counted_and_not_averaged_as_infinite(folders: Path) -> None:
-    save(picture(1), folders / "good" / "0001.png")
-    psnr = compared(folders).results().get("image.good.psnr_db")
-    assert psnr.n == 2
-    assert "not in the mean: 1 of 3 images (the images are identical)" in psnr.definition
 
 
 def test_nothing_in_common_is_an_error_that_shows_both_namings(folders: Path) -> None:

@@ -78,50 +78,6 @@ def test_the_report_asks_for_nothing_complains_of_nothing_and_can_be_read(
     assert browser.complaints == []
 
 
-def test_light_and_dark_are_two_looks_of_the_same_page(browser: Any, report: Path) -> None:
-    looks = []
-    for dark in (False, True):
-        browser.show(report.as_uri(), width=1280, dark=dark)
-        colours = "[document.body, document.querySelector('figure svg text')].map((e) => "
-        colours += "getComputedStyle(e)).map((s) => s.backgroundColor + s.fill)"
-        looks.append(browser.ask(colours))
-    assert looks[0][0] != looks[1][0]
-    assert looks[0][1] != looks[1][1]
-
-
-def test_the_keyboard_reaches_what_there_is_to_do(browser: Any, report: Path) -> None:
-    browser.show(report.as_uri(), width=1280, dark=False)
-    reached = []
-    for _ in range(400):
-        browser.press("Tab")
-        name = browser.ask(
-            "document.activeElement.tagName + '.' + document.activeElement.className"
-        )
-        if name == "BODY.":
-            break
-        reached.append(name)
-    assert reached[0] == "A.skip"
-    shown = "[...document.querySelectorAll('a,summary')].filter((e) => e.checkVisibility()).length"
-    wanted = browser.ask(shown)
-    assert sum(name.startswith(("A.", "SUMMARY.")) for name in reached) == wanted
-    browser.ask("document.querySelector('summary').focus()")
-    browser.press("Enter")
-    assert browser.ask("document.querySelector('details').open")
-
-
-def test_a_printed_report_is_dark_on_white_without_its_contents(browser: Any, report: Path) -> None:
-    browser.show(report.as_uri(), width=1280, dark=True, media="print")
-    style = "getComputedStyle(document.querySelector('{}')).{}"
-    assert browser.ask(style.format("body", "backgroundColor")) == "rgb(255, 255, 255)"
-    assert browser.ask(style.format("nav", "display")) == "none"
-    assert browser.ask(style.format("figure svg text", "fill")) != "rgb(232, 235, 241)"
-    heights = "[...document.querySelectorAll('details.part:not([open]) > :not(summary)')].map("
-    heights += "(e) => e.getBoundingClientRect().height)"
-    folded = browser.ask(heights)
-    assert len(folded) > 5
-    assert sum(height > 0 for height in folded) > len(folded) / 2  # print unfolds every part
-
-
 def test_a_page_that_wants_to_load_something_is_noticed(browser: Any, report: Path) -> None:
     spoiled = report.with_name("spoiled.html")
     text = report.read_text().replace("<main", '<img src="other.png" alt=""><h4>x</h4><main', 1)

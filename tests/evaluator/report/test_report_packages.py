@@ -1,6 +1,5 @@
 """Parquet says what CSV and JSON say, with types; without a package the report is still written."""
 
-import importlib
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -11,12 +10,10 @@ import pytest
 from own_process import printed
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import MissingDependencyError
 from bridge.exchange.trials_csv import TrialRecord, read_trials
+from evaluator.columns import OF_MEASUREMENTS, OF_TRIALS
 from evaluator.compare import compare_run
 from evaluator.report.parquet import (
-    MEASUREMENT_TYPES,
-    TRIAL_TYPES,
     write_measurements,
     write_trials,
 )
@@ -98,8 +95,8 @@ def test_groups_hold_the_numbers_of_the_success_table(written: Written) -> None:
 
 
 def test_every_field_has_a_column() -> None:
-    assert list(TRIAL_TYPES) == [field.name for field in fields(TrialRecord)]
-    assert len(MEASUREMENT_TYPES) == 14
+    assert list(OF_TRIALS) == [field.name for field in fields(TrialRecord)]
+    assert len(OF_MEASUREMENTS) == 14
 
 
 def take_away(monkeypatch: pytest.MonkeyPatch, package: str, user: str) -> None:
@@ -136,12 +133,6 @@ def test_without_pyarrow_the_report_is_written_and_says_so(
     assert not list(six_trials.run.results_dir.glob("*.parquet"))
 
 
-def test_without_jinja2_it_is_said_which_extra_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    take_away(monkeypatch, "jinja2", "evaluator.report.page")
-    with pytest.raises(MissingDependencyError, match=r"jinja2.*robot-gst\[report\]"):
-        importlib.import_module("evaluator.report.page")
-
-
 class Missing:
     """An import finder that claims one package is not installed."""
 
@@ -153,14 +144,6 @@ class Missing:
         if name.split(".")[0] == self._package:
             message = f"No module named {name!r}"
             raise ModuleNotFoundError(message, name=name)
-
-
-def test_nothing_heavy_is_loaded_before_something_is_written() -> None:
-    code = (
-        "import sys, evaluator.report.write, evaluator.compare; "
-        "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'torch') if n in sys.modules])"
-    )
-    assert printed(code) == "[]"
 
 
 def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_path: Path) -> None:
@@ -179,5 +162,5 @@ def test_parquet_is_written_without_pandas_and_numbers_keep_their_last_bit(tmp_p
 
 def test_no_measurement_is_a_table_without_rows(tmp_path: Path) -> None:
     frame = pd.read_parquet(write_measurements(tmp_path / "m.parquet", []))
-    assert list(frame.columns) == list(MEASUREMENT_TYPES)
+    assert list(frame.columns) == list(OF_MEASUREMENTS)
     assert len(frame) == 0
