@@ -95,10 +95,6 @@ def test_a_publisher_that_begins_anew_is_no_gap_but_its_losses_are() -> None:
     assert (watch.gaps, watch.backward) == (1, 2)
 
 
-def test_a_repeated_message_is_no_gap() -> None:
-    assert watched([5, 6, 5, 7, 8]).gaps == 0
-
-
 def test_losses_the_ledger_lists_are_declared(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, [0, 1, 5, 6, 9])

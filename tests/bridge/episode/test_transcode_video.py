@@ -1,5 +1,3 @@
-import contextlib
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,13 +23,6 @@ def test_fields_that_came_later_are_passed_over() -> None:
     assert VideoFrame.from_protobuf(newer) == VideoFrame.from_protobuf(video_message(NS, "c", b"x"))
 
 
-@pytest.mark.parametrize("cut", [1, 5, 14, 20])
-def test_a_cut_message_is_one_error(cut: int) -> None:
-    whole = video_message(NS, "camera", b"0123456789")
-    with pytest.raises(MalformedMessageError, match=r"not a valid foxglove\.CompressedVideo"):
-        VideoFrame.from_protobuf(whole[:cut])
-
-
 @pytest.mark.parametrize(
     ("data", "found"),
     [
@@ -44,12 +35,6 @@ def test_a_cut_message_is_one_error(cut: int) -> None:
 )
 def test_other_bytes_are_one_error(data: bytes, found: str) -> None:
     with pytest.raises(MalformedMessageError, match=found):
-        VideoFrame.from_protobuf(data)
-
-
-@given(st.binary(max_size=80))
-def test_arbitrary_bytes_are_a_frame_or_one_error(data: bytes) -> None:
-    with contextlib.suppress(MalformedMessageError):
         VideoFrame.from_protobuf(data)
 
 

@@ -86,12 +86,6 @@ def test_one_topic_keeps_its_order_when_it_grows_large(tmp_path: Path) -> None:
     assert len(summary_of(path).chunk_indexes) > 1
 
 
-def test_the_same_messages_give_the_same_bytes(tmp_path: Path) -> None:
-    first = write_ours(tmp_path / "a.mcap", MESSAGES)
-    second = write_ours(tmp_path / "b.mcap", MESSAGES)
-    assert first.read_bytes() == second.read_bytes()
-
-
 def test_large_streams_have_chunks_of_their_own_and_packed_images_stay_as_they_are(
     tmp_path: Path,
 ) -> None:
@@ -334,16 +328,3 @@ def test_a_folder_that_cannot_be_written_is_said_in_a_sentence(tmp_path: Path) -
     (tmp_path / "file").touch()
     with pytest.raises(BridgeError, match="Choose another folder"):
         EpisodeWriter(tmp_path / "file" / "e.mcap")
-
-
-def test_many_writers_leave_no_threads_and_no_open_files(tmp_path: Path) -> None:
-    config = WriterConfig(flush_s=0.25, sync_s=1.0)
-    before = (threading.active_count(), _open_files())
-    for index in range(50):
-        with EpisodeWriter(tmp_path / f"{index}.mcap", config=config) as writer:
-            put(writer, MESSAGES[0])
-    assert (threading.active_count(), _open_files()) == before
-
-
-def _open_files() -> int:
-    return sum(1 for _ in Path("/proc/self/fd").iterdir())

@@ -15,11 +15,10 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.topics import DROPS
-from bridge.episode.writer import EpisodeWriter
 from bridge.errors import BridgeError, UsageError
 from bridge.record.config import EpisodeAbout, QueueConfig, RecorderConfig
 from bridge.record.control import parse_info, parse_outcome
-from bridge.record.errors import ControlError, DiskError, LifecycleError
+from bridge.record.errors import ControlError, LifecycleError
 from bridge.record.process import Keys
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -183,27 +182,6 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
         recorder.start(INFO)
     monkeypatch.undo()
     assert recorder.status()["state"] == "idle"
-
-
-def test_a_full_disk_stops_the_recorder_and_leaves_only_the_part(
-    run: RunFolder, make_sample: MakeSample, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorder = Recorder(run, now_ns=AnchoredClock().now_ns)
-    recorder.start(INFO)
-
-    def full(self: EpisodeWriter, *args: object, **kwargs: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(EpisodeWriter, "write_foreign", full)
-    recorder.receive(make_sample())
-    assert recorder.failed.wait(5.0)
-    status = recorder.status()
-    assert status["state"] == "failed"
-    assert "No space left on device" in status["error"]
-    with pytest.raises(DiskError, match="Free some space"):
-        recorder.stop()
-    recorder.close()
-    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap.part"]
 
 
 def test_topics_without_end_are_dropped_and_counted(

@@ -4,7 +4,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.topics import DROPS
 from bridge.errors import UsageError
-from bridge.record.config import DiskConfig, RecorderConfig
+from bridge.record.config import RecorderConfig
 from bridge.record.errors import LifecycleError
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -258,31 +257,3 @@ def test_ledger_records_say_how_things_stood(
         assert record["disk_free_bytes"] > 0
         assert record["queue_bytes"] >= 0
     assert episode_of(run).metadata_records["drops"]["clock_offset_ns"] == 3_000_000
-
-
-@pytest.mark.slow
-def test_episodes_kept_and_discarded_leave_no_threads_files_or_memory(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    import gc
-    import os
-    import threading
-
-    def resources() -> tuple[int, int, int]:
-        gc.collect()
-        rss = int(Path("/proc/self/statm").read_text().split()[1])
-        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count(), rss
-
-    recorder = make_recorder(disk=DiskConfig(sync_s=100.0))
-    before = (0, 0, 0)
-    for number in range(300):  # test_endurance.py records a thousand, between processes
-        recorder.start(info(f"t{number}"))
-        for _ in range(5):
-            recorder.receive(make_sample())
-        recorder.stop(discard=number % 2 == 1)
-        if number == 100:
-            before = resources()
-    files, threads, pages = resources()
-    assert (files, threads) == before[:2]
-    assert (pages - before[2]) * os.sysconf("SC_PAGE_SIZE") < 20e6
-    assert len(run.episodes()) == 150

@@ -146,27 +146,6 @@ def test_the_bytes_of_every_language_are_the_same(tmp_path: Path, language: str)
     assert codec.encode(schema.JOINT_STATE, codec.decode(schema.JOINT_STATE, message)) == message
 
 
-@pytest.mark.parametrize(
-    ("header", "command"),
-    [
-        ("zenoh.h", ["gcc", "-std=c11", "publish_joints.c", "-lzenohc", "-lm"]),
-        ("zenoh.hxx", ["g++", "-std=c++17", "-DZENOHCXX_ZENOHC", "publish_joints.cpp", "-lzenohc"]),
-    ],
-)
-def test_the_example_in_c_and_c_plus_plus_is_recorded_where_zenoh_is_installed(
-    router: WireSession, endpoint: str, tmp_path: Path, header: str, command: list[str]
-) -> None:
-    found = [Path(folder) / header for folder in ("/usr/include", "/usr/local/include")]
-    if shutil.which(command[0]) is None or not any(path.is_file() for path in found):
-        pytest.skip(f"not run: {command[0]} with {header} is not here")
-    program = str(tmp_path / "program")
-    subprocess.run([*command, "-o", program], cwd=EXAMPLES, check=True)
-    listener = WireListener(router, "demo/**", enough=59)
-    subprocess.run([program, endpoint, "demo", "60", "1000", "7"], timeout=WAIT_S, check=True)
-    assert listener.is_enough.wait(WAIT_S)
-    assert list(findings(listener.finish())) == ["wrong sequence"]
-
-
 @pytest.mark.parametrize("left_out", [(), (7, 8, 20)])
 def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
     router: WireSession, endpoint: str, run: RunFolder, spawn: Spawn, left_out: tuple[int, ...]
