@@ -486,9 +486,7 @@ class _Shared(Generic[Item, Result]):
         self.found: dict[int, Result] = {}
         self.asked: dict[Worker, deque[range]] = {}
         self._next = 0
-        """The first item that nobody has had."""
         self._again: deque[int] = deque()
-        """Items that another process did not do."""
         self._done, self._spent_s = 0, 0.0
 
     @property

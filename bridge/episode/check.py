@@ -62,7 +62,6 @@ class CheckReport:
     unknown_tails: list[str] = field(default_factory=list)
     """Topics that fell silent before the end, so that nobody knows what they sent after."""
     presences: dict[str, Presence] = field(default_factory=dict)
-    """When each topic was there."""
 
     @property
     def exit_code(self) -> int:

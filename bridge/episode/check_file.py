@@ -55,7 +55,6 @@ def summary_faults(
         seen: What the walk through the data found; the summary's schemas and channels are added to
             it.
         summary: What the file says of itself; None where it has no summary, which is no fault.
-        footer_at: Where the footer begins [bytes from the start of the file].
     """
     if summary is None:
         return
@@ -151,7 +150,6 @@ def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
 
 _INDEX_HEAD = struct.Struct("<HI")
 NEVER = 1 << 64
-"""After every log time there can be."""
 
 
 class Faults:

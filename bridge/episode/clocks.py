@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 from mcap import records
 
 from bridge.clock import NS_PER_S, ClockChoice, join_ns, split_ns
-from bridge.episode import protobuf, schema
+from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.topics import CLOCKS
 from bridge.errors import EpisodeError
@@ -104,7 +103,6 @@ class ClockLine:
     uncertainty_ns: float
     """The truth is at most this far from the line at each reading that was used."""
     readings: int
-    """Round trips measured."""
 
     def offset_at(self, at_ns: int) -> float:
         """Source minus recorder at a time of the recorder's clock [ns]."""
@@ -154,7 +152,6 @@ class SourceClock:
     """Beginning of its topics, such as ``lab`` or ``lab/cam/side``."""
     host: str
     topics: frozenset[str] = frozenset()
-    """What it publishes."""
     spans: list[list[Reading]] = field(default_factory=list)
     """Readings, a new list each time the clock was set."""
     jumps: list[Jump] = field(default_factory=list)
@@ -363,8 +360,6 @@ def _restamped_data(
             stamp = item["header"]["stamp"]
             stamp["sec"], stamp["nanosec"] = _moved(stamp["sec"], stamp["nanosec"], shift_ns)
         return codec.encode(type_name, message)
-    if type_name == schema.COMPRESSED_VIDEO:
-        return _restamped_video(data, shift_ns)
     if definition is None:
         return data
     if definition.encoding == "jsonschema":
@@ -386,17 +381,6 @@ def _restamped_json(data: bytes, shift_ns: int) -> bytes:
     if not isinstance(stamp_ns, int) or isinstance(stamp_ns, bool) or stamp_ns <= 0:
         return data
     return json.dumps({**record, "stamp_ns": max(0, stamp_ns + shift_ns)}).encode()
-
-
-def _restamped_video(data: bytes, shift_ns: int) -> bytes:
-    frame = VideoFrame.from_protobuf(data)
-    sec, nanosec = _moved(*split_ns(frame.stamp_ns), shift_ns)
-    stamp = protobuf.number_field(1, sec) + protobuf.number_field(2, nanosec)
-    parts = [protobuf.bytes_field(1, stamp)]
-    for number, value in protobuf.fields(memoryview(data)):
-        if number != 1 and not isinstance(value, int):
-            parts.append(protobuf.bytes_field(number, bytes(value)))
-    return b"".join(parts)
 
 
 def clocks_of(episode: Episode) -> list[SourceClock]:

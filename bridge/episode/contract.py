@@ -23,7 +23,6 @@ from bridge.whole_file import write_whole
 
 SCHEMA_VERSION = 1
 CONTRACT_FILE = "cell.toml"
-"""Of a run folder."""
 TEMPLATES = "cells/contracts"
 RECORD_NAME = "contract"
 """Of the metadata record that holds an episode's contract."""
@@ -65,7 +64,6 @@ class Contract:
 
     topics: Mapping[str, TopicRule]
     cell: str = ""
-    """Name of the cell, for people."""
 
     def to_record(self) -> dict[str, str]:
         """The ``contract`` metadata record; every value is JSON."""
@@ -189,7 +187,6 @@ class Presence:
     longest_ns: int = 0
     """The longest silence between two messages, pauses not counted."""
     longest_at_ns: int = 0
-    """When it began."""
 
     def see(self, stamp_ns: int, pauses: Spans) -> None:
         """Take the next message."""
@@ -245,7 +242,6 @@ class TopicReport:
     tail: str
     """``known``, or ``unknown``: it fell silent, and nobody knows what was sent after."""
     breaches: tuple[str, ...] = ()
-    """Where it broke its contract."""
 
 
 def judge(

@@ -29,7 +29,6 @@ from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 TEMPORARY, UNREADABLE = ".recovering", ".unreadable"
 SPARE_BYTES = 16 << 20
-"""Left free beside a copy."""
 
 
 class RecoveryError(BridgeError):

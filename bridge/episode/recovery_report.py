@@ -35,13 +35,11 @@ class RecoveryReport:
     """The finished episode; None when nothing could be read."""
     messages: int = 0
     topics: dict[str, int] = field(default_factory=dict)
-    """Messages by topic."""
     bytes_kept: int = 0
     bytes_lost: int = 0
     """Bytes of the file that hold no whole record; what never reached the disk is not known."""
     reason: str = ""
     finished: bool = False
-    """It was complete already."""
     attachments: int = 0
     metadata: int = 0
     last_log_time_ns: dict[str, int] = field(default_factory=dict)
@@ -55,7 +53,6 @@ class RecoveryTally:
     """Counts while a file is being read."""
 
     messages: dict[int, int] = field(default_factory=dict)
-    """By channel id."""
     last_ns: dict[int, int] = field(default_factory=dict)
     topics: dict[int, str] = field(default_factory=dict)
     attachments: int = 0
@@ -64,7 +61,6 @@ class RecoveryTally:
     bytes_lost: int = 0
     losses: list[str] = field(default_factory=list)
     has_data: bool = False
-    """Found a header or anything behind one."""
     reached_end: int | None = None
     """Where the writer ended the data, if it did."""
     earlier: dict[str, object] = field(default_factory=dict)

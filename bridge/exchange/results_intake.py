@@ -56,7 +56,6 @@ class Taken:
     path: Path
     kind: str
     summary: str
-    """What was understood, in one line."""
     trials: tuple[TrialRecord, ...] = ()
     rates: tuple[RateRecord, ...] = ()
 

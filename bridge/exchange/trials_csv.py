@@ -53,7 +53,6 @@ class TrialRecord:
     progress: float | None = None
     """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
     sim_progress: float | None = None
-    """The same in the twin."""
     tags: tuple[tuple[str, str], ...] = ()
     """What was varied, by axis: lighting, pose, distractor, start region."""
 

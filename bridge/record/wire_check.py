@@ -55,7 +55,6 @@ class TopicHeard:
     odd_attachments: set[int] = field(default_factory=set)
     states: dict[MessageState, int] = field(default_factory=dict)
     last_numbers: dict[bytes, int] = field(default_factory=dict)
-    """By publisher."""
     first_ns: int = 0
     last_ns: int = 0
     last_source_ns: int | None = None

@@ -39,7 +39,6 @@ GRIPPER_WIDTH = "gripper_width"
 RECORD_TAG = "robot_gst"
 """Element of a URDF that holds the record; readers of URDF pass over what they do not know."""
 NUM_JOINTS = (6, 7)
-"""Joints of an arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +62,6 @@ class Finger:
     offset_m: float = 0.0
     """Width at which the lever is parallel to the closing pads' face [m]."""
     zero_rad: float = 0.0
-    """Value there."""
     table: tuple[tuple[float, float], ...] = ()
     """Rows of width [m] and value [m or rad], widths rising."""
 
@@ -113,7 +111,6 @@ class Gripper:
     fingers: tuple[Finger, ...] = ()
     """Joints that are driven: two, or one that the others follow by ``mimic`` in the URDF."""
     max_width_m: float = 0.0
-    """Distance between the pads when open."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +157,6 @@ class Robot:
     mesh_folders: Mapping[str, str] = field(default_factory=dict)
     """Folders, relative to the robot file, of other packages that ``package://`` names."""
     folder: Path = Path()
-    """Where the robot file lies."""
 
     @property
     def finger_joints(self) -> tuple[str, ...]:

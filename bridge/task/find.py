@@ -39,9 +39,7 @@ class Attached:
     sha256: str = ""
     """Of the file it was recorded with; empty: it does not say."""
     data: bytes | None = None
-    """The attachment, where there is one."""
     origin: str = ""
-    """For messages: which episode."""
 
 
 NOTHING = Attached()

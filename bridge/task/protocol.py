@@ -19,7 +19,6 @@ Item = TypeVar("Item")
 
 SCHEMA_VERSION = 1
 FILE_NAME = "protocol.json"
-"""In the run folder."""
 SEEDS_PER_SESSION = 1000
 """Session 7 starts at start seed 7000; sessions never share a start."""
 STARTS_STREAM, ARMS_STREAM = 808, 606
@@ -124,7 +123,6 @@ class Protocol:
     """The one question the study is judged by; None where it was not designed."""
     secondary: tuple[Endpoint, ...] = ()
     interval: str = "wilson"
-    """Interval of rates."""
     alpha: float = 0.05
     """Chance of a false alarm, shared by all questions after Holm."""
     codes: Mapping[str, str] = field(default_factory=dict)

@@ -129,7 +129,6 @@ class Task:
     stages: tuple[dict[str, Any], ...]
     success: tuple[dict[str, Any], ...]
     cell: str = "standin"
-    """Cell file the task was made for."""
     derived: Mapping[str, Any] | None = None
     """Who made the file of which tasks' objects, by which version of its rules; None: a person."""
     grip_force_N: float | None = None
@@ -182,7 +181,6 @@ class TaskFile:
     """The text of a task file, and where it was found."""
 
     data: bytes
-    """TOML in UTF-8."""
     origin: str
     """A path, or which attachment of which episode."""
 

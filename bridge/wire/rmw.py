@@ -177,7 +177,6 @@ class RosEndpoint:
     kind: EntityKind
     domain: int
     session: str
-    """zenoh id of the process."""
     node: str
     """With its namespace, as ROS prints it: ``/arm/driver``."""
     topic: str = ""

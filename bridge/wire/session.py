@@ -234,7 +234,6 @@ class WireSession:
         self._alive: list[AliveToken] = []
         self._definitions: dict[tuple[str, str], schema.Schema] = {}
         self.topics: set[str] = set()
-        """What it has publishers for."""
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
@@ -291,7 +290,6 @@ class WireSession:
         Args:
             key_expression: zenoh keys, where ``*`` stands for one part and ``**`` for any number.
             callback: Gets each message, in order; must be quick.
-            max_bytes: Larger payloads are told of (``oversize_bytes``) and not copied.
         """
 
         def on_sample(sample: Any) -> None:
@@ -417,9 +415,6 @@ class WireSession:
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
         listened. Whoever has not answered in time is left out, and so is what comes after
         ``max_mb`` [MB], for nobody knows what a cache holds.
-
-        Args:
-            max_mb: Bound on all answers together [MB].
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB

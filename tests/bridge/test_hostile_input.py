@@ -137,15 +137,6 @@ def test_positions_that_do_not_match_their_names_are_found_by_the_check(tmp_path
     assert "1 positions of 2 joints" in check_episode(path).faults[0]
 
 
-def test_only_cameras_of_ours_are_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "e.mcap"
-    topics = ("/c/cam/side/color/image", "/standin/truth/cam/x/color/image", "/color/image")
-    with EpisodeWriter(path) as writer:
-        for topic in topics:
-            writer.write(topic, b"", type_name=schema.COMPRESSED_IMAGE, log_time_ns=1)
-    assert streams.camera_ids(Episode.open(path)) == ["side"]
-
-
 def transform(parent: str, child: str, stamp_ns: int = 0) -> FrameTransform:
     return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=np.eye(4))
 
@@ -171,23 +162,6 @@ def test_frames_that_hang_together_in_no_single_way_are_refused(
     with pytest.raises(AmbiguousFrameError, match=r"frame '[abc]'"):
         tree.T_root_frame(transforms[-1].child if len(transforms) == 2 else "c", 0)
     assert np.array_equal(tree.T_root_frame("fine", 0), np.eye(4))
-
-
-def test_two_encodings_of_one_type_keep_their_own_schemas(tmp_path: Path) -> None:
-    path = tmp_path / "e.mcap"
-    named = schema.Schema(
-        name=schema.JOINT_STATE, schema_encoding="", message_encoding="json", data=b""
-    )
-    with EpisodeWriter(path) as writer:
-        writer.write("/a", sample(1, (), []), type_name=schema.JOINT_STATE, log_time_ns=1)
-        writer.write_foreign("/b", b"{}", schema_record=named, log_time_ns=2)
-        writer.write_foreign("/a", b"{}", schema_record=named, log_time_ns=3)
-    summary = Episode.open(path).files[0].summary
-    found = {
-        (channel.topic, channel.message_encoding, summary.schemas[channel.schema_id].encoding)
-        for channel in summary.channels.values()
-    }
-    assert found == {("/a", "cdr", "ros2msg"), ("/b", "json", ""), ("/a", "json", "")}
 
 
 @pytest.mark.parametrize("text", [b"objects = 3\nschema_version = 1", b"\xff\xfe", b"[", b""])

@@ -128,7 +128,6 @@ def joint_messages(
     """Yield sensor_msgs/JointState messages with positions alone.
 
     Args:
-        stamps_ns: Source time of each message [ns since 1970].
         names: Joints, in the order of the columns of ``position``.
         position: One row for each message [rad; m for a gripper's width].
     """
@@ -143,7 +142,6 @@ def pose_messages(
     """Yield geometry_msgs/PoseStamped messages.
 
     Args:
-        stamps_ns: Source time of each message [ns since 1970].
         frame_id: The frame the poses are expressed in.
     """
     q, p = se3.split(Ts_frame_body)

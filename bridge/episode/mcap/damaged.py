@@ -177,11 +177,9 @@ class Contents:
     """The whole records found from the front of a chunk's data."""
 
     size: int = 0
-    """Bytes they fill."""
     index: dict[int, list[int]] = field(default_factory=dict)
     """By channel: log time and offset of each message, one after the other."""
     definitions: list[bytes] = field(default_factory=list)
-    """Schema and channel records."""
 
     @property
     def num_messages(self) -> int:

@@ -40,11 +40,7 @@ from bridge.errors import EpisodeError
 
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
-    """Read the whole data section once; every chunk is unpacked and its CRC checked.
-
-    Args:
-        data_end: Where its data section ends [bytes from the start of the file].
-    """
+    """Read the whole data section once; every chunk is unpacked and its CRC checked."""
     builder = _Builder()
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
@@ -99,7 +95,6 @@ class Seen:
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel."""
     start_ns: int | None = None
     end_ns: int = 0
     chunks: list[records.ChunkIndex] = field(default_factory=list)
@@ -351,7 +346,6 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
 
     Args:
         footer: The last record, with the summary's place and CRC (0: not checked).
-        footer_at: Where the footer begins [bytes from the start of the file].
     """
     if not footer.summary_start:
         return None

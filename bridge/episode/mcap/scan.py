@@ -59,7 +59,6 @@ class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
     raw: bytes
-    """The whole record."""
     head: ChunkHead
     contents: Contents
 

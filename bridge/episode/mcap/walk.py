@@ -69,7 +69,6 @@ class RecordSpan(NamedTuple):
     offset: int
     """Of its opcode, from the start of the file."""
     length: int
-    """Bytes after opcode and length."""
 
     @property
     def end(self) -> int:
@@ -81,7 +80,6 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Args:
-        start: Where the first record begins [bytes from the start of the stream].
         end: Where the last one must end.
     """
     at = start
@@ -347,7 +345,6 @@ class MessageHead(NamedTuple):
     at: int
     """Where the record begins: in a chunk's data, or in the file."""
     length: int
-    """Of the payload."""
     channel_id: int
     sequence: int
     publish_time_ns: int

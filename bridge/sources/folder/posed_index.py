@@ -35,7 +35,6 @@ PARAMETERS = {
 BENDING_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
 MOST_PX = 65_500
-"""Of a JPEG's side."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
 """Sparse points nearer or farther than these percentiles are taken for outliers."""
@@ -57,11 +56,9 @@ class PosedIndex:
 
     path: Path
     layout: str
-    """COLMAP or transforms.json."""
     name: str
     cameras: dict[str, Camera]
     images: tuple[PosedImage, ...]
-    """In the order of their names."""
     sparse_range: tuple[float, float] | None
     """Distances of COLMAP's points along the optical axes; None without points."""
     assumed: dict[str, str] = field(default_factory=dict)

@@ -40,7 +40,6 @@ def toy_mesh(name: str, size_m: tuple[float, float, float]) -> ToyMesh:
 
     Args:
         name: One of ``toys.DESIGNS``.
-        size_m: Outer extents [m].
     """
     design = DESIGNS.get(name)
     if design is None:

@@ -29,7 +29,6 @@ class Lattice:
 
     points_m: Float[np.ndarray, "num_points 3"]
     tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
-    """Positively oriented."""
 
     def volume_m3(self) -> float:
         """Sum over the tetrahedra."""

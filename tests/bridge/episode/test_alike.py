@@ -74,19 +74,6 @@ def test_joints_read_at_once_are_those_read_one_by_one(names: list[str], moving:
     np.testing.assert_array_equal(found[2], np.stack([sample.position for sample in samples]))
 
 
-def test_other_frames_and_other_joints_are_not_alike_but_read_all_the_same() -> None:
-    two_frames = [pose(1, 0.1, "one"), pose(2, 0.2, "two")]
-    assert poses_of(two_frames) is None
-    track = pose_track_of(two_frames)
-    assert track is not None
-    assert track.p_m[:, 0].tolist() == [0.1, 0.2]
-    swapped = [joints(1, [1.0, 2.0]), joints(2, [4.0, 3.0], ("bc", "a"))]
-    assert joints_of(swapped) is None
-    arm = joint_track_of(swapped)
-    assert arm is not None
-    assert arm.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
-
-
 def test_poses_are_ordered_and_of_equal_stamps_the_last_counts() -> None:
     track = pose_track_of([pose(30, 0.3), pose(10, 0.1), pose(30, 0.4), pose(20, 0.2)])
     assert track is not None

@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 from pathlib import Path
 
 import pytest
@@ -117,18 +116,6 @@ def test_only_what_changed_is_opened_again(run: RunFolder, monkeypatch: pytest.M
     (run.episodes_dir / "t1.mcap").unlink()
     assert [(entry.id, entry.task) for entry in list_episodes(run)] == [("t2", "new"), ("t3", "")]
     assert read == ["t2.mcap"]
-
-
-def test_a_file_that_may_still_change_in_this_tick_is_not_trusted(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write(run, "t1", task="one")
-    list_episodes(run)
-    size, now_ns = path.stat().st_size, time.time_ns()
-    write(run, "t1", task="two")
-    os.utime(path, ns=(now_ns, now_ns))
-    assert path.stat().st_size == size
-    assert list_episodes(run)[0].task == "two"
 
 
 def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:

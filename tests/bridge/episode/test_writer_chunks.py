@@ -35,15 +35,6 @@ def summary_of(path: Path) -> Summary:
     return summary
 
 
-class Clock:
-    """Seconds that pass when told to."""
-
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
 U64 = st.integers(0, 2**64 - 1)
 STORED = st.builds(
     Stored,
@@ -129,32 +120,6 @@ def test_one_topic_with_two_schemas_of_one_name_has_two_channels(tmp_path: Path)
     assert summary.statistics is not None
     assert summary.statistics.channel_message_counts == {1: 3, 2: 3}
     assert [item.sequence for item in read_all(path)] == [0, 0, 1, 1, 2, 2]
-
-
-def written(writer: EpisodeWriter) -> int:
-    writer.wait_for_disk()
-    return writer.part_path.stat().st_size
-
-
-def test_tick_writes_what_has_waited_long_enough(tmp_path: Path) -> None:
-    clock = Clock()
-    config = WriterConfig(flush_s=0.25)
-    writer = EpisodeWriter(tmp_path / "e.mcap", config=config, monotonic=clock)
-    empty = written(writer)
-    put(writer, MESSAGES[0])
-    writer.tick()
-    assert written(writer) == empty
-    clock.now_s = 0.2
-    put(writer, MESSAGES[1])
-    clock.now_s = 0.25
-    writer.tick()
-    joints_only = written(writer)
-    assert joints_only > empty
-    clock.now_s = 0.45
-    writer.tick()
-    assert written(writer) > joints_only
-    writer.close()
-    assert len(read_all(writer.path)) == 2
 
 
 def test_attachments_and_metadata_are_in_the_file_at_once(tmp_path: Path) -> None:

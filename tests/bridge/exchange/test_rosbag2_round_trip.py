@@ -228,14 +228,6 @@ def test_rosbags_reads_every_topic_of_an_export(tmp_path: Path) -> None:
     assert {m.log_time - m.publish_time for _, _, m in found} == {7}
 
 
-def test_an_export_imported_again_is_the_same(tmp_path: Path) -> None:
-    kept = write_episode(tmp_path / "t1.mcap")
-    export_bag(Episode.open(tmp_path / "t1.mcap"), tmp_path / "bag")
-    made = imported(tmp_path / "bag", tmp_path)
-    assert by_time(stored(made)) == by_time(kept)
-    assert Episode.open(made).attachment("robot.urdf") == b"<robot/>"
-
-
 def test_records_of_json_can_become_strings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -130,18 +130,6 @@ def test_without_a_preroll_there_is_no_snapshot(make_recorder: MakeRecorder) -> 
         make_recorder().snapshot(info())
 
 
-def test_a_refused_start_costs_no_preroll(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=30.0)
-    recorder.receive(make_sample())
-    (run.episodes_dir / "taken.mcap").write_bytes(b"")
-    with pytest.raises(UsageError, match="exists already"):
-        recorder.start(info("taken"))
-    recorder.start(info())
-    assert recorder.stop()["messages"] == 1
-
-
 def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
     make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
 ) -> None:
@@ -172,28 +160,6 @@ def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
     assert episode_of(run).metadata_records["recorder"]["paused"] == [span]
     report = check_episode(run.episodes_dir / "t1.mcap")
     assert (report.declared_losses, report.undeclared_losses, report.faults) == (1, 0, [])
-
-
-def test_stopping_a_paused_episode_finishes_it(make_recorder: MakeRecorder, run: RunFolder) -> None:
-    recorder = make_recorder()
-    recorder.start(info())
-    recorder.pause()
-    recorder.stop()
-    record = episode_of(run).metadata_records["recorder"]
-    assert [end_ns for _, end_ns in record["paused"]] == [record["end_ns"]]
-    recorder.start(info("t2"))
-    assert recorder.status()["state"] == "recording"
-
-
-def test_what_others_say_is_kept_in_the_episode(
-    make_recorder: MakeRecorder, run: RunFolder
-) -> None:
-    recorder = make_recorder()
-    recorder.also_tell("ros2_warnings", lambda: ["/map: another definition"])
-    recorder.start(info())
-    recorder.stop()
-    record = episode_of(run).metadata_records["recorder"]
-    assert record["ros2_warnings"] == recorder.status()["ros2_warnings"]
 
 
 def test_a_start_beside_later_parts_is_refused(make_recorder: MakeRecorder, run: RunFolder) -> None:

@@ -149,23 +149,6 @@ def test_a_signal_finishes_the_open_episode(
     assert recorded(cell.run_path / "episodes" / "t1.mcap") == sent(tmp_path / "account")
 
 
-def test_commands_control_a_recorder(cell: Cell) -> None:
-    cell.record()
-    cell.wait_until_ready()
-    assert cell.command("ctl", "start", "--id", "t1", "--task", "x").returncode == 0
-    assert "recording t1" in cell.command("ctl", "status").stdout
-    assert cell.command("ctl", "mark", "here").returncode == 0
-    stopped = cell.command("ctl", "stop", "--result", "failure", "--json")
-    assert json.loads(stopped.stdout)["episode"] == "t1"
-    refused = cell.command("ctl", "start", "--id", "../evil")
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert "not usable as a file name" in refused.stderr
-    unknown = cell.command("ctl", "status", "--recorder", "other")
-    assert unknown.returncode == 1
-    assert "nobody answered on rec/other/ctl/status" in unknown.stderr
-    assert [path.name for path in cell.run_path.parent.rglob("*.mcap*")] == ["t1.mcap"]
-
-
 def test_nobody_there_and_port_taken_are_one_sentence(cell: Cell) -> None:
     alone = cell.command("ctl", "status")
     assert alone.returncode == 1

@@ -189,14 +189,6 @@ def test_a_publisher_that_comes_later_is_not_recorded_twice(cell: Cell) -> None:
     assert sorted(numbers) == list(range(500))
 
 
-def test_without_a_listener_for_history_the_past_is_missed(cell: Cell) -> None:
-    """The reason for the test above: a plain subscription gets nothing of the past."""
-    cell.robot("33", "5", "latched").speak()
-    cell.session.subscribe("**", cell.receive)
-    time.sleep(0.5)
-    assert cell.got == []
-
-
 def test_another_definition_is_flagged_and_kept_apart(cell: Cell) -> None:
     graph = cell.listen()
     cell.recorder.start(EpisodeInfo(id="t1", kind="trial"))

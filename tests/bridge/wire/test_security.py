@@ -136,17 +136,6 @@ def test_without_a_certificate_of_ours_nobody_gets_in(
         join(name)
 
 
-def test_a_client_refuses_a_recorder_of_another_authority(
-    pki: Path, guarded: WireSession, tls: str, tmp_path: Path
-) -> None:
-    certify(tmp_path, "ca", None)
-    text = (pki / "cell.json5").read_text().replace(str(pki / "ca.pem"), str(tmp_path / "ca.pem"))
-    (tmp_path / "cell.json5").write_text(text)
-    config = WireConfig(connect=(tls,), config=tmp_path / "cell.json5", connect_timeout_s=REFUSED_S)
-    with pytest.raises(NoPeerError):
-        open_session(config)
-
-
 @pytest.mark.parametrize(
     ("name", "allowed"),
     [
@@ -187,25 +176,6 @@ def test_only_the_operator_controls_the_recorder(
         with pytest.raises(NoReplyError):
             RecorderClient(join(name), timeout_s=REFUSED_S).ask("stop")
     assert len(asked) == 1
-
-
-def test_the_gate_judges_for_the_cell_only(
-    guarded: WireSession, join: Callable[[str], WireSession]
-) -> None:
-    gate, cell = join("gate"), join("cell")
-    seen: list[WireSample] = []
-    gate.subscribe("lab/cam/**", seen.append)
-    gate.serve("lab/gate/verdict", lambda payload: b"verdict")
-    end_s = time.monotonic() + 5.0
-    while True:  # the declarations need a moment to reach the cell
-        with contextlib.suppress(NoReplyError):
-            assert cell.query("lab/gate/verdict", b"plan", timeout_s=REFUSED_S) == b"verdict"
-            break
-        assert time.monotonic() < end_s
-    send_all(cell, "/lab/cam/a/color/image")
-    assert arrived(seen, "/lab/cam/a/color/image")
-    with pytest.raises(NoReplyError):
-        join("camera").query("lab/gate/verdict", b"plan", timeout_s=REFUSED_S)
 
 
 def test_a_stranger_reads_nothing(guarded: WireSession, join: Callable[[str], WireSession]) -> None:

@@ -171,16 +171,13 @@ def _images(scan: _PosedScan, config: FrameConfig, output: Output) -> list[_Imag
         found_topic = streams.find_camera_topic(scan.episode, camera_id, "color/image")
         topics = [found_topic] if found_topic else []
         stamps = np.array(
-            [
-                stamp_of(decode(m.type_name, m.data))
-                for m in streams.image_messages(scan.episode, topics)
-            ]
+            [stamp_of(decode(m.type_name, m.data)) for m in scan.episode.messages(topics)]
         )
         posed = stamps[~unknown_mask(scan.tree, [info.frame_id], stamps)]
         chosen = spread(np.unique(posed), max(1, most // len(scan.infos))).tolist()
         held = set(chosen[config.first_holdout :: config.holdout_every])
         wanted = set(chosen)
-        for message in streams.image_messages(scan.episode, topics):
+        for message in scan.episode.messages(topics):
             color = color_from_message(message.type_name, message.data)
             if color.stamp_ns not in wanted:
                 continue
