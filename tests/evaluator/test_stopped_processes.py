@@ -2,7 +2,9 @@
 
 import os
 import signal
+from collections.abc import Callable
 from multiprocessing.connection import wait
+from typing import Any
 
 import pytest
 
@@ -30,14 +32,22 @@ def test_a_process_stopped_in_the_middle_of_an_answer_costs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with ProcessPool(1) as pool:
-        worker = pool._start()
-        shared = process_pool._Shared(bytes, [LARGE])
-        shared.ask(worker, 2)
-        assert wait([worker.outlet], 60)
-        os.kill(worker.pid, signal.SIGSTOP)
+        pool._start()
+        answers = pool.map(bytes, [LARGE], each_s=process_pool.WORTH_S)
+        monkeypatch.setattr(process_pool, "wait", stopping(pool))
         monkeypatch.setattr(process_pool, "PATIENCE_S", 0.1)
-        pool._exchange(shared)
-        shared.do_one()
-        assert len(shared.found[0]) == LARGE
+        (answer,) = answers
+        assert len(answer) == LARGE
         assert pool.workers == []
-    assert worker.process.returncode == -signal.SIGKILL
+
+
+def stopping(pool: ProcessPool) -> Callable[..., list[Any]]:
+    """Stop each process as soon as it has begun to answer."""
+
+    def wait_and_stop(outlets: Any, timeout_s: float | None = None) -> list[Any]:
+        found = wait(outlets, timeout_s)
+        for worker in pool.workers:
+            os.kill(worker.pid, signal.SIGSTOP)
+        return found
+
+    return wait_and_stop
