@@ -85,10 +85,8 @@ class SchemaVersionError(EpisodeError):
     """A record was written by a newer major version than this reader knows."""
 
     def __init__(self, *, path: Path, name: str, found: int, known: int) -> None:
-        """Remember both versions."""
+        """Remember its name."""
         self.name = name
-        self.found_version = found
-        self.known_version = known
         super().__init__(
             path=path,
             found=f"{name} has schema version {found}, this reader knows {known}",

@@ -346,8 +346,7 @@ class FileCheck:
 def _index_entries(body: bytes) -> tuple[int, UInt64[np.ndarray, "entries 2"]]:
     """Read a message index: its channel, and log time and offset of each message."""
     if len(body) < _INDEX_HEAD.size:
-        message = f"a message index of {len(body)} bytes"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message index of {len(body)} bytes")
     channel_id, length = _INDEX_HEAD.unpack_from(body)
     if length % 16 or length > len(body) - _INDEX_HEAD.size:
         message = f"a message index of {len(body)} bytes claims {length} bytes of entries"

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from mcap import records
 
 from bridge.clock import NS_PER_S, ClockChoice, join_ns, split_ns
@@ -121,25 +122,22 @@ def fit_line(readings: Sequence[Reading]) -> ClockLine:
     start_ns = min(reading.at_ns for reading in readings)
     end_ns = max(reading.at_ns for reading in readings)
     middle_ns = (start_ns + end_ns) // 2
-    weights = [1.0 / reading.error_ns**2 for reading in used]
-    total = sum(weights)
-    pairs = [(reading.at_ns - middle_ns, reading.offset_ns) for reading in used]
-    mean_t = sum(w * t for w, (t, _) in zip(weights, pairs, strict=True)) / total
-    mean_o = sum(w * o for w, (_, o) in zip(weights, pairs, strict=True)) / total
-    spread = sum(w * (t - mean_t) ** 2 for w, (t, _) in zip(weights, pairs, strict=True))
+    weights = 1.0 / np.array([reading.error_ns for reading in used], dtype=np.float64) ** 2
+    t = np.array([reading.at_ns - middle_ns for reading in used], dtype=np.float64)
+    o = np.array([reading.offset_ns for reading in used], dtype=np.float64)
+    mean_t, mean_o = np.average(t, weights=weights), np.average(o, weights=weights)
     drift = None
-    span_ns = max(t for t, _ in pairs) - min(t for t, _ in pairs)
-    if span_ns >= DRIFT_SPAN_S * NS_PER_S:
-        shared = zip(weights, pairs, strict=True)
-        drift = sum(w * (t - mean_t) * (o - mean_o) for w, (t, o) in shared) / spread
-    offset_ns = mean_o - (drift or 0.0) * mean_t
-    off_ns = [abs(offset_ns + (drift or 0.0) * t - o) for t, o in pairs]
+    if np.ptp(t) >= DRIFT_SPAN_S * NS_PER_S:
+        shared = np.sum(weights * (t - mean_t) * (o - mean_o))
+        drift = float(shared / np.sum(weights * (t - mean_t) ** 2))
+    offset_ns = float(mean_o - (drift or 0.0) * mean_t)
+    off_ns = np.abs(offset_ns + (drift or 0.0) * t - o)
     return ClockLine(
         start_ns=start_ns,
         end_ns=end_ns,
         offset_ns=offset_ns,
         drift=drift,
-        uncertainty_ns=max(d + r.error_ns for d, r in zip(off_ns, used, strict=True)),
+        uncertainty_ns=float(max(d + r.error_ns for d, r in zip(off_ns, used, strict=True))),
         readings=len(readings),
     )
 

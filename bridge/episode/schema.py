@@ -194,6 +194,5 @@ def json_schema_version(name: str) -> int:
     """Return the major version of one of our JSON schemas."""
     schema = schema_for(name)
     if schema is None or schema.schema_encoding != "jsonschema":
-        message = f"{name} has no JSON schema"
-        raise KeyError(message)
+        raise KeyError(f"{name} has no JSON schema")
     return int(json.loads(schema.data).get("version", 1))

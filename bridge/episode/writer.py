@@ -271,8 +271,7 @@ class EpisodeWriter:
         """
         known = schema.schema_for(type_name)
         if known is None:
-            message = f"no schema for {type_name!r}; use write_foreign for other types"
-            raise ValueError(message)
+            raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")
         self.write_foreign(
             topic,
             data,

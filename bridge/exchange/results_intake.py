@@ -111,8 +111,7 @@ def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
             names = ", ".join(dict.fromkeys(("outcome", *known)))
             likely = difflib.get_close_matches(name, ("outcome", *known), n=1)
             hint = f" Did you mean {likely[0]}?" if likely else ""
-            message = f"--map {name}=...: no such column.{hint} There are: {names}."
-            raise UsageError(message)
+            raise UsageError(f"--map {name}=...: no such column.{hint} There are: {names}.")
 
 
 def _unknown_table(table: TableText) -> str:
@@ -146,11 +145,10 @@ def _take_json(path: Path) -> Taken:
         trials = read_trials_json(path, items)
         understood = f"{path.name}: trials, {len(trials)} objects"
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
-    message = (
+    raise UsageError(
         f"{path} lists objects that are neither trials (task with recorded or sim_planned) nor "
         "rates (task, side, rate)."
     )
-    raise UsageError(message)
 
 
 def _listed(path: Path) -> list[dict[str, Any]] | None:

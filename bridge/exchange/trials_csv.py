@@ -276,8 +276,7 @@ def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialReco
     trials = read_trials(table)
     path = trials_path(run)
     if path.exists() and not force:
-        message = f"{path} exists already. Replace it with --force, or use another run."
-        raise UsageError(message)
+        raise UsageError(f"{path} exists already. Replace it with --force, or use another run.")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, trials_text(trials).encode())
     return trials

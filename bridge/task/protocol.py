@@ -243,8 +243,7 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
         write_whole(path, protocol.to_json())
         return
     if there.edited:
-        message = f"{path} was edited after it was written: put the written text back."
-        raise UsageError(message)
+        raise UsageError(f"{path} was edited after it was written: put the written text back.")
     compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
     hidden = ("sha256", "edited")
     names = [
@@ -253,11 +252,10 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
         if name not in hidden and getattr(there, name) != getattr(protocol, name)
     ]
     if names:
-        message = (
+        raise UsageError(
             f"{path} was written before the first trial and says something else "
             f"about: {', '.join(names)}. Give the same options again, or another folder."
         )
-        raise UsageError(message)
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:

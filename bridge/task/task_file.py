@@ -191,8 +191,7 @@ class TaskFile:
             with path.open("rb") as stream:
                 return TaskFile(stream.read(MAX_BYTES + 1), str(path))
         except OSError as error:
-            message = f"{path} cannot be read: {error.strerror}."
-            raise UsageError(message) from error
+            raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
 
     @property
     def sha256(self) -> str:
@@ -237,8 +236,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text())
     except (ValueError, OSError) as error:  # not TOML, not text, not readable
-        message = f"{path} cannot be read as TOML: {error}."
-        raise UsageError(message) from error
+        raise UsageError(f"{path} cannot be read as TOML: {error}.") from error
 
 
 def _task_from(table: dict[str, Any]) -> Task:

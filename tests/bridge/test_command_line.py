@@ -16,7 +16,6 @@ from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.whole_file import write_whole
 
 
 @pytest.fixture
@@ -164,11 +163,3 @@ def test_no_help_text_holds_what_the_terminal_would_swallow(target: str) -> None
         if dataclasses.is_dataclass(kind):
             texts.extend(help_sources(kind))
     assert [token for text in texts for token in re.findall(r"<[a-z_ ]+>", text)] == []
-
-
-def test_a_file_written_whole_has_its_bytes_and_leaves_no_part(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("before")
-    write_whole(path, b"after")
-    assert path.read_bytes() == b"after"
-    assert list(tmp_path.iterdir()) == [path]

@@ -54,8 +54,7 @@ class MessageTemplate:
     def _place(self, mark: bytes) -> int:
         at = self._bytes.find(mark)
         if at < 0 or self._bytes.find(mark, at + 1) >= 0:
-            message = f"{mark!r} is not once in the message"
-            raise ValueError(message)
+            raise ValueError(f"{mark!r} is not once in the message")
         return at
 
     def fill(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:

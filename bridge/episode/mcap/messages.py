@@ -62,8 +62,7 @@ def _refuse_strays(
     is_known = announced[channel_ids]
     if not is_known.all():
         channel_id = int(channel_ids[int(np.argmin(is_known))])
-        message = f"a message is of channel {channel_id}, which was never announced"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message is of channel {channel_id}, which was never announced")
 
 
 def message_table(data: bytes) -> MessageTable:
@@ -229,8 +228,7 @@ def read_chunk(
     offset = index.chunk_start_offset
     place = next(walk(stream, offset, data_end), None)
     if place is None or place.opcode != CHUNK:
-        message = f"the index points at byte {offset}, where no chunk lies"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the index points at byte {offset}, where no chunk lies")
     chunk = parse_chunk(read_body(stream, place))
     data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
     return data, message_table(data)

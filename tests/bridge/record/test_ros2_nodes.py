@@ -139,7 +139,7 @@ def test_a_topic_is_recorded_so_that_others_can_decode_it(cell: Cell, form: str)
             "topic": "/chatter",
             "type": STRING,
             "type_hash": get_typestore(Stores.ROS2_JAZZY).hash_rihs01(STRING),
-            "qos": {"reliable": True, "transient_local": False, "depth": 20, "keep_all": False},
+            "qos": {"transient_local": False, "depth": 20},
         }
     ]
     assert graph.warnings() == []

@@ -175,11 +175,6 @@ def test_a_goal_that_holds_at_the_start_is_noticed_whatever_its_kind() -> None:
     assert [is_goal(spec) for spec in (ON, still, target)] == [True, False, True]
 
 
-def test_what_an_object_belongs_to_is_read_from_the_predicates() -> None:
-    assert TASK.goal_of("cube") == ("on", "block")
-    assert TASK.goal_of("block") is None
-
-
 def test_every_kind_has_words() -> None:
     assert "rests on block: its underside within 8 mm" in describe_predicate(ON)
     text = describe_predicate({**MOVED, "at_least_m": 0.1, "direction": [1, 0, 0]})

@@ -16,10 +16,8 @@ from bridge.task.check import task_problems
 from bridge.task.predicate import (
     PredicateResult,
     Rollout,
-    already_true_at_start,
     bodies_of,
     evaluate_success,
-    is_goal,
 )
 from bridge.task.relations import SIDES, WAYS, Box, footprint_gap_m
 from bridge.task.summary import describe_predicate
@@ -229,20 +227,6 @@ def test_what_is_not_localised_or_not_a_number_stays_open(spec: dict[str, Any]) 
         assert answer.value is None
         assert name in answer.detail
         assert found(spec, **{**Ts, name: np.full((4, 4), np.nan)}).value is None
-
-
-def test_every_relation_is_a_goal_and_may_hold_at_the_start() -> None:
-    specs = (BESIDE, OUTSIDE, BETWEEN, UPRIGHT, ALIGNED, ON_TABLE)
-    assert all(is_goal(spec) for spec in specs)
-    assert is_goal({"kind": "moved", "object": "cube", "by_m": 0.1, "direction": "left"})
-    assert not is_goal({"kind": "moved", "object": "cube", "at_most_m": 0.1})
-    task = replace(TASK, success=(ON_TABLE, OUTSIDE))
-    for x, held in ((0.8, True), (0.5, False)):
-        Ts = {"cube": pose(x, 0.0, 0.02)[None], "box": pose(0.5, 0.0, 0.0)[None]}
-        rollout = Rollout(
-            stamps_ns=np.zeros(1, dtype=np.int64), Ts_base_object=Ts, finger_contact={}
-        )
-        assert already_true_at_start(task, rollout) is held
 
 
 def test_an_object_belongs_where_the_first_predicate_says() -> None:
