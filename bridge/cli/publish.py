@@ -42,13 +42,11 @@ def publish_folder(
 
     Args:
         folder: Folder of one of the three layouts (docs/rgbd_folder.md).
-        config: Names and rate.
         fast: Send as fast as the recorder takes it; stamps keep their distance.
         episode: Ask the recorder to record this episode from the first to the last frame.
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer
@@ -125,13 +123,11 @@ def publish_episode(
 
     Args:
         file: A finished episode, or any other MCAP file.
-        config: What, how fast, and under which names.
         duration_s: Stop after this long [s].
         episode: Ask the recorder to record this episode from the first to the last message.
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from dataclasses import asdict
 
@@ -180,10 +176,8 @@ def publish_standin(
     Soft toys: robot-gst publish standin --task sloth_into_basket --conditions without_replanning
 
     Args:
-        config: What the session does.
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.source import run_source
     from bridge.sources.standin.session import StandinSource, describe
@@ -214,12 +208,10 @@ def publish_realsense(
     Example: robot-gst publish realsense --cell lab --camera side=123622270224
 
     Args:
-        config: Which cameras, and how.
         list: Say what is attached and end.
         duration_s: Stop after this long [s].
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.realsense.device import describe_device
     from bridge.sources.realsense.publish import RealSenseSource, attached_devices
@@ -262,11 +254,9 @@ def publish_ur(
 
     Args:
         host: Name or address of the controller.
-        config: What is read, and how.
         duration_s: Stop after this long [s].
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.source import run_source
     from bridge.sources.ur.publish import UrSource, describe_counts
