@@ -25,6 +25,5 @@ def dataset_file(folder: str, name: str, suffix: str = ".toml") -> Path:
     path = datasets_folder() / folder / f"{name}{suffix}"
     if not path.is_file() or path.parent != datasets_folder() / folder:
         names = sorted(item.stem for item in (datasets_folder() / folder).glob(f"*{suffix}"))
-        message = f"no {folder[:-1]} named {name!r}. There are: {', '.join(names)}."
-        raise UsageError(message)
+        raise UsageError(f"no {folder[:-1]} named {name!r}. There are: {', '.join(names)}.")
     return path

@@ -44,7 +44,7 @@ EXTRAS = {
     "standin": Extra(
         "the stand-in cell of the demo", ("mujoco", "open3d", "pin", "example-robot-data", "scipy")
     ),
-    "video": Extra("video streams, LeRobot videos", ("av",), is_optional=True),
+    "video": Extra("LeRobot videos", ("av",), is_optional=True),
     "realsense": Extra("RealSense cameras", ("pyrealsense2",), is_optional=True),
     "ur": Extra("the UR arm's model", ("example-robot-data",), is_optional=True),
     "mujoco": Extra("replay --engine mujoco or both", ("mujoco",), is_optional=True),
@@ -75,7 +75,6 @@ class InstallCheck:
     ok: bool
     advice: str = ""
     purpose: str = ""
-    """What the package's extra is for."""
 
 
 def examine() -> list[InstallCheck]:

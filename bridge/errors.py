@@ -85,7 +85,7 @@ class SchemaVersionError(EpisodeError):
     """A record was written by a newer major version than this reader knows."""
 
     def __init__(self, *, path: Path, name: str, found: int, known: int) -> None:
-        """Remember both versions."""
+        """Remember its name."""
         self.name = name
         super().__init__(
             path=path,

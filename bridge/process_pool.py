@@ -1,11 +1,10 @@
 """Processes that may die or hang: each message has a deadline, and a death costs one item.
 
-``Worker`` is one process, ``ProcessPool`` several. A pool does work in two ways: ``run`` leaves it
-all to the processes (simulation, which may take its process down), ``map`` shares it with them
-(reading and comparing, which this process can do as well). Neither pool of the standard library
-will do: ``concurrent.futures`` breaks as a whole when one process is killed, and with Python 3.11
-waits for ever when that happens while another one is being started; ``multiprocessing.Pool`` waits
-for what a dead process had.
+``Worker`` is one process, ``ProcessPool`` several. ``run`` tells of what no process could do
+(simulation, which may take its process down); ``map`` does it here (reading and comparing). Neither
+pool of the standard library will do: ``concurrent.futures`` breaks as a whole when one process is
+killed, and with Python 3.11 waits for ever when that happens while another one is being started;
+``multiprocessing.Pool`` waits for what a dead process had.
 
 A process is a new interpreter, for threads and simulators' memory must not be forked, and the
 program's own main module stays unloaded there. It talks over its own standard streams alone, so it
@@ -26,11 +25,12 @@ import time
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import wait
-from typing import Any, BinaryIO, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, BinaryIO, Protocol, TypeVar, runtime_checkable
 
 from bridge.errors import BridgeError, GstError
 
@@ -257,14 +257,10 @@ def _listen(inbox: BinaryIO, arrived: "queue.SimpleQueue[bytes]") -> None:
 ATTEMPTS = 2
 """What died twice is not tried again."""
 WORTH_S = 3.0
-"""Work for which ``map`` starts one more process: it needs about one second until it can begin."""
+"""Work for which ``map`` starts processes: each needs about one second until it can begin."""
 CHUNK_S = 0.1
 """Work that ``map`` hands over at once: short, so that none waits long for another at the end."""
 MAX_CHUNK = 100
-AHEAD = 2
-"""Chunks handed over before the first is back, so that nobody waits for the next."""
-LOOK_S = 0.02
-"""A look at what the others have found takes a tenth as long as reading a file."""
 MOST = 8
 """Processes by default: each takes up to half a gigabyte; more are used when asked for."""
 
@@ -352,11 +348,18 @@ class ProcessPool:
         return True
 
     def run(
-        self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
+        self,
+        function: Function,
+        items: Sequence[Item],
+        cost: Callable[[Item], float],
+        patience_s: float | None = None,
     ) -> Iterator[tuple[Item, Answer | Failed]]:
         """See ``Runner``; an item whose process died is tried once more after all others.
 
         The longest go first, so that no process is left with a long one at the end (Graham 1969).
+
+        Args:
+            patience_s: Processes none of which answers for so long are ended [s]; None waits.
         """
         todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
         at_work: dict[Worker, tuple[Item, int]] = {}
@@ -365,7 +368,11 @@ class ProcessPool:
                 while todo and len(at_work) < self._size:
                     self._begin(function, todo, at_work)
                 outlets = {worker.outlet: worker for worker in at_work}
-                for outlet in wait(list(outlets)):
+                spoke = wait(list(outlets), patience_s)
+                if not spoke:
+                    for worker in at_work:
+                        worker.process.kill()
+                for outlet in spoke:
                     worker = outlets[outlet]
                     try:
                         if self._has_prepared(worker):
@@ -413,54 +420,25 @@ class ProcessPool:
     ) -> Iterator[Result]:
         """Yield what ``work`` returns for each item, in the order of the items.
 
-        This process works too, and does whatever another one did not do: it was killed, hung, ran
-        out of memory, or met an exception, which is then raised here, where it always was.
+        What no process did is done here: it was killed, hung, ran out of memory, or met an
+        exception, which is then raised here, where it always was.
         """
-        try:
-            while len(self.workers) < min(self._size, int(len(items) * each_s / WORTH_S)):
-                self._start()
-        except OSError:  # the system gives no further process
-            self._size = len(self.workers)
-        if not self.workers:
+        if not self._size or len(items) * each_s < WORTH_S:
             yield from map(work, items)
             return
-        shared = _Shared(work, items)
-        next_look_s = 0.0
-        try:
-            for number in range(len(items)):
-                while number not in shared.found:
-                    if not shared.is_more or time.monotonic() >= next_look_s:
-                        self._exchange(shared)
-                        next_look_s = time.monotonic() + LOOK_S
-                    shared.do_one()
-                yield shared.found.pop(number)
-        finally:
-            for worker, chunks in shared.asked.items():
-                if chunks:
-                    self._lose(worker)
-
-    def _exchange(self, shared: "_Shared[Any, Any]") -> None:
-        """Take what the others have found, and hand out more; wait only with nothing to do here."""
-        outlets = {worker.outlet: worker for worker in self.workers}
-        patience_s = 0.0 if shared.is_more else PATIENCE_S
-        spoke = wait(list(outlets), patience_s) if outlets else []
-        failed = list(outlets.values()) if patience_s and not spoke else []
-        for outlet in spoke:
-            worker = outlets[outlet]
-            try:
-                if not self._has_prepared(worker):
-                    shared.take(worker, worker.finish())
-            except (WorkerLostError, pickle.UnpicklingError, AttributeError, ImportError):
-                failed.append(worker)  # it ended, or came to load newer code than ours
-        for worker in self.workers:
-            try:
-                while worker not in self._preparing and shared.wants_more(worker):
-                    shared.ask(worker, 1 + len(self.workers))
-            except WorkerLostError:
-                failed.append(worker)
-        for worker in set(failed):
-            self._lose(worker)
-            shared.give_back(worker)
+        size = max(1, min(MAX_CHUNK, round(CHUNK_S / each_s)))
+        chunks = [items[at : at + size] for at in range(0, len(items), size)]
+        found: dict[int, Answer | Failed] = {}
+        at = 0
+        with suppress(NoProcessError):
+            numbered, job = list(enumerate(chunks)), partial(_do_chunk, work)
+            for (number, _), answer in self.run(job, numbered, _first, PATIENCE_S):
+                found[number] = answer
+                while at in found:
+                    yield from _results(work, chunks[at], found.pop(at))
+                    at += 1
+        for number in range(at, len(chunks)):
+            yield from _results(work, chunks[number], found.get(number))
 
     def __enter__(self) -> "ProcessPool":
         """Use as a context manager."""
@@ -474,67 +452,19 @@ class ProcessPool:
             self._lose(worker)
 
 
-class _Shared(Generic[Item, Result]):
-    """A list that several processes share: what is to be done, was handed out, and was found."""
-
-    def __init__(self, work: Callable[[Item], Result], items: Sequence[Item]) -> None:
-        self.work, self.items = work, items
-        self.found: dict[int, Result] = {}
-        self.asked: dict[Worker, deque[range]] = {}
-        self._next = 0
-        """The first item that nobody has had."""
-        self._again: deque[int] = deque()
-        """Items that another process did not do."""
-        self._done, self._spent_s = 0, 0.0
-
-    @property
-    def is_more(self) -> bool:
-        """Whether this process has something to do."""
-        return self._next < len(self.items) or bool(self._again)
-
-    def wants_more(self, worker: Worker) -> bool:
-        """Whether there is an item nobody has had, for a process that has few."""
-        return self._next < len(self.items) and len(self.asked.get(worker, ())) < AHEAD
-
-    def do_one(self) -> None:
-        """Do the next item here, if there is one."""
-        if not self.is_more:
-            return
-        number = self._again.popleft() if self._again else self._chunk_of(1)[0]
-        began_s = time.monotonic()
-        self.found[number] = self.work(self.items[number])
-        self._spent_s += time.monotonic() - began_s
-        self._done += 1
-
-    def ask(self, worker: Worker, processes: int) -> None:
-        """Hand over what will last for a moment, judging by what it took here."""
-        lasts = int(CHUNK_S * self._done / max(self._spent_s, 1e-6))
-        fair = (len(self.items) - self._next) // (AHEAD * processes)
-        chunk = self._chunk_of(max(1, min(lasts, fair, MAX_CHUNK)))
-        self.asked.setdefault(worker, deque()).append(chunk)
-        worker.begin(_do_chunk, (self.work, [self.items[number] for number in chunk]))
-
-    def _chunk_of(self, size: int) -> range:
-        self._next += size
-        return range(self._next - size, self._next)
-
-    def take(self, worker: Worker, answer: list[Result] | Failed) -> None:
-        """Note what another process found, or that it did not."""
-        chunk = self.asked[worker].popleft()
-        if isinstance(answer, Failed):  # this process will meet it too, and say so
-            self._again.extend(chunk)
-        else:
-            self.found.update(zip(chunk, answer, strict=True))
-
-    def give_back(self, worker: Worker) -> None:
-        """Do here what a lost process had."""
-        for chunk in self.asked.pop(worker, ()):
-            self._again.extend(chunk)
+def _first(chunk: tuple[int, Any]) -> float:
+    """Let chunks be begun in their order."""
+    return float(-chunk[0])
 
 
-def _do_chunk(work_and_items: tuple[Callable[[Any], Any], Sequence[Any]]) -> list[Any]:
-    work, items = work_and_items
-    return [work(item) for item in items]
+def _do_chunk(work: Callable[[Item], Result], chunk: tuple[int, Sequence[Item]]) -> list[Result]:
+    return [work(item) for item in chunk[1]]
+
+
+def _results(
+    work: Callable[[Item], Result], chunk: Sequence[Item], answer: Answer | Failed | None
+) -> Iterable[Result]:
+    return answer if isinstance(answer, list) else map(work, chunk)
 
 
 def lost(reason: str) -> Failed:

@@ -27,7 +27,6 @@ def dashboard(
     Args:
         runs: Run folders; the first one is shown first.
         config: Where to listen.
-        output: How to talk.
     """
     from bridge.errors import MissingDependencyError, UsageError
 
@@ -52,7 +51,6 @@ def share(run: Path, /, *, config: ShareConfig = SHARE, output: Output = OUTPUT)
     Args:
         run: Run folder; robot-gst evaluate comes before.
         config: Which trials, and how large the file may be.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import MissingDependencyError
@@ -88,7 +86,6 @@ def view(target: Path, /, *, out: Path | None = None, output: Output = OUTPUT) -
     Args:
         target: An episode file, a plan of a run's plans/, or a run folder for its newest trial.
         out: Only write this .rrd file; without it, one beside the run's derived episodes is opened.
-        output: How to talk.
     """
     from dashboards import rerun_viewer as viewer
 

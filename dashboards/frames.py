@@ -1,7 +1,6 @@
 """Camera frames of an episode: when they were taken, and their bytes as recorded."""
 
 import json
-import sys
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,15 +13,12 @@ from jaxtyping import UInt8
 from bridge.episode import schema
 from bridge.episode.cdr.messages import color_file_from_message
 from bridge.episode.reader import Episode, RawMessage
-from bridge.episode.streams import image_messages
 from bridge.episode.topics import RECORDED_TOPIC, RENDERED_TOPIC
 from bridge.media.color import decode_color
 from dashboards.errors import NotHereError
 
 RENDERED = "rendered:"
 """Before a camera's id: its images as the twin renders them."""
-FRAMES_BEFORE = (40, 400, sys.maxsize)
-"""How far back a video is read for one of its frames, in steps."""
 MEDIA_TYPES = ((b"\xff\xd8", "image/jpeg"), (b"\x89PNG\r\n\x1a\n", "image/png"))
 
 
@@ -59,7 +55,6 @@ def _tracks(path: Path, _mtime_ns: int, _size: int) -> dict[str, CameraTrack]:
         for topic in (
             *episode.topics_of_type(schema.COMPRESSED_IMAGE),
             *episode.topics_of_type(schema.IMAGE),
-            *episode.topics_of_type(schema.COMPRESSED_VIDEO),
         )
         if (name := _camera_of(topic)) is not None
     }
@@ -91,8 +86,7 @@ def _camera_of(topic: str) -> str | None:
 def read_frame(path: Path, camera_id: str, stamp_ns: int) -> tuple[bytes, str]:
     """Return the image nearest to an instant and its media type.
 
-    A compressed image is given byte for byte as recorded; a raw one, or a frame of a video, becomes
-    JPEG. Frames before the first whole picture of a video show that picture.
+    A compressed image is given byte for byte as recorded; a raw one becomes JPEG.
 
     Args:
         stamp_ns: Source time of the wanted instant [ns].
@@ -163,49 +157,25 @@ def read_span(
         yield track.stamps_ns[index], decode_color(color.data)
 
 
-def _is_video(episode: Episode, track: CameraTrack) -> bool:
-    summary = episode.topics().get(track.topic)
-    return summary is not None and summary.type_name == schema.COMPRESSED_VIDEO
-
-
 def _in_one_pass(
     path: Path, track: CameraTrack, first: int, last: int
 ) -> Iterator[tuple[int, RawMessage]]:
-    """Yield the frames from one place in a track to another, with their places.
-
-    A video is read from some frames before the first, which it may need to be decoded.
-    """
-    episode = Episode.open(path)
-    begin = max(0, first - FRAMES_BEFORE[0]) if _is_video(episode, track) else first
-    log_ns = track.log_times_ns[begin : last + 1]
+    """Yield the frames from one place in a track to another, with their places."""
+    log_ns = track.log_times_ns[first : last + 1]
     places = {track.stamps_ns[place]: place for place in range(first, last + 1)}
     span = {"start_ns": min(log_ns), "end_ns": max(log_ns) + 1}
-    for message in image_messages(episode, [track.topic], **span):
+    for message in Episode.open(path).messages([track.topic], **span):
         place = places.get(message.publish_time_ns)
         if place is not None:
             yield place, message
 
 
 def _find(episode: Episode, track: CameraTrack, index: int) -> RawMessage | None:
-    """The image of a track's frame. A video is read from further and further before it.
-
-    Its frames need those since the last whole picture, which most cameras send once a second.
-    """
-    wanted_ns = track.stamps_ns[index]
-    for before in FRAMES_BEFORE if _is_video(episode, track) else (0,):
-        first = max(0, index - before)
-        last = index if first else max(index, min(before, len(track.stamps_ns) - 1))
-        span = {
-            "start_ns": min(track.log_times_ns[first : index + 1]),
-            "end_ns": max(track.log_times_ns[index : last + 1]) + 1,
-        }
-        earliest: RawMessage | None = None
-        for message in image_messages(episode, [track.topic], **span):
-            if message.publish_time_ns == wanted_ns:
-                return message
-            earliest = earliest or message
-        if not first and earliest is not None and earliest.publish_time_ns > wanted_ns:
-            return earliest
+    """The image of a track's frame."""
+    log_ns = track.log_times_ns[index]
+    for message in episode.messages([track.topic], start_ns=log_ns, end_ns=log_ns + 1):
+        if message.publish_time_ns == track.stamps_ns[index]:
+            return message
     return None
 
 

@@ -160,7 +160,7 @@ def log_cameras(file: RerunFile, episode: Episode, prefix: str, start_ns: int) -
 
 def _send_color(file: RerunFile, episode: Episode, topic: str, entity: str) -> list[int]:
     stamps = []
-    for message in streams.image_messages(episode, [topic]):
+    for message in episode.messages([topic]):
         image = color_file_from_message(message.type_name, message.data)
         try:
             kind = media_type(image.data, episode.path)

@@ -169,7 +169,6 @@ def demo(run: Path, /, *, config: DemoConfig = DEMO, output: Output = OUTPUT) ->
     Args:
         run: Run folder; made where needed. The same command again goes on where it was stopped.
         config: How much to do.
-        output: How to talk.
     """
     from dashboards.demo import run_demo
 
@@ -186,7 +185,6 @@ def trials(run: Path, /, *, config: TrialsConfig = TRIALS, output: Output = OUTP
     Args:
         run: Run folder; made where needed. The same command again goes on where it was stopped.
         config: What the study does; written to protocol.json before the first trial.
-        output: How to talk.
     """
     from dashboards.trials import run_trials
 

@@ -49,9 +49,8 @@ def evaluate(
 
     Args:
         sources: A run folder, a table of trials (one row per trial) or of rates (task, condition,
-            policy, side, unit, n, rate) in CSV or JSON, PolaRiS eval_results.csv, LeRobot
-            eval_info.json, a folder of SIMPLER videos, or a folder of any of these. Several are one
-            study. May be left out with --check-published.
+            policy, side, unit, n, rate) in CSV or JSON, or a folder of any of these. Several are
+            one study. May be left out with --check-published.
         out: Folder for the results; RUN/results, or NAME_results beside a table, without it.
         fail_under: Exit with 3 when a number stays below: 0.8 for the trials in which sim and
             outcome agree, or r=0.8, ppv=0.9, any id of results.json; several with commas.

@@ -54,7 +54,6 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
 
     Args:
         episode: An episode file, recorded or derived.
-        output: How to talk.
     """
     from bridge.episode.clocks import clocks_of
     from bridge.episode.contract import PRESENCE_RECORD, presence_lines
@@ -153,8 +152,6 @@ def check(
     Args:
         episodes: Episode files, or folders to search for them; parts go with their episode.
         contract: Hold them to this TOML file or template, not to what they were recorded under.
-        wire: What to listen to, and where.
-        output: How to talk.
     """
     from bridge.episode.check import check_all
     from bridge.episode.contract import find_contract
@@ -224,9 +221,6 @@ def doctor(*, output: Output = OUTPUT) -> int:
     """Show what is installed, what is missing, and how to get it.
 
     Example: robot-gst doctor
-
-    Args:
-        output: How to talk.
     """
     from bridge.doctor import examine
 
@@ -252,7 +246,6 @@ def recover(paths: list[Path], /, *, output: Output = OUTPUT) -> int:
 
     Args:
         paths: Files of any MCAP writer, or folders to search for ``*.mcap.part``.
-        output: How to talk.
     """
     from bridge.episode import recover as recovery
     from bridge.episode.recovery_report import RecoveryReport
@@ -314,7 +307,6 @@ def ls(
     Args:
         run: Run folder, or a folder of runs.
         query: Which, and in what order.
-        output: How to talk.
     """
     from bridge.episode.catalogue import find_runs
 
@@ -445,7 +437,6 @@ def label(
         policy: What moved the robot; with --task.
         by: Who says so.
         detail: What happened, in words.
-        output: How to talk.
     """
     from bridge.episode.catalogue import (
         assign_trial,

@@ -40,7 +40,6 @@ def export_tum(
         color: recorded keeps JPEG bytes as they are; png decodes them.
         clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
-        output: How to talk.
     """
     from bridge.episode.clocks import open_episode
     from bridge.exchange.rgbd import export_tum as write_tum
@@ -89,7 +88,6 @@ def export_csv(
         derived: Also the replays and localisations of the run.
         clock: corrected takes offset and drift of the sources' clocks out of all stamps.
         force: Replace an earlier export.
-        output: How to talk.
     """
     from bridge.exchange.csv_export import episode_files
     from bridge.exchange.csv_export import export_csv as write_csv
@@ -122,7 +120,6 @@ def export_rosbag2(
         out: The folder to make.
         json_topics: Topics of JSON records: left out, or as std_msgs/String.
         force: Replace an earlier export.
-        output: How to talk.
     """
     from bridge.episode.reader import Episode
     from bridge.exchange.rosbag2_export import export_bag
@@ -152,7 +149,6 @@ def import_trials(
         table: One row per trial; docs/exchange.md lists the columns.
         run: Run folder; made where needed.
         force: Replace trials imported earlier.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.exchange.trials_csv import import_trials as keep_trials
@@ -187,8 +183,6 @@ def import_rgbd(
         folder: Folder of one of the three layouts (docs/rgbd_folder.md).
         run: Run folder; made where needed.
         episode: Id of the new episode.
-        config: Names and rate.
-        output: How to talk.
     """
     from bridge.episode.metadata import EpisodeInfo
     from bridge.sources.folder.messages import (
@@ -261,8 +255,6 @@ def import_images(
         folder: Folder of one of the two layouts (docs/rgbd_folder.md).
         run: Run folder; made where needed.
         episode: Id of the new episode.
-        config: Names, rate and scale.
-        output: How to talk.
     """
     from bridge.episode.metadata import EpisodeInfo
     from bridge.sources.folder.posed_index import read_posed_index
@@ -305,7 +297,6 @@ def import_rosbag2(
         run: Run folder; made where needed.
         episode: Id of the new episode; by default from the name of the bag.
         task: Name or file of the task it is a trial of.
-        output: How to talk.
     """
     import re
 

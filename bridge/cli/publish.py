@@ -38,13 +38,11 @@ def publish_folder(
 
     Args:
         folder: Folder of one of the three layouts (docs/rgbd_folder.md).
-        config: Names and rate.
         fast: Send as fast as the recorder takes it; stamps keep their distance.
         episode: Ask the recorder to record this episode from the first to the last frame.
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.record.control import RecorderClient
     from bridge.record.status import describe_answer
@@ -121,13 +119,11 @@ def publish_episode(
 
     Args:
         file: A finished episode, or any other MCAP file.
-        config: What, how fast, and under which names.
         duration_s: Stop after this long [s].
         episode: Ask the recorder to record this episode from the first to the last message.
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from dataclasses import asdict
 

@@ -49,11 +49,9 @@ def record(
         anyway: Start it although topics are missing that cell.toml requires; else it waits.
         learn: Write the run's cell.toml from this good episode, and record nothing.
         about: What is being recorded, with --episode or the key s.
-        config: The recorder's settings.
         listen: Where to listen; other processes connect here.
         connect: Other zenoh routers to join.
         zenoh_config: zenoh configuration (JSON5), for example with access control.
-        output: How to talk.
     """
     from bridge.errors import UsageError
     from bridge.record.control import parse_info
@@ -137,7 +135,6 @@ def ctl(
         recorder: Name of the recorder.
         connect: Where it listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.errors import UsageError
     from bridge.record.control import RecorderClient

@@ -19,7 +19,6 @@ def check(*files: str, output: Output = OUTPUT) -> int:
 
     Args:
         files: Task files, or names of those that ship with robot-gst.
-        output: How to talk.
     """
     from bridge.errors import UsageError
     from bridge.task.check import TaskFileError
@@ -56,7 +55,6 @@ def new(name: str, /, *, like: str = "", folder: Path = Path(), output: Output =
         name: Of the task and of its file, NAME.toml: letters, digits, '_' and '-'.
         like: Start from this task, a name or a file, rather than from a cube and a block.
         folder: Where the file goes; here when not given.
-        output: How to talk.
     """
     from bridge.errors import UsageError
     from bridge.task.find import chosen_task_file

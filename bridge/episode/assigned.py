@@ -56,8 +56,7 @@ def assign(
 ) -> Path:
     """Note that an episode is a trial; what is None stays as it was."""
     if info.kind not in ("trial", "imported"):
-        message = f"{path.stem} is a {info.kind}; trials and imported episodes have tasks."
-        raise UsageError(message)
+        raise UsageError(f"{path.stem} is a {info.kind}; trials and imported episodes have tasks.")
     record: dict[str, Any] = {
         "schema_version": 1,
         "task": task,

@@ -62,7 +62,6 @@ class CheckReport:
     unknown_tails: list[str] = field(default_factory=list)
     """Topics that fell silent before the end, so that nobody knows what they sent after."""
     presences: dict[str, Presence] = field(default_factory=dict)
-    """When each topic was there."""
 
     @property
     def exit_code(self) -> int:
@@ -103,23 +102,10 @@ class CheckReport:
 
     def to_json(self) -> dict[str, Any]:
         """Everything, for ``--json``."""
-        return {
-            "file": str(self.path),
-            "state": self.summary,
-            "parts": [str(path) for path in self.parts],
-            "missing_parts": [str(path) for path in self.missing_parts],
-            "messages": self.messages,
-            "declared_losses": self.declared_losses,
-            "undeclared_losses": self.undeclared_losses,
-            "cut_short": self.cut_short,
-            "recovered": self.recovered,
-            "breaches": self.breaches,
-            "unknown_tails": self.unknown_tails,
-            "faults": self.faults,
-            "num_faults": self.num_faults,
-            "notes": self.notes,
-            "topics": {topic: asdict(found) for topic, found in self.topics.items()},
-        }
+        found = asdict(self)
+        del found["path"], found["presences"]
+        paths = {name: list(map(str, found[name])) for name in ("parts", "missing_parts")}
+        return {"file": str(self.path), "state": self.summary, **found, **paths}
 
 
 def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
@@ -135,10 +121,8 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
     report.parts = list(episode.parts) if episode else [path]
     if episode is not None:
         watch.pauses = Pauses(_paused_spans(episode))
-    for part in report.parts:
-        if episode is not None:
+        for part in report.parts:
             watch.read(FileCheck(part, faults))
-    if episode is not None:
         _check_parts(report, episode, faults)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
@@ -268,6 +252,7 @@ def _judge_topics(
     decoder = watch.decoder
     ours = watch.is_ours and not _is_imported(episode)
     is_recording = episode is not None and "recorder" in episode.metadata_records
+    say = faults.add if ours else report.notes.append
     report.notes += sorted(decoder.missing)
     shared = _shared_topics(episode)
     for topic, topic_watch in sorted(watch.topics.items()):
@@ -276,10 +261,10 @@ def _judge_topics(
         result.declared_losses = decoder.drop_log.get(topic, 0)
         result.unnumbered = decoder.unnumbered.get(topic, 0)
         if result.undecodable:
-            _say(report, faults if ours else None, result.first_fault)
+            say(result.first_fault)
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
-            _say(report, faults if ours and is_recording else None, text)
+            (say if is_recording else report.notes.append)(text)
         if decoder.has_drop_log and topic not in shared:
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
@@ -291,7 +276,7 @@ def _judge_topics(
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
     for text in decoder.size_faults():
-        _say(report, faults if ours else None, text)
+        say(text)
 
 
 def _is_recording(episode: Episode) -> bool:
@@ -329,13 +314,6 @@ def _judge_presence(
         report.topics.setdefault(topic, TopicCheck()).presence = found
     report.breaches = breaches_of(reports)
     report.unknown_tails = unknown_tails(reports)
-
-
-def _say(report: CheckReport, faults: Faults | None, text: str) -> None:
-    if faults is None:
-        report.notes.append(text)
-    else:
-        faults.add(text)
 
 
 def _is_imported(episode: Episode | None) -> bool:

@@ -55,7 +55,6 @@ def summary_faults(
         seen: What the walk through the data found; the summary's schemas and channels are added to
             it.
         summary: What the file says of itself; None where it has no summary, which is no fault.
-        footer_at: Where the footer begins [bytes from the start of the file].
     """
     if summary is None:
         return
@@ -151,7 +150,6 @@ def _are_all(opcode: int, stream: ByteStream, start: int, end: int) -> bool:
 
 _INDEX_HEAD = struct.Struct("<HI")
 NEVER = 1 << 64
-"""After every log time there can be."""
 
 
 class Faults:
@@ -348,8 +346,7 @@ class FileCheck:
 def _index_entries(body: bytes) -> tuple[int, UInt64[np.ndarray, "entries 2"]]:
     """Read a message index: its channel, and log time and offset of each message."""
     if len(body) < _INDEX_HEAD.size:
-        message = f"a message index of {len(body)} bytes"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message index of {len(body)} bytes")
     channel_id, length = _INDEX_HEAD.unpack_from(body)
     if length % 16 or length > len(body) - _INDEX_HEAD.size:
         message = f"a message index of {len(body)} bytes claims {length} bytes of entries"

@@ -17,7 +17,6 @@ from bridge.episode.cdr.messages import (
     DepthImage,
     JointSample,
     PoseSample,
-    VideoFrame,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -43,7 +42,6 @@ class Decoder:
     def __init__(self) -> None:
         """Start without a drop log."""
         self.drop_log: dict[str, int] = {}
-        """Losses declared by topic."""
         self.unnumbered: dict[str, int] = {}
         """By topic, messages without a number of their publisher's."""
         self.has_drop_log = False
@@ -129,7 +127,6 @@ _KNOWN_COLORS = ("jpeg", "jpg", "png", "rgb8; jpeg", "bgr8; jpeg", "rgb8; png", 
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
     schema.COMPRESSED_IMAGE: _color,
-    schema.COMPRESSED_VIDEO: VideoFrame.from_protobuf,
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,

@@ -40,7 +40,6 @@ def journal_path(part_path: Path) -> Path:
 class _Small:
     chunk: EncodedChunk
     since_s: float
-    """When its first message came."""
     closed_s: float
     is_in_journal: bool = False
 
@@ -85,7 +84,6 @@ class ChunkQueue:
         self._journal = _Journal(journal_path(part_path))
         self._journal_thread: threading.Thread | None = None
         self._needed_s: float | None = None
-        """When the journal was needed last."""
         self._thread = threading.Thread(target=self._work, name="episode disk", daemon=True)
         self._thread.start()
 

@@ -14,12 +14,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from mcap import records
 
 from bridge.clock import NS_PER_S, ClockChoice, join_ns, split_ns
-from bridge.episode import protobuf, schema
+from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.reader import Episode, RawMessage
 from bridge.episode.topics import CLOCKS
 from bridge.errors import EpisodeError
@@ -104,7 +104,6 @@ class ClockLine:
     uncertainty_ns: float
     """The truth is at most this far from the line at each reading that was used."""
     readings: int
-    """Round trips measured."""
 
     def offset_at(self, at_ns: int) -> float:
         """Source minus recorder at a time of the recorder's clock [ns]."""
@@ -123,25 +122,22 @@ def fit_line(readings: Sequence[Reading]) -> ClockLine:
     start_ns = min(reading.at_ns for reading in readings)
     end_ns = max(reading.at_ns for reading in readings)
     middle_ns = (start_ns + end_ns) // 2
-    weights = [1.0 / reading.error_ns**2 for reading in used]
-    total = sum(weights)
-    pairs = [(reading.at_ns - middle_ns, reading.offset_ns) for reading in used]
-    mean_t = sum(w * t for w, (t, _) in zip(weights, pairs, strict=True)) / total
-    mean_o = sum(w * o for w, (_, o) in zip(weights, pairs, strict=True)) / total
-    spread = sum(w * (t - mean_t) ** 2 for w, (t, _) in zip(weights, pairs, strict=True))
+    weights = 1.0 / np.array([reading.error_ns for reading in used], dtype=np.float64) ** 2
+    t = np.array([reading.at_ns - middle_ns for reading in used], dtype=np.float64)
+    o = np.array([reading.offset_ns for reading in used], dtype=np.float64)
+    mean_t, mean_o = np.average(t, weights=weights), np.average(o, weights=weights)
     drift = None
-    span_ns = max(t for t, _ in pairs) - min(t for t, _ in pairs)
-    if span_ns >= DRIFT_SPAN_S * NS_PER_S:
-        shared = zip(weights, pairs, strict=True)
-        drift = sum(w * (t - mean_t) * (o - mean_o) for w, (t, o) in shared) / spread
-    offset_ns = mean_o - (drift or 0.0) * mean_t
-    off_ns = [abs(offset_ns + (drift or 0.0) * t - o) for t, o in pairs]
+    if np.ptp(t) >= DRIFT_SPAN_S * NS_PER_S:
+        shared = np.sum(weights * (t - mean_t) * (o - mean_o))
+        drift = float(shared / np.sum(weights * (t - mean_t) ** 2))
+    offset_ns = float(mean_o - (drift or 0.0) * mean_t)
+    off_ns = np.abs(offset_ns + (drift or 0.0) * t - o)
     return ClockLine(
         start_ns=start_ns,
         end_ns=end_ns,
         offset_ns=offset_ns,
         drift=drift,
-        uncertainty_ns=max(d + r.error_ns for d, r in zip(off_ns, used, strict=True)),
+        uncertainty_ns=float(max(d + r.error_ns for d, r in zip(off_ns, used, strict=True))),
         readings=len(readings),
     )
 
@@ -154,7 +150,6 @@ class SourceClock:
     """Beginning of its topics, such as ``lab`` or ``lab/cam/side``."""
     host: str
     topics: frozenset[str] = frozenset()
-    """What it publishes."""
     spans: list[list[Reading]] = field(default_factory=list)
     """Readings, a new list each time the clock was set."""
     jumps: list[Jump] = field(default_factory=list)
@@ -363,8 +358,6 @@ def _restamped_data(
             stamp = item["header"]["stamp"]
             stamp["sec"], stamp["nanosec"] = _moved(stamp["sec"], stamp["nanosec"], shift_ns)
         return codec.encode(type_name, message)
-    if type_name == schema.COMPRESSED_VIDEO:
-        return _restamped_video(data, shift_ns)
     if definition is None:
         return data
     if definition.encoding == "jsonschema":
@@ -386,17 +379,6 @@ def _restamped_json(data: bytes, shift_ns: int) -> bytes:
     if not isinstance(stamp_ns, int) or isinstance(stamp_ns, bool) or stamp_ns <= 0:
         return data
     return json.dumps({**record, "stamp_ns": max(0, stamp_ns + shift_ns)}).encode()
-
-
-def _restamped_video(data: bytes, shift_ns: int) -> bytes:
-    frame = VideoFrame.from_protobuf(data)
-    sec, nanosec = _moved(*split_ns(frame.stamp_ns), shift_ns)
-    stamp = protobuf.number_field(1, sec) + protobuf.number_field(2, nanosec)
-    parts = [protobuf.bytes_field(1, stamp)]
-    for number, value in protobuf.fields(memoryview(data)):
-        if number != 1 and not isinstance(value, int):
-            parts.append(protobuf.bytes_field(number, bytes(value)))
-    return b"".join(parts)
 
 
 def clocks_of(episode: Episode) -> list[SourceClock]:

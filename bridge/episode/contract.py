@@ -13,7 +13,9 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
@@ -23,7 +25,6 @@ from bridge.whole_file import write_whole
 
 SCHEMA_VERSION = 1
 CONTRACT_FILE = "cell.toml"
-"""Of a run folder."""
 TEMPLATES = "cells/contracts"
 RECORD_NAME = "contract"
 """Of the metadata record that holds an episode's contract."""
@@ -41,6 +42,9 @@ FEWEST_FOR_RATE = 10
 """A rate is judged when the contract promises at least so many messages."""
 
 
+Above0 = Annotated[float, msgspec.Meta(gt=0, lt=1e12)]
+
+
 class ContractError(UsageError):
     """A contract cannot be used."""
 
@@ -49,11 +53,11 @@ class ContractError(UsageError):
 class TopicRule:
     """What one topic promises."""
 
-    rate_hz: float | None = None
+    rate_hz: Above0 | None = None
     """Messages per second [1/s]; None promises none."""
-    tolerance: float = 0.2
+    tolerance: Above0 = 0.2
     """By which part of it the mean rate may differ."""
-    silence_s: float | None = None
+    silence_s: Above0 | None = None
     """The longest time without a message [s]; None allows any."""
     required: bool = True
     """Whether a recording without the topic is broken; else it may be absent."""
@@ -65,7 +69,6 @@ class Contract:
 
     topics: Mapping[str, TopicRule]
     cell: str = ""
-    """Name of the cell, for people."""
 
     def to_record(self) -> dict[str, str]:
         """The ``contract`` metadata record; every value is JSON."""
@@ -82,10 +85,8 @@ def read_contract(path: Path) -> Contract:
     """Read a contract."""
     try:
         values = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ContractError(f"the contract {path} cannot be read: {error}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ContractError(f"the contract {path} is no TOML: {error}.") from error
     return contract_from(values, name=str(path))
 
 
@@ -106,44 +107,27 @@ def find_contract(run: Path, name: str | None) -> Contract | None:
 
 def contract_from(values: Mapping[str, Any], *, name: str) -> Contract:
     """Build a contract from parsed values."""
-    _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
-    version, topics = values.get("schema_version"), values.get("topics")
+    version, whose, rules = values.get("schema_version"), "topics", {}
     if version != SCHEMA_VERSION:
         found = "is missing" if version is None else f"is {version!r:.40}"
         raise ContractError(f"{name}: schema_version {found}; it must be {SCHEMA_VERSION}.")
-    if not isinstance(topics, dict):
-        raise ContractError(f'{name}: topics must be tables, for example [topics."/lab/TOPIC"].')
-    cell = values.get("cell", "")
-    if not isinstance(cell, str):
-        raise ContractError(f"{name}: cell must be a text, got {cell!r:.40}.")
-    rules = {topic: _rule(topic, rule, name) for topic, rule in topics.items()}
-    return Contract(topics=rules, cell=cell)
-
-
-def _rule(topic: str, values: Any, name: str) -> TopicRule:
-    whose = f"topics.{json.dumps(topic)}"
-    if not topic.startswith("/"):
-        raise ContractError(f"{name}: {whose}: a topic starts with a slash: /{topic}.")
-    if not isinstance(values, dict):
-        raise ContractError(f"{name}: {whose} must be a table, got {values!r:.40}.")
-    _refuse_unknown(values, [item.name for item in fields(TopicRule)], where=name, prefix=whose)
-    numbers: dict[str, float] = {}
-    for key in ("rate_hz", "tolerance", "silence_s"):
-        value = values.get(key)
-        if value is None:  # TOML has no null; an episode's record has
-            continue
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not 0 < value < math.inf:
-            raise ContractError(f"{name}: {whose}.{key} must be above zero, got {value!r:.40}.")
-        numbers[key] = float(value)
-    if not isinstance(values.get("required", True), bool):
-        found = values["required"]
-        raise ContractError(f"{name}: {whose}.required must be true or false, got {found!r:.40}.")
-    return TopicRule(**numbers, required=values.get("required", True))
+    _refuse_unknown(values, ("schema_version", "cell", "topics"), where=name, prefix="")
+    known = [item.name for item in fields(TopicRule)]
+    try:
+        for topic, rule in msgspec.convert(values.get("topics"), dict[str, Any]).items():
+            whose = f"topics.{json.dumps(topic)}"
+            if not topic.startswith("/"):
+                raise ContractError(f"{name}: {whose}: a topic starts with a slash: /{topic}.")
+            _refuse_unknown(rule if isinstance(rule, dict) else (), known, where=name, prefix=whose)
+            rules[topic] = msgspec.convert(rule, TopicRule)
+        whose = "cell"
+        return Contract(topics=rules, cell=msgspec.convert(values.get("cell", ""), str))
+    except msgspec.ValidationError as error:
+        raise ContractError(f"{name}: {whose}: {error}.") from error
 
 
 def _refuse_unknown(
-    values: Mapping[str, Any], allowed: Sequence[str], *, where: str, prefix: str
+    values: Iterable[str], allowed: Sequence[str], *, where: str, prefix: str
 ) -> None:
     for key in values:
         if key in allowed:
@@ -189,7 +173,6 @@ class Presence:
     longest_ns: int = 0
     """The longest silence between two messages, pauses not counted."""
     longest_at_ns: int = 0
-    """When it began."""
 
     def see(self, stamp_ns: int, pauses: Spans) -> None:
         """Take the next message."""
@@ -245,7 +228,6 @@ class TopicReport:
     tail: str
     """``known``, or ``unknown``: it fell silent, and nobody knows what was sent after."""
     breaches: tuple[str, ...] = ()
-    """Where it broke its contract."""
 
 
 def judge(
@@ -267,48 +249,29 @@ def judge(
     Returns:
         A report for each topic that was there or was promised.
     """
-    rules = contract.topics if contract else {}
-    absent = Presence()
-    return {
-        topic: _report(
-            topic,
-            presences.get(topic, absent),
-            rules.get(topic),
-            span,
-            lost.get(topic, 0),
-            by_habit=by_habit,
-        )
-        for topic in sorted({*presences, *rules} - OF_RECORDER)
-    }
-
-
-def _report(
-    topic: str,
-    presence: Presence,
-    rule: TopicRule | None,
-    span: Span,
-    lost: int,
-    *,
-    by_habit: bool,
-) -> TopicReport:
+    rules, absent = contract.topics if contract else {}, Presence()
     total_ns = _silence_ns(span.start_ns, span.end_ns, span.pauses)
-    rate_hz = rule.rate_hz if rule else None
-    expected = None if rate_hz is None else round(rate_hz * s_from_ns(total_ns))
-    was_there = presence.messages > 0
-    tail_ns = _silence_ns(presence.last_ns, span.end_ns, span.pauses) if was_there else total_ns
-    return TopicReport(
-        messages=presence.messages,
-        first_s=s_from_ns(presence.first_ns - span.start_ns) if was_there else None,
-        last_s=s_from_ns(presence.last_ns - span.start_ns) if was_there else None,
-        longest_silence_s=s_from_ns(presence.longest_ns),
-        longest_silence_at_s=s_from_ns(presence.longest_at_ns - span.start_ns)
-        if presence.longest_ns
-        else 0.0,
-        tail_s=s_from_ns(tail_ns),
-        expected=expected,
-        tail="unknown" if _fell_silent(topic, presence, rule, tail_ns, by_habit) else "known",
-        breaches=tuple(_breaches(topic, presence, rule, span, lost)) if rule else (),
-    )
+    reports = {}
+    for topic in sorted({*presences, *rules} - OF_RECORDER):
+        presence, rule = presences.get(topic, absent), rules.get(topic)
+        rate_hz = rule.rate_hz if rule else None
+        was_there = presence.messages > 0
+        tail_ns = _silence_ns(presence.last_ns, span.end_ns, span.pauses) if was_there else total_ns
+        is_silent = _fell_silent(topic, presence, rule, tail_ns, by_habit)
+        longest_at_ns = presence.longest_at_ns - span.start_ns if presence.longest_ns else 0
+        found = _breaches(topic, presence, rule, span, lost.get(topic, 0)) if rule else ()
+        reports[topic] = TopicReport(
+            messages=presence.messages,
+            first_s=s_from_ns(presence.first_ns - span.start_ns) if was_there else None,
+            last_s=s_from_ns(presence.last_ns - span.start_ns) if was_there else None,
+            longest_silence_s=s_from_ns(presence.longest_ns),
+            longest_silence_at_s=s_from_ns(longest_at_ns),
+            tail_s=s_from_ns(tail_ns),
+            expected=None if rate_hz is None else round(rate_hz * s_from_ns(total_ns)),
+            tail="unknown" if is_silent else "known",
+            breaches=tuple(found),
+        )
+    return reports
 
 
 def _fell_silent(

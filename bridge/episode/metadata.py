@@ -22,7 +22,6 @@ NOTHING_EXECUTED = "nothing executed"
 WITHOUT, WITH = "without_replanning", "with_replanning"
 """The two conditions of a trial that evaluation compares."""
 CONDITION_OF = {"without": WITHOUT, "with": WITH, "control": WITHOUT}
-"""Of each study arm."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,7 +29,6 @@ from bridge.errors import BridgeError, GstError, PathNotFoundError
 
 TEMPORARY, UNREADABLE = ".recovering", ".unreadable"
 SPARE_BYTES = 16 << 20
-"""Left free beside a copy."""
 
 
 class RecoveryError(BridgeError):
@@ -118,8 +117,7 @@ def _set_aside(path: Path) -> None:
 def _locked(path: Path, *, write: bool) -> Iterator[int]:
     descriptor = lock_dead(path, write=write)
     if descriptor is None:
-        message = f"{path} is still being written. Stop its recorder first."
-        raise StillWrittenError(message)
+        raise StillWrittenError(f"{path} is still being written. Stop its recorder first.")
     try:
         yield descriptor
     finally:
@@ -162,7 +160,7 @@ def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) ->
             if target is not None:
                 target.take(found)
         if target is not None:
-            tally.name(target.looked_up)
+            tally.define(target.looked_up)
         report = tally.report(path, None, finished=False)
         if target is None:
             return report
@@ -183,8 +181,7 @@ def _prove(path: Path) -> None:
     """Read the copy back; its CRC covers every byte that was found whole before."""
     with path.open("rb") as stream:
         if finished_data(RecordFile(stream.fileno())) is None:
-            message = f"{path} does not hold what was written to it. Check the disk."
-            raise RecoveryError(message)
+            raise RecoveryError(f"{path} does not hold what was written to it. Check the disk.")
 
 
 def _keep_original(path: Path) -> Path | None:

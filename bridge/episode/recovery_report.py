@@ -35,15 +35,11 @@ class RecoveryReport:
     """The finished episode; None when nothing could be read."""
     messages: int = 0
     topics: dict[str, int] = field(default_factory=dict)
-    """Messages by topic."""
-    bytes_kept: int = 0
     bytes_lost: int = 0
     """Bytes of the file that hold no whole record; what never reached the disk is not known."""
     reason: str = ""
     finished: bool = False
-    """It was complete already."""
     attachments: int = 0
-    metadata: int = 0
     last_log_time_ns: dict[str, int] = field(default_factory=dict)
     """By topic: nothing after it was found."""
     original: Path | None = None
@@ -55,16 +51,12 @@ class RecoveryTally:
     """Counts while a file is being read."""
 
     messages: dict[int, int] = field(default_factory=dict)
-    """By channel id."""
     last_ns: dict[int, int] = field(default_factory=dict)
     topics: dict[int, str] = field(default_factory=dict)
     attachments: int = 0
-    metadata: int = 0
-    bytes_kept: int = 0
     bytes_lost: int = 0
     losses: list[str] = field(default_factory=list)
     has_data: bool = False
-    """Found a header or anything behind one."""
     reached_end: int | None = None
     """Where the writer ended the data, if it did."""
     earlier: dict[str, object] = field(default_factory=dict)
@@ -88,31 +80,24 @@ class RecoveryTally:
                 self._take_cut(found)
             case Chunk():
                 self._count(found.contents)
-                self.bytes_kept += found.length
             case TopMessage():
                 self._add(found.channel_id, 1, found.log_time_ns)
-                self.bytes_kept += found.length
             case AttachmentSpan():
                 self.attachments += 1
-                self.bytes_kept += found.length
             case Plain():
                 self._take_plain(found)
         self.has_data = True
 
     def _take_plain(self, found: Plain) -> None:
-        self.bytes_kept += found.length
         if found.opcode == mcap.CHANNEL:
-            self._define([found.raw])
-        elif found.opcode == mcap.METADATA:
-            self.metadata += 1
-            if isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
-                self.earlier = from_strings(found.record.metadata)
+            self.define([found.raw])
+        elif isinstance(found.record, Metadata) and found.record.name == RECORD_NAME:
+            self.earlier = from_strings(found.record.metadata)
 
     def _take_cut(self, found: CutChunk) -> None:
         lost = found.unpacked_size - found.contents.size
         kept = found.contents.num_messages
         self._count(found.contents)
-        self.bytes_kept += found.contents.size
         self.bytes_lost += lost
         self.losses.append(
             f"at byte {found.offset} the file ends inside a chunk; "
@@ -120,7 +105,7 @@ class RecoveryTally:
         )
 
     def _count(self, contents: Contents) -> None:
-        self._define(contents.definitions)
+        self.define(contents.definitions)
         for channel_id, entries in contents.index.items():
             self._add(channel_id, len(entries) // 2, max(entries[::2]))
 
@@ -128,19 +113,12 @@ class RecoveryTally:
         self.messages[channel_id] = self.messages.get(channel_id, 0) + count
         self.last_ns[channel_id] = max(self.last_ns.get(channel_id, 0), last_ns)
 
-    def _define(self, definitions: list[bytes]) -> None:
+    def define(self, definitions: list[bytes]) -> None:
+        """Learn the names of channels."""
         for raw in definitions:
             channel = read_plain(raw)
             if isinstance(channel, Channel):
                 self.topics.setdefault(channel.id, channel.topic)
-
-    def name(self, definitions: list[bytes]) -> None:
-        """Learn the names of channels whose definition was lost and found elsewhere."""
-        self._define(definitions)
-
-    def topic_of(self, channel_id: int) -> str:
-        """Name of a channel, also of one whose definition was lost."""
-        return self.topics.get(channel_id, unknown_topic(channel_id))
 
     @property
     def reason(self) -> str:
@@ -165,7 +143,7 @@ class RecoveryTally:
         counts: dict[str, int] = {}
         last: dict[str, int] = {}
         for channel_id, count in self.messages.items():
-            topic = self.topic_of(channel_id)
+            topic = self.topics.get(channel_id, unknown_topic(channel_id))
             counts[topic] = counts.get(topic, 0) + count
             last[topic] = max(last.get(topic, 0), self.last_ns[channel_id])
         before = self.earlier.get("bytes_lost")
@@ -174,12 +152,10 @@ class RecoveryTally:
             output=output,
             messages=sum(counts.values()),
             topics=dict(sorted(counts.items())),
-            bytes_kept=self.bytes_kept,
             bytes_lost=self.bytes_lost + (before if isinstance(before, int) else 0),
             reason=str(self.earlier.get("reason", "")) if finished else self.reason,
             finished=finished,
             attachments=self.attachments,
-            metadata=self.metadata,
             last_log_time_ns=dict(sorted(last.items())),
         )
 

@@ -20,11 +20,10 @@ _LATER_PART = re.compile(rf"({EPISODE_ID.pattern})\.([1-9][0-9]{{0,5}})\.mcap")
 def check_episode_id(episode_id: str) -> str:
     """Return the id if it is safe as a file name; remote requests cannot leave the run folder."""
     if not EPISODE_ID.fullmatch(episode_id):
-        message = (
+        raise UsageError(
             f"episode id {episode_id!r:.80} is not usable as a file name. "
             "Use letters, digits, '_' and '-', at most 121 characters."
         )
-        raise UsageError(message)
     return episode_id
 
 

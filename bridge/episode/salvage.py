@@ -213,10 +213,10 @@ class CopyTarget:
         for block in self._source.blocks(found.offset, found.length):
             self.section.file.append([block])
         self.section.summary.add_attachment(
-            found.name,
-            media_type=found.media_type,
-            log_time_ns=found.log_time_ns,
-            create_time_ns=found.create_time_ns,
+            found.record.name,
+            media_type=found.record.media_type,
+            log_time_ns=found.record.log_time,
+            create_time_ns=found.record.create_time,
             data_size=found.data_size,
             offset=offset,
             length=found.length,

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from bridge.episode import protobuf
-
 # ``rosbags`` carries the same definitions; ``tests/parity`` compares ours with them.
 
 SEPARATOR = "=" * 80
@@ -187,41 +185,12 @@ def schema_for(name: str) -> Schema | None:
         return Schema(
             name=name, schema_encoding="jsonschema", message_encoding="json", data=text.encode()
         )
-    if name == COMPRESSED_VIDEO:
-        return Schema(
-            name=name,
-            schema_encoding="protobuf",
-            message_encoding="protobuf",
-            data=_video_descriptor(),
-        )
     return None
-
-
-def _video_descriptor() -> bytes:
-    timestamp = "google/protobuf/timestamp.proto"
-    return protobuf.file_descriptor(
-        name=timestamp,
-        package="google.protobuf",
-        message="Timestamp",
-        members=[("seconds", 1, protobuf.INT64_TYPE, ""), ("nanos", 2, protobuf.INT32_TYPE, "")],
-    ) + protobuf.file_descriptor(
-        name=COMPRESSED_VIDEO.replace(".", "/") + ".proto",
-        package="foxglove",
-        message=COMPRESSED_VIDEO.removeprefix("foxglove."),
-        imports=[timestamp],
-        members=[
-            ("timestamp", 1, protobuf.MESSAGE_TYPE, ".google.protobuf.Timestamp"),
-            ("frame_id", 2, protobuf.STRING_TYPE, ""),
-            ("data", 3, protobuf.BYTES_TYPE, ""),
-            ("format", 4, protobuf.STRING_TYPE, ""),
-        ],
-    )
 
 
 def json_schema_version(name: str) -> int:
     """Return the major version of one of our JSON schemas."""
     schema = schema_for(name)
     if schema is None or schema.schema_encoding != "jsonschema":
-        message = f"{name} has no JSON schema"
-        raise KeyError(message)
+        raise KeyError(f"{name} has no JSON schema")
     return int(json.loads(schema.data).get("version", 1))

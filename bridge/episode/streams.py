@@ -17,14 +17,12 @@ from bridge.episode.cdr.messages import (
     JointSample,
     PoseSample,
     RawColor,
-    VideoFrame,
     color_from_message,
-    raw_color_to_cdr,
     stamp_of,
     string_from_cdr,
     transforms_from_cdr,
 )
-from bridge.episode.reader import Episode, RawMessage
+from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
     CAMERAS,
@@ -40,7 +38,6 @@ from bridge.errors import EpisodeError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.geometry.trajectory import PoseTrajectory
-from bridge.media.video import VideoDecoder, VideoDecodingError
 from bridge.robots.robot import Robot, robot_of
 from bridge.task.find import ATTACHMENT, Attached, find_task_file
 from bridge.task.plan import Plan
@@ -115,15 +112,21 @@ def transform_tree(episode: Episode) -> TransformTree:
 
 def camera_ids(episode: Episode) -> list[str]:
     """Cameras that have colour images: the ``<id>`` of ``.../cam/<id>/color/image``."""
-    found = (COLOR_TOPIC.search(topic) for topic in episode.topics() if not is_truth(topic))
+    found = (COLOR_TOPIC.search(topic) for topic in _readable(episode))
     return sorted({match[1] for match in found if match is not None})
 
 
 def find_camera_topic(episode: Episode, camera_id: str, tail: str) -> str | None:
     """Return a camera's topic by its end (``depth/image``); stand-in truth is never found."""
     ending = f"{CAMERAS}{camera_id}/{tail}"
-    found = (t for t in episode.topics() if t.endswith(ending) and not is_truth(t))
-    return next(found, None)
+    return next((topic for topic in _readable(episode) if topic.endswith(ending)), None)
+
+
+def _readable(episode: Episode) -> Iterator[str]:
+    """Topics but ground truth, and videos: their frames are kept as they came, and not decoded."""
+    for topic, about in episode.topics().items():
+        if not is_truth(topic) and about.type_name != schema.COMPRESSED_VIDEO:
+            yield topic
 
 
 def _camera_topic(episode: Episode, camera_id: str, tail: str) -> str:
@@ -145,54 +148,6 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
     raise EpisodeError(path=episode.path, found=f"{topic} is empty", hint="Record it again.")
 
 
-def image_messages(
-    episode: Episode,
-    topics: Iterable[str],
-    *,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
-) -> Iterator[RawMessage]:
-    """Yield messages as ``Episode.messages`` does, each frame of a video as a raw image.
-
-    Frames before a video's first whole picture are passed over: they show nothing by themselves.
-
-    Args:
-        start_ns: First log time wanted [ns since 1970]; None: from the start.
-        end_ns: Log time to stop before [ns since 1970]; None: to the end.
-    """
-    decoders: dict[tuple[str, str], VideoDecoder] = {}
-    waiting: dict[int, RawMessage] = {}
-    found = episode.messages(topics, start_ns=start_ns, end_ns=end_ns)
-    for number, message in enumerate(found):
-        if message.type_name != schema.COMPRESSED_VIDEO:
-            yield message
-            continue
-        frame = VideoFrame.from_protobuf(message.data)
-        try:
-            decoder = decoders.get((message.topic, frame.format))
-            if decoder is None:
-                decoder = decoders[message.topic, frame.format] = VideoDecoder(frame.format)
-            shown = decoder.decode(frame.data, number)
-        except VideoDecodingError as error:
-            raise EpisodeError(
-                path=episode.path,
-                found=f"{message.topic}: {error}",
-                hint="robot-gst check lists everything that is wrong with it.",
-            ) from error
-        waiting[number] = message
-        for shown_number, image_u8 in shown:
-            yield _as_image(waiting.pop(shown_number), image_u8)
-    for decoder in decoders.values():
-        for shown_number, image_u8 in decoder.flush():
-            yield _as_image(waiting.pop(shown_number), image_u8)
-
-
-def _as_image(message: RawMessage, image_u8: UInt8[np.ndarray, "height width 3"]) -> RawMessage:
-    frame = VideoFrame.from_protobuf(message.data)
-    data = raw_color_to_cdr(frame.stamp_ns, frame.frame_id, image_u8)
-    return message._replace(type_name=schema.IMAGE, data=data)
-
-
 def rgbd_frames(
     episode: Episode, camera_id: str, tree: TransformTree | None = None
 ) -> Iterator[RgbdFrame]:
@@ -208,7 +163,7 @@ def rgbd_frames(
     depth_topic = _camera_topic(episode, camera_id, "depth/image")
     waiting_colors: list[CompressedColor | RawColor] = []
     waiting_depths: list[DepthImage] = []
-    for message in image_messages(episode, [color_topic, depth_topic]):
+    for message in episode.messages([color_topic, depth_topic]):
         if message.topic == color_topic:
             waiting_colors.append(color_from_message(message.type_name, message.data))
         else:

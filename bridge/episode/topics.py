@@ -20,7 +20,6 @@ ROBOT_DESCRIPTION = "/robot_description"
 DROPS = "/recorder/drops"
 CLOCKS = "/recorder/clocks"
 OF_RECORDER = frozenset((DROPS, CLOCKS))
-"""What only a recorder writes."""
 TRUTH = "standin/truth"
 """Takes the place of the cell in topics that hold a stand-in cell's ground truth."""
 
@@ -70,7 +69,6 @@ RENDERED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/rendered/depth$")
 
 _TYPES: tuple[tuple[str, str], ...] = (
     (COLOR_TOPIC.pattern, schema.COMPRESSED_IMAGE),
-    (f"{CAMERAS}[^/]+/color/preview$", schema.COMPRESSED_VIDEO),
     (f"{CAMERAS}[^/]+{DEPTH_IMAGE}$", schema.IMAGE),
     (f"{CAMERAS}[^/]+({COLOR_INFO}|{DEPTH_INFO})$", schema.CAMERA_INFO),
     (f"{JOINT_STATES}$", schema.JOINT_STATE),

@@ -86,7 +86,6 @@ class TransformTree:
 
         Args:
             frame: Name of the frame.
-            stamp_ns: Source time [ns since 1970]; between recorded transforms it is interpolated.
         """
         T: Float[np.ndarray, "4 4"] = self.Ts_root_frame(frame, np.array([stamp_ns]))[0]
         return T

@@ -41,7 +41,6 @@ class Channel:
         self.id = channel_id
         self.type_name = type_name
         self.definition = definition
-        """Schema and channel records."""
         self.next_definition = 0
         """Number of the chunk of its group that holds them next."""
         self.times_defined = 0
@@ -51,7 +50,6 @@ class Channel:
 
 
 About = tuple[tuple[str, str], ...]
-"""Names and texts of a channel's metadata."""
 SLOW_FLUSH_S = 0.05
 """On a slow disk small messages are not held back longer than this [s]: the write takes enough."""
 REPEAT_CHUNKS = 16
@@ -268,14 +266,12 @@ class EpisodeWriter:
         """Append one serialised message of a type this project knows.
 
         Args:
-            log_time_ns: When it was received [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
             sequence: The publisher's number of it; None counts on from the message before.
         """
         known = schema.schema_for(type_name)
         if known is None:
-            message = f"no schema for {type_name!r}; use write_foreign for other types"
-            raise ValueError(message)
+            raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")
         self.write_foreign(
             topic,
             data,
@@ -301,7 +297,6 @@ class EpisodeWriter:
 
         Args:
             schema_record: What it is; None where nobody knows.
-            log_time_ns: When it was received [ns since 1970].
             publish_time_ns: When it was sent [ns since 1970]; None: the log time.
             sequence: The publisher's number of it; None counts on from the message before.
         """

@@ -73,11 +73,10 @@ def _refuse_strangers(out: Path, *, force: bool) -> None:
                 return
             message = f"{out} exists already. Choose another folder, or replace it with --force."
             raise UsageError(message)
-    message = (
+    raise UsageError(
         f"{out} exists and was not written by an export, so it is not replaced. "
         "Choose another folder, or move it away."
     )
-    raise UsageError(message)
 
 
 def _umask() -> int:

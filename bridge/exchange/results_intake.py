@@ -1,8 +1,8 @@
 """What a file or a folder of somebody's results holds, as far as its own words tell.
 
 Known are tables of trials and of rates (CSV, or JSON lists of objects with the same names), tables
-of printed figures, ``eval_info.json`` of LeRobot, ``eval_results.csv`` of PolaRiS and folders of
-SIMPLER videos. An outcome is never guessed: a file that does not say it is left, with the reason.
+of printed figures. An outcome is never guessed: a file that does not say it is left, with the
+reason.
 """
 
 import difflib
@@ -14,13 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from bridge.errors import BridgeError, PathNotFoundError, UsageError
-from bridge.exchange.benchmark_results import (
-    POLARIS_COLUMNS,
-    SIMPLER_NAME,
-    read_lerobot_eval,
-    read_polaris,
-    read_simpler,
-)
 from bridge.exchange.table_text import (
     AS_SAVED,
     TableError,
@@ -44,31 +37,24 @@ from bridge.exchange.trials_csv import (
 from bridge.exchange.trials_rates import COLUMNS as RATE_COLUMNS
 from bridge.exchange.trials_rates import RateRecord, rates_of
 
-PUBLISHED, SIMPLER, POLARIS, LEROBOT = "a published table", "SIMPLER", "PolaRiS", "LeRobot"
-ROLLOUTS = (SIMPLER, POLARIS, LEROBOT)
-"""Benchmarks whose files hold the sim side alone."""
+PUBLISHED = "a published table"
+LISTS = "Give a list of trials or rates"
 FIGURES = ("k", "n", "rate", "rate_percent")
 """A table with a column side and one of these is one of rates."""
-READ_ENDINGS = (".csv", ".tsv", ".txt", ".json", ".mp4")
+READ_ENDINGS = (".csv", ".tsv", ".txt", ".json")
 MOST_FILES = 20_000
 """Files of a folder that are looked at."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Taken:
-    """What one file, or one folder of videos, was taken for."""
+    """What one file was taken for."""
 
     path: Path
     kind: str
     summary: str
-    """What was understood, in one line."""
     trials: tuple[TrialRecord, ...] = ()
     rates: tuple[RateRecord, ...] = ()
-
-    @property
-    def rollouts(self) -> bool:
-        """Whether it holds rollouts of a simulator alone."""
-        return self.kind in ROLLOUTS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,14 +66,11 @@ class Left:
 
 
 def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
-    """Read a file, or a folder of SIMPLER videos; its content tells what it is."""
-    if path.is_dir():
-        trials = read_simpler(path)
-        return _rollouts(path, SIMPLER, trials, f"{len(trials)} videos named by their outcome")
+    """Read a file; its content tells what it is."""
     if path.suffix.lower() == ".json":
         return _take_json(path)
     # A slip in a name is told by the reader of the table, once it is known which one it is.
-    known = (*COLUMNS, *RATE_COLUMNS, "statistic", "printed", "success")
+    known = (*COLUMNS, *RATE_COLUMNS, "statistic", "printed")
     _refuse_unknown(options, known)
     table = open_table(path, known, options, near=False)
     header = table.header
@@ -105,9 +88,6 @@ def take(path: Path, options: TableOptions = AS_SAVED) -> Taken:
     if "side" in header:
         rows = read_rows(path, ("task", "side"), RATE_COLUMNS, options)
         return _taken_rates(path, rates_of(rows), options)
-    if set(POLARIS_COLUMNS) <= set(header):
-        trials = read_polaris(path)
-        return _rollouts(path, POLARIS, trials, f"{len(trials)} rollouts of its folder's task")
     if "trial_id" in header or ("task" in header and set(SIDES_OF_TRIAL) & set(header)):
         opened = open_trials(path, options)
         trials = trials_of(rows_of(opened))
@@ -123,20 +103,14 @@ def _refuse_unknown(options: TableOptions, known: Sequence[str]) -> None:
             names = ", ".join(dict.fromkeys(("outcome", *known)))
             likely = difflib.get_close_matches(name, ("outcome", *known), n=1)
             hint = f" Did you mean {likely[0]}?" if likely else ""
-            message = f"--map {name}=...: no such column.{hint} There are: {names}."
-            raise UsageError(message)
+            raise UsageError(f"--map {name}=...: no such column.{hint} There are: {names}.")
 
 
 def _unknown_table(table: TableText) -> str:
-    if set(POLARIS_COLUMNS[:2]) <= set(table.header):
-        return (
-            f"{table.path} are PolaRiS results without outcomes: columns "
-            f"{', '.join(POLARIS_COLUMNS[2:])} are not there, and no outcome is guessed."
-        )
     return (
         f"{table.path} is neither a trials CSV (no column trial_id, nor task with recorded or "
-        "sim_planned) nor a rates CSV (no column side) nor PolaRiS results "
-        f"({', '.join(POLARIS_COLUMNS)}); its columns are: {', '.join(table.header) or 'none'}. "
+        "sim_planned) nor a rates CSV (no column side); its columns are: "
+        f"{', '.join(table.header) or 'none'}. "
         'Say which is which: --map "task=...,recorded=...,sim_planned=..."'
     )
 
@@ -147,19 +121,14 @@ def _taken_rates(path: Path, records: Sequence[RateRecord], options: TableOption
     return Taken(path=path, kind="rates", summary=understood, rates=tuple(records))
 
 
-def _rollouts(path: Path, kind: str, trials: Sequence[TrialRecord], what: str) -> Taken:
-    return Taken(path=path, kind=kind, summary=f"{path.name}: {kind}, {what}", trials=tuple(trials))
-
-
 def _take_json(path: Path) -> Taken:
-    """Read ``eval_info.json`` of LeRobot, or a list of trials or rates."""
+    """Read a list of trials or of rates."""
     if not path.is_file():
         hint = "Give a file of results."
         raise PathNotFoundError(path=path, what="results file", hint=hint)
     items = _listed(path)
     if items is None:
-        trials = read_lerobot_eval(path)
-        return _rollouts(path, LEROBOT, trials, f"{len(trials)} episodes")
+        raise TableError(path=path, row=None, found="no list of objects", hint=LISTS)
     if all("side" in item and "task" in item for item in items):
         records = rates_of(json_rows(path, items, RATE_COLUMNS))
         understood = f"{path.name}: rates, {len(records)} objects"
@@ -168,11 +137,10 @@ def _take_json(path: Path) -> Taken:
         trials = read_trials_json(path, items)
         understood = f"{path.name}: trials, {len(trials)} objects"
         return Taken(path=path, kind="trials", summary=understood, trials=tuple(trials))
-    message = (
+    raise UsageError(
         f"{path} lists objects that are neither trials (task with recorded or sim_planned) nor "
         "rates (task, side, rate)."
     )
-    raise UsageError(message)
 
 
 def _listed(path: Path) -> list[dict[str, Any]] | None:
@@ -181,8 +149,7 @@ def _listed(path: Path) -> list[dict[str, Any]] | None:
         record = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         found = f"no JSON ({error})"
-        hint = "Give an eval_info.json of LeRobot, or a list of trials or rates"
-        raise TableError(path=path, row=None, found=found, hint=hint) from error
+        raise TableError(path=path, row=None, found=found, hint=LISTS) from error
     if isinstance(record, dict):
         record = next((record[n] for n in ("trials", "rates") if n in record), None)
     is_list = isinstance(record, list) and record
@@ -196,19 +163,12 @@ def look_through(folder: Path, options: TableOptions = AS_SAVED) -> tuple[list[T
     files = sorted(path for path in folder.rglob("*") if path.is_file())[:MOST_FILES]
     taken: list[Taken] = []
     left: list[Left] = []
-    videos = [p for p in files if p.suffix == ".mp4" and SIMPLER_NAME.fullmatch(p.stem)]
-    if videos:
-        _try(folder, partial(take, folder, options), taken, left)
     for path in files:
-        if path in videos:
-            continue
         if path.suffix.lower() not in READ_ENDINGS:
-            left.append(Left(path=path, reason="no table, JSON or named video"))
-        elif path.suffix.lower() == ".mp4":
-            left.append(Left(path=path, reason="a video whose name tells no outcome"))
+            left.append(Left(path=path, reason="no table and no JSON"))
         else:
             _try(path, partial(take, path, options), taken, left)
-    return _tell_apart(taken, folder), left
+    return taken, left
 
 
 def _try(path: Path, read: Callable[[], Taken], taken: list[Taken], left: list[Left]) -> None:
@@ -217,24 +177,3 @@ def _try(path: Path, read: Callable[[], Taken], taken: list[Taken], left: list[L
     except (BridgeError, UsageError) as error:
         reason = str(error).replace(f"{path} ", "").replace(f"{path}: ", "")
         left.append(Left(path=path, reason=reason))
-
-
-def _tell_apart(taken: Sequence[Taken], folder: Path) -> list[Taken]:
-    """Give the tasks of rollouts the folder's words where a file does not know them."""
-    several = len([each for each in taken if each.kind == LEROBOT]) > 1
-    if not several:
-        return list(taken)
-    return [
-        replace(each, trials=tuple(_in_folder(trial, each.path, folder) for trial in each.trials))
-        if each.kind == LEROBOT
-        else each
-        for each in taken
-    ]
-
-
-def _in_folder(trial: TrialRecord, path: Path, folder: Path) -> TrialRecord:
-    """Name a LeRobot rollout by the folder its file lies in, which is one evaluation's output."""
-    where = path.parent.relative_to(folder).as_posix()
-    if where == ".":
-        return trial
-    return replace(trial, policy=where, trial_id=f"{where}/{trial.trial_id}")

@@ -45,9 +45,7 @@ class Review:
     cause: str = ""
     """Why, in a word or two, where it failed."""
     note: str = ""
-    """What else the rater wants to say."""
     flag: bool = False
-    """Set aside to be looked at again."""
 
     @property
     def success(self) -> bool | None:
@@ -82,7 +80,6 @@ class SavedReview:
     review: Review | None
     """None where there is none."""
     version: str = UNSAVED
-    """Changes whenever the label does."""
 
 
 class ReviewConflictError(BridgeError):

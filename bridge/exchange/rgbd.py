@@ -29,7 +29,6 @@ from bridge.episode.streams import (
     camera_ids,
     camera_info,
     find_camera_topic,
-    image_messages,
     transform_tree,
 )
 from bridge.episode.transforms import TransformTree
@@ -121,7 +120,7 @@ def _write_camera(
         (place / part).mkdir(parents=True, exist_ok=True)
     topics = [find_camera_topic(episode, name, f"{kind}/image") for kind in ("color", "depth")]
     counts = dict.fromkeys(topics, 0)
-    for message in image_messages(episode, [topic for topic in topics if topic is not None]):
+    for message in episode.messages([topic for topic in topics if topic is not None]):
         counts[message.topic] += 1
         with message_named(episode, message.topic, counts[message.topic]):
             if message.topic == topics[0]:

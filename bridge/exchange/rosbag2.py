@@ -53,7 +53,6 @@ class ImportReport:
     files: list[str]
     messages: int
     topics: dict[str, int]
-    """Messages by topic."""
 
 
 def find_files(source: Path) -> list[Path]:

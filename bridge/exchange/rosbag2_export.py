@@ -36,9 +36,7 @@ class ExportReport:
 
     messages: int = 0
     topics: dict[str, int] = field(default_factory=dict)
-    """Messages by topic."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Why, by topic."""
 
 
 @dataclass(kw_only=True)

@@ -171,7 +171,6 @@ class TableText:
     renamed: tuple[tuple[str, str], ...] = ()
     """Theirs and ours, where ``map`` said so."""
     left: tuple[str, ...] = ()
-    """Columns that are not read."""
     axes: Mapping[str, str] = field(default_factory=dict)
     """By axis: the column that holds its value."""
 

@@ -53,7 +53,6 @@ class TrialRecord:
     progress: float | None = None
     """How far the recorded trial came, 0 to 1, where a rubric or its stages say so."""
     sim_progress: float | None = None
-    """The same in the twin."""
     tags: tuple[tuple[str, str], ...] = ()
     """What was varied, by axis: lighting, pose, distractor, start region."""
 
@@ -277,8 +276,7 @@ def import_trials(table: Path, run: RunFolder, *, force: bool) -> list[TrialReco
     trials = read_trials(table)
     path = trials_path(run)
     if path.exists() and not force:
-        message = f"{path} exists already. Replace it with --force, or use another run."
-        raise UsageError(message)
+        raise UsageError(f"{path} exists already. Replace it with --force, or use another run.")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, trials_text(trials).encode())
     return trials

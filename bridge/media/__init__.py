@@ -1,1 +1,1 @@
-"""Colour, depth and video codecs, and how much one image is like another."""
+"""Colour and depth codecs, and how much one image is like another."""

@@ -162,8 +162,7 @@ class SlidWindow:
         padding: Padding,
     ) -> None:
         """Look at both images, which stay as they are."""
-        self._images, broken = _without_broken(first, second)
-        self._spoilt = None if broken is None else _windows_seeing(broken, padding)
+        self._images = first, second
         self._mirrored = padding == "reflect"
         self._room = 0 if padding == "valid" else BORDER
         height, width, channels = first.shape
@@ -259,11 +258,7 @@ class SlidWindow:
         mean_u += mean_v
         similar /= mean_u
         similar *= structure
-        similar = similar[:, : self.columns]
-        if self._spoilt is not None:
-            spoilt = self._spoilt[rows, :, channel]
-            similar[spoilt] = np.nan
-        return Band(channel=channel, rows=rows, similar=similar)
+        return Band(channel=channel, rows=rows, similar=similar[:, : self.columns])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,28 +268,6 @@ class _Scratch:
     seen: Float64[np.ndarray, "4 num_seen width"]
     down: Float64[np.ndarray, "4 num_rows width"]
     across: Float64[np.ndarray, "4 num_rows columns"]
-
-
-def _without_broken(
-    first: np.ndarray, second: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
-    """Set values that are not finite to 0, for their product with 0 would spoil whole blocks."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        if math.isfinite(float(first.sum()) + float(second.sum())):
-            return (first, second), None
-    broken = ~(np.isfinite(first) & np.isfinite(second))
-    return (np.where(broken, 0.0, first), np.where(broken, 0.0, second)), broken
-
-
-def _windows_seeing(
-    broken: Bool[np.ndarray, "height width channels"], padding: Padding
-) -> Bool[np.ndarray, "num_rows num_columns channels"]:
-    from scipy.ndimage import maximum_filter  # noqa: PLC0415  # hardly ever needed
-
-    mode = "mirror" if padding == "reflect" else "constant"
-    near = maximum_filter(broken, size=(WINDOW, WINDOW, 1), mode=mode)
-    inner = slice(BORDER, -BORDER)
-    return np.asarray(near[inner, inner] if padding == "valid" else near)
 
 
 @cache
@@ -316,7 +289,6 @@ PADDINGS: dict[Padding, str] = {
     "zero": "zeros beyond the border",
     "reflect": "mirrored beyond the border",
 }
-"""In words, for stamps."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,6 @@ from bridge.wire.session import WireSession
 PERIOD_S = 1.0
 MAX_SOURCES = 200
 KEPT = 600
-"""Readings kept of each source."""
 EARLIER = 60
 """Of those made before an episode, at most so many begin it: the best of each stretch."""
 

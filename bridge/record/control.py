@@ -84,7 +84,6 @@ class RecorderClient:
 
 
 MAX_LISTED = 1000
-"""Episodes in one answer."""
 RESULTS = ("success", "failure", "unknown")
 Record = TypeVar("Record")
 

@@ -315,11 +315,7 @@ class EpisodeRecording:
         self._writer.write_json(topic, record, type_name=type_name, log_time_ns=log_ns)
 
     def write_clock(self, record: dict[str, Any], stamp_ns: int) -> None:
-        """Append readings of a source's clock.
-
-        Args:
-            stamp_ns: Now, by the recorder's clock [ns since 1970].
-        """
+        """Append readings of a source's clock."""
         self._write_json(CLOCKS, record, schema.CLOCKS, stamp_ns)
 
     def write_event(

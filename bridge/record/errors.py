@@ -6,7 +6,6 @@ from pathlib import Path
 from bridge.errors import BridgeError, UsageError
 
 MAX_NAMED = 4
-"""Topics that a sentence names."""
 
 
 def in_short(words: list[str]) -> str:

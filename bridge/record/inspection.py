@@ -13,7 +13,6 @@ from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
-from bridge.episode.cdr.messages import VideoFrame
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -31,7 +30,6 @@ class MessageState(StrEnum):
 
 
 GOOD = MessageState.GOOD
-"""Looked up for every message."""
 
 
 def resolve_type(topic: str, type_name: str) -> str:
@@ -67,46 +65,26 @@ def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], Messag
         return lambda data: MessageState.UNDECODABLE
     if known.message_encoding == "cdr":
         return lambda data: _inspect_cdr(type_name, data)
-    if known.message_encoding == "json":
-        version = schema.json_schema_version(type_name)
-        return lambda data: _inspect_json(version, data)
-    return _inspect_video
+    version = schema.json_schema_version(type_name)
+    return lambda data: _inspect_json(version, data)
 
 
 def stamp_reader(record: schema.Schema | None) -> Callable[[bytes], int | None] | None:
     """Return what reads the time in a message itself, or None for types without one.
 
-    For messages that came without an attachment: ``header.stamp`` of a ROS 2 type, the timestamp
-    of Foxglove's video.
+    For messages that came without an attachment: ``header.stamp`` of a ROS 2 type.
     """
     if record is None:
         return None
-    if record.name == schema.COMPRESSED_VIDEO and record.message_encoding == "protobuf":
-        return _video_stamp_ns
     if record.schema_encoding == "ros2msg" and codec.begins_with_header(record.data):
         return _header_stamp_ns
     return None
-
-
-def _video_stamp_ns(data: bytes) -> int | None:
-    try:
-        return VideoFrame.from_protobuf(data).stamp_ns or None
-    except codec.MalformedMessageError:
-        return None
 
 
 def _header_stamp_ns(data: bytes) -> int | None:
     """A stamp of 0 was never set."""
     stamp = codec.header_stamp(data)
     return None if stamp is None else join_ns(*stamp) or None
-
-
-def _inspect_video(data: bytes) -> MessageState:
-    try:
-        VideoFrame.from_protobuf(data)
-    except codec.MalformedMessageError:
-        return MessageState.UNDECODABLE
-    return GOOD
 
 
 def _inspect_cdr(type_name: str, data: bytes) -> MessageState:

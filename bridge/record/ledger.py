@@ -23,7 +23,6 @@ class Tally:
     """Counts of one topic."""
 
     received: int = 0
-    """Written to the episode."""
     gaps: int = 0
     """Lost before they reached the recorder, by the publishers' numbers. Negative in a second in
     which more of them arrived late than went missing."""
@@ -81,7 +80,6 @@ class Ledger:
         """Start empty."""
         self.warnings: list[str] = []
         self.presences: dict[str, Presence] = {}
-        """When each topic was there."""
         self.pauses: list[tuple[int, int]] = []
         """Begin and end of each pause that is over [ns]."""
         self._max_topics = max_topics

@@ -41,7 +41,6 @@ class Silence:
     topic: str
     silent_s: float
     required: bool = False
-    """The contract does."""
     cause: str = ""
     """What else is known: its publisher left, or a link closed meanwhile."""
 
@@ -89,11 +88,7 @@ class PresenceMonitor:
         tell: Callable[[News], None] = lambda news: None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin to listen.
-
-        Args:
-            now_s: A clock without steps [s].
-        """
+        """Begin to listen."""
         self.contract: Contract | None = None
         self.starved_s = 0.0
         """How long the recorder stood still in all [s]."""

@@ -154,10 +154,8 @@ class Item:
     """A message that was taken in; the encoder of its stream may put a smaller one in its place."""
 
     sample: WireSample
-    """What is written."""
     step: Step
     ticket: int
-    """Place in the order of arrival."""
     type_name: str
     """Of what is written; "" when nobody knows."""
     size: int

@@ -41,7 +41,6 @@ class Status:
         self.recovered: list[dict[str, Any]] = []
         """What was found cut off when the recorder began."""
         self.others: dict[str, Callable[[], object]] = {}
-        """What others have to say, by name."""
         self._run = run
         self._config = config
         self._input_queue = input_queue

@@ -55,7 +55,6 @@ class TopicHeard:
     odd_attachments: set[int] = field(default_factory=set)
     states: dict[MessageState, int] = field(default_factory=dict)
     last_numbers: dict[bytes, int] = field(default_factory=dict)
-    """By publisher."""
     first_ns: int = 0
     last_ns: int = 0
     last_source_ns: int | None = None
@@ -101,15 +100,12 @@ class TopicHeard:
 class WireListener:
     """Takes messages and liveliness tokens on network threads; judges them at the end."""
 
-    def __init__(self, session: WireSession, key: str, *, enough: int | None = None) -> None:
+    def __init__(self, session: WireSession, key: str) -> None:
         """Begin to listen."""
         self._lock = threading.Lock()
         self._tracker = SequenceTracker()
         self._heard: dict[tuple[str, str, str], TopicHeard] = {}
         self._alive: set[str] = set()
-        self._messages = 0
-        self._enough = enough
-        self.is_enough = threading.Event()
         self._subscribers = [
             session.watch_alive(f"**{ALIVE}", self._on_token),
             session.watch_alive(rmw.TOKENS, self._on_token),
@@ -130,9 +126,6 @@ class WireListener:
                     topic=key[0], type_name=key[1], message_encoding=key[2]
                 )
             self._note(heard, sample)
-            self._messages += 1
-            if self._enough is not None and self._messages >= self._enough:
-                self.is_enough.set()
 
     def _note(self, heard: TopicHeard, sample: WireSample) -> None:
         heard.messages += 1

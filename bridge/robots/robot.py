@@ -11,7 +11,6 @@ import math
 import re
 import sysconfig
 import tomllib
-import types
 import typing
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from html import unescape
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from bridge.data_files import dataset_file, datasets_folder
@@ -39,7 +39,6 @@ GRIPPER_WIDTH = "gripper_width"
 RECORD_TAG = "robot_gst"
 """Element of a URDF that holds the record; readers of URDF pass over what they do not know."""
 NUM_JOINTS = (6, 7)
-"""Joints of an arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +62,6 @@ class Finger:
     offset_m: float = 0.0
     """Width at which the lever is parallel to the closing pads' face [m]."""
     zero_rad: float = 0.0
-    """Value there."""
     table: tuple[tuple[float, float], ...] = ()
     """Rows of width [m] and value [m or rad], widths rising."""
 
@@ -113,7 +111,6 @@ class Gripper:
     fingers: tuple[Finger, ...] = ()
     """Joints that are driven: two, or one that the others follow by ``mimic`` in the URDF."""
     max_width_m: float = 0.0
-    """Distance between the pads when open."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +157,6 @@ class Robot:
     mesh_folders: Mapping[str, str] = field(default_factory=dict)
     """Folders, relative to the robot file, of other packages that ``package://`` names."""
     folder: Path = Path()
-    """Where the robot file lies."""
 
     @property
     def finger_joints(self) -> tuple[str, ...]:
@@ -266,6 +262,10 @@ def _put_before(prefix: str, root: ET.Element) -> None:
             item.set(key, prefix + name)
 
 
+_ODD = (msgspec.ValidationError, AttributeError, TypeError, ValueError)
+"""What a record that is not a robot raises."""
+
+
 def read_robot(name: str) -> Robot:
     """Read a robot file by its name in ``datasets/robots``, or by its path.
 
@@ -277,8 +277,8 @@ def read_robot(name: str) -> Robot:
         table = tomllib.loads(path.read_text())
         if table.pop("schema_version", None) != SCHEMA_VERSION:
             raise ValueError(f"schema_version is not {SCHEMA_VERSION}")
-        return _robot_from({**table, "folder": path.parent})
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, TypeError, ValueError) as error:
+        return replace(_robot_from(table), folder=path.parent)
+    except _ODD as error:
         raise UsageError(f"{path} is not a robot file: {error}. See docs/robots.md.") from error
 
 
@@ -293,7 +293,7 @@ def robot_of(urdf: str) -> Robot:
     if carried is not None:
         try:
             return _robot_from(json.loads(unescape(carried[1])))
-        except (TypeError, ValueError, AttributeError) as error:
+        except _ODD as error:
             raise UsageError(
                 f"the robot description carries a record that is not a robot: {error}. "
                 "Name the robot's file: --robot FILE.toml."
@@ -347,55 +347,20 @@ def robot_name(urdf: str) -> str:
 
 def _robot_from(table: Mapping[str, Any]) -> Robot:
     """Make the record of a table, names with their prefix."""
-    gripper = dict(table.get("gripper", {}))
-    fingers = tuple(_record(Finger, item, "gripper.fingers") for item in gripper.pop("fingers", ()))
-    robot: Robot = _record(
-        Robot,
-        {key: value for key, value in table.items() if key != "gripper"},
-        "robot",
-        gripper=_record(Gripper, gripper, "gripper", fingers=fingers),
-    )
-    robot = _prefixed(robot)
-    _check_names(robot)
-    _check_numbers(robot)
-    return robot
-
-
-def _record(kind: type, table: Mapping[str, Any], where: str, **made: Any) -> Any:
-    """Check keys and types against a dataclass, and make it."""
-    hints = typing.get_type_hints(kind)
-    allowed = [item.name for item in fields(kind)]
-    values = dict(made)
-    for key, value in table.items():
-        if key not in allowed:
+    gripper = table.get("gripper", {})
+    parts = [(Robot, "robot", table), (Gripper, "gripper", gripper)]
+    parts += [(Finger, "gripper.fingers", item) for item in gripper.get("fingers", ())]
+    for kind, where, part in parts:
+        allowed = [item.name for item in fields(kind)]
+        for key in set(part) - set(allowed):
             near = get_close_matches(key, allowed, n=1)
             guess = f"; did you mean {near[0]!r}?" if near else "."
             raise ValueError(f"{where} has no {key}{guess} It may have: {', '.join(allowed)}")
-        values[key] = _fitting(f"{where}.{key}", value, hints[key])
-    for item in fields(kind):
-        if item.name not in values and item.default is item.default_factory:
-            raise ValueError(f"{where} lacks {item.name}")
-    return kind(**values)
-
-
-def _fitting(where: str, value: Any, hint: Any) -> Any:
-    """Return a value of the annotated type: TOML has lists for tuples."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is types.UnionType:
-        return None if value is None else _fitting(where, value, arguments[0])
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        if math.isfinite(value):
-            return float(value)
-    elif hint in (str, bool, Path) and isinstance(value, hint):
-        return value
-    elif origin is tuple and isinstance(value, list | tuple):
-        endless = arguments[-1] is Ellipsis
-        if endless or len(value) == len(arguments):
-            kinds = [arguments[0]] * len(value) if endless else arguments
-            return tuple(_fitting(where, *pair) for pair in zip(value, kinds, strict=True))
-    elif origin is Mapping and isinstance(value, Mapping):
-        return {key: _fitting(f"{where}.{key}", item, str) for key, item in value.items()}
-    raise ValueError(f"{where} cannot be {value!r}")
+    json.dumps(table, default=str, allow_nan=False)  # refuses numbers that are none
+    robot = _prefixed(msgspec.convert(table, Robot))
+    _check_names(robot)
+    _check_numbers(robot)
+    return robot
 
 
 def _prefixed(robot: Robot) -> Robot:

@@ -56,8 +56,7 @@ class HostClock:
         last_ns = self._last_device_ns
         if last_ns is not None and device_ns < last_ns - RESTART_NS:
             if self._wraps_ns is None or last_ns - device_ns < self._wraps_ns // 2:
-                message = "the device's clock went backwards"
-                raise ValueError(message)
+                raise ValueError("the device's clock went backwards")
             self._wrapped_ns += self._wraps_ns
             device_ns += self._wraps_ns
         self._last_device_ns = device_ns if last_ns is None else max(device_ns, last_ns)

@@ -23,7 +23,6 @@ BODIES = (GRIPPER, TABLE)
 CAVITIES = ("open_box", "basket")
 VERBS = ("grasp", "carry", "release", "push")
 MOST_LISTED = 40
-"""Problems in one message."""
 REFERENCES = ("object", "container", "support", "reference", "first", "second")
 """Keys of a success predicate that name an object; the first is the one that moves."""
 

@@ -39,9 +39,7 @@ class Attached:
     sha256: str = ""
     """Of the file it was recorded with; empty: it does not say."""
     data: bytes | None = None
-    """The attachment, where there is one."""
     origin: str = ""
-    """For messages: which episode."""
 
 
 NOTHING = Attached()
@@ -121,8 +119,7 @@ def keep_task_file(tasks_dir: Path, name: str, data: bytes) -> Path:
             _write_new(path, data)
         if path.read_bytes() == data:
             return path
-    message = f"{path} is there with another content. Move it away."
-    raise UsageError(message)
+    raise UsageError(f"{path} is there with another content. Move it away.")
 
 
 def _write_new(path: Path, data: bytes) -> None:
@@ -154,11 +151,10 @@ def union_of(files: Iterable[TaskFile]) -> Task | None:
         for key, model in task.objects.items():
             before, origin = defined.setdefault(key, (model, file.origin))
             if before != model:
-                message = (
+                raise UsageError(
                     f"object {key!r} is defined differently in {origin} and in {file.origin}: one "
                     "scene cannot hold both. Give them two names, or rebuild the scans apart."
                 )
-                raise UsageError(message)
         joined = task if joined is None else _joined(joined, task)
     return joined
 

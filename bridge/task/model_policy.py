@@ -14,15 +14,12 @@ def server_of(url: str) -> tuple[str, str, int, str]:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port
     except ValueError as error:
-        message = f"the model's address cannot be read: {error}."
-        raise UsageError(message) from error
+        raise UsageError(f"the model's address cannot be read: {error}.") from error
     if parts.scheme not in ("http", "https") or not host:
-        message = "the model's address must begin with http:// or https:// and name a host."
-        raise UsageError(message)
+        raise UsageError("the model's address must begin with http:// or https:// and name a host.")
     if "@" in parts.netloc or parts.query or parts.fragment:
-        message = (
+        raise UsageError(
             "the model's address must hold no user, query or fragment. Put the key into the "
             "environment variable instead."
         )
-        raise UsageError(message)
     return parts.scheme, host, port or (443 if parts.scheme == "https" else 80), parts.path

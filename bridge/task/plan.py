@@ -57,7 +57,6 @@ class Ranking:
     cost: float
     """What it is ranked by; less is better."""
     seed: int
-    """What it was drawn with."""
 
 
 @dataclass(frozen=True, kw_only=True)

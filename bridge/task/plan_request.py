@@ -49,11 +49,9 @@ class PlanRequest:
     robot: str
     joint_names: tuple[str, ...]
     joints_rad: tuple[float, ...]
-    """Where the arm stands."""
     objects: tuple[dict[str, Any], ...]
     """One gst localisation v1 record per object of the task, all of them found."""
     stamp_ns: int = 0
-    """The cell's time."""
     refused: tuple[Refusal, ...] = ()
     """What the gate refused before, oldest first; empty where nobody looks at its answers."""
 
@@ -127,7 +125,6 @@ class PlanAnswer:
     plan: Plan | None = None
     reason: str = ""
     heard: bool = True
-    """Whether a planner answered at all."""
     remarks: tuple[str, ...] = ()
     """For whoever looks after the planner; they are not sent."""
 

@@ -62,7 +62,6 @@ class PredicateResult:
     value: bool | None
     detail: str
     object_id: str = ""
-    """The object it is about."""
 
 
 def evaluate_success(task: Task, rollout: Rollout) -> list[PredicateResult]:

@@ -19,7 +19,6 @@ Item = TypeVar("Item")
 
 SCHEMA_VERSION = 1
 FILE_NAME = "protocol.json"
-"""In the run folder."""
 SEEDS_PER_SESSION = 1000
 """Session 7 starts at start seed 7000; sessions never share a start."""
 STARTS_STREAM, ARMS_STREAM = 808, 606
@@ -124,7 +123,6 @@ class Protocol:
     """The one question the study is judged by; None where it was not designed."""
     secondary: tuple[Endpoint, ...] = ()
     interval: str = "wilson"
-    """Interval of rates."""
     alpha: float = 0.05
     """Chance of a false alarm, shared by all questions after Holm."""
     codes: Mapping[str, str] = field(default_factory=dict)
@@ -245,8 +243,7 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
         write_whole(path, protocol.to_json())
         return
     if there.edited:
-        message = f"{path} was edited after it was written: put the written text back."
-        raise UsageError(message)
+        raise UsageError(f"{path} was edited after it was written: put the written text back.")
     compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
     hidden = ("sha256", "edited")
     names = [
@@ -255,11 +252,10 @@ def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> No
         if name not in hidden and getattr(there, name) != getattr(protocol, name)
     ]
     if names:
-        message = (
+        raise UsageError(
             f"{path} was written before the first trial and says something else "
             f"about: {', '.join(names)}. Give the same options again, or another folder."
         )
-        raise UsageError(message)
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:

@@ -94,8 +94,7 @@ def made_of(kind: type[Record], record: Mapping[str, Any], *, name: str) -> Reco
 
 
 def _refuse(text: str) -> float:
-    message = f"{text} is not a number in JSON"
-    raise ValueError(message)
+    raise ValueError(f"{text} is not a number in JSON")
 
 
 def _finite(text: str) -> float:

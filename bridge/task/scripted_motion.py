@@ -45,17 +45,13 @@ class ScriptedMotion:
     hand_link: str
     """Link that carries the tool; it and all links behind it may touch boxes."""
     joints: tuple[str, ...]
-    """The arm's, base to hand."""
     base_m: tuple[float, float, float]
     """Where the root of the URDF stands, its axes along those of the world."""
     targets: tuple[JointTarget, ...]
-    """In the order of their times."""
     gain_hz: float
     """Speed that a joint is told per distance to its target."""
     limit_rad_s: float
-    """Largest speed of each joint."""
     period_s: float
-    """Between two commands."""
     duration_s: float
     boxes: Mapping[str, PushedBox] = field(default_factory=dict)
     """By object id; empty where the tool alone moves."""

@@ -129,7 +129,6 @@ class Task:
     stages: tuple[dict[str, Any], ...]
     success: tuple[dict[str, Any], ...]
     cell: str = "standin"
-    """Cell file the task was made for."""
     derived: Mapping[str, Any] | None = None
     """Who made the file of which tasks' objects, by which version of its rules; None: a person."""
     grip_force_N: float | None = None
@@ -182,7 +181,6 @@ class TaskFile:
     """The text of a task file, and where it was found."""
 
     data: bytes
-    """TOML in UTF-8."""
     origin: str
     """A path, or which attachment of which episode."""
 
@@ -193,8 +191,7 @@ class TaskFile:
             with path.open("rb") as stream:
                 return TaskFile(stream.read(MAX_BYTES + 1), str(path))
         except OSError as error:
-            message = f"{path} cannot be read: {error.strerror}."
-            raise UsageError(message) from error
+            raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
 
     @property
     def sha256(self) -> str:
@@ -239,8 +236,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text())
     except (ValueError, OSError) as error:  # not TOML, not text, not readable
-        message = f"{path} cannot be read as TOML: {error}."
-        raise UsageError(message) from error
+        raise UsageError(f"{path} cannot be read as TOML: {error}.") from error
 
 
 def _task_from(table: dict[str, Any]) -> Task:

@@ -22,7 +22,6 @@ class ClockAnswer(NamedTuple):
     """What one source said."""
 
     source: str
-    """Beginning of its topics."""
     identity: str
     """Of its process; "" where it did not say."""
     host: str

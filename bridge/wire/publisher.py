@@ -110,11 +110,7 @@ class WirePublisher:
         """Messages that found the shared memory full and went over the network instead."""
 
     def put(self, data: bytes | bytearray, *, source_ns: int) -> None:
-        """Send one serialised message made at ``source_ns``.
-
-        Args:
-            source_ns: Source time of the message [ns since 1970].
-        """
+        """Send one serialised message made at ``source_ns``."""
         note = Attachment(sequence=self._sequence, source_ns=source_ns, gid=self.gid)
         self._sequence += 1
         payload: Any = data

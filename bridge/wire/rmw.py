@@ -159,12 +159,10 @@ class EntityKind(Enum):
 class RosQos(NamedTuple):
     """The part of an endpoint's quality of service that matters to a recorder."""
 
-    reliable: bool = True
     transient_local: bool = False
     """Late subscribers get the last messages: /tf_static, /robot_description, maps."""
     depth: int = 42
-    """How many; 42 is rmw_zenoh's default. With keep_all history it is only what was asked for."""
-    keep_all: bool = False
+    """How many; 42 is rmw_zenoh's default."""
 
 
 DEFAULT_QOS = RosQos()
@@ -177,7 +175,6 @@ class RosEndpoint:
     kind: EntityKind
     domain: int
     session: str
-    """zenoh id of the process."""
     node: str
     """With its namespace, as ROS prints it: ``/arm/driver``."""
     topic: str = ""
@@ -239,8 +236,7 @@ def _name(mangled: str) -> str:
 def parse_qos(text: str) -> RosQos | None:
     """Read ``<reliability>:<durability>:<history>,<depth>:...``; an empty field is the default.
 
-    The numbers are those of ``rmw/types.h``: reliability 2 is best effort, durability 1 transient
-    local, history 2 keep all.
+    The numbers are those of ``rmw/types.h``: durability 1 is transient local.
     """
     fields = text.split(":")
     if len(fields) < _QOS_FIELDS:
@@ -249,12 +245,7 @@ def parse_qos(text: str) -> RosQos | None:
     numbers = [fields[0], fields[1], history, depth]
     if any(each and not _is_number(each) for each in numbers):
         return None
-    return RosQos(
-        reliable=fields[0] != "2",
-        transient_local=fields[1] == "1",
-        depth=int(depth) if depth else DEFAULT_QOS.depth,
-        keep_all=history == "2",
-    )
+    return RosQos(fields[1] == "1", int(depth) if depth else DEFAULT_QOS.depth)
 
 
 def _is_number(text: str) -> bool:

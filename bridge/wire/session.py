@@ -194,27 +194,14 @@ def _gid(session: str, entity: int) -> bytes:
 
 
 class Subscriber:
-    """A running subscription."""
+    """A running subscription, or a token that says that somebody is there."""
 
     def __init__(self, inner: Any) -> None:
-        """Use ``WireSession.subscribe``."""
+        """Use ``WireSession.subscribe`` or ``declare_alive``."""
         self._inner = inner
 
     def close(self) -> None:
-        """Stop receiving."""
-        with contextlib.suppress(zenoh.ZError):
-            self._inner.undeclare()
-
-
-class AliveToken:
-    """Says that somebody is there, until it is closed or its process ends."""
-
-    def __init__(self, inner: Any) -> None:
-        """Use ``WireSession.declare_alive``."""
-        self._inner = inner
-
-    def close(self) -> None:
-        """Say goodbye."""
+        """Stop receiving, or say goodbye."""
         with contextlib.suppress(zenoh.ZError):
             self._inner.undeclare()
 
@@ -231,10 +218,9 @@ class WireSession:
         self.last_receive_error = ""
         self._clock = AnchoredClock()
         self._services: list[Service] = []
-        self._alive: list[AliveToken] = []
+        self._alive: list[Subscriber] = []
         self._definitions: dict[tuple[str, str], schema.Schema] = {}
         self.topics: set[str] = set()
-        """What it has publishers for."""
         self._pool = SharedPool(shared_memory_mb * BYTES_PER_MB) if shared_memory_mb else None
 
     @property
@@ -291,7 +277,6 @@ class WireSession:
         Args:
             key_expression: zenoh keys, where ``*`` stands for one part and ``**`` for any number.
             callback: Gets each message, in order; must be quick.
-            max_bytes: Larger payloads are told of (``oversize_bytes``) and not copied.
         """
 
         def on_sample(sample: Any) -> None:
@@ -417,9 +402,6 @@ class WireSession:
         Used for what caches keep: the last messages of a topic whose publisher spoke before we
         listened. Whoever has not answered in time is left out, and so is what comes after
         ``max_mb`` [MB], for nobody knows what a cache holds.
-
-        Args:
-            max_mb: Bound on all answers together [MB].
         """
         answers: list[WireSample] = []
         left = max_mb * BYTES_PER_MB
@@ -442,10 +424,10 @@ class WireSession:
             raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
         return answers
 
-    def declare_alive(self, key: str) -> AliveToken:
+    def declare_alive(self, key: str) -> Subscriber:
         """Let everybody see that this session is there, until it closes or its process ends."""
         try:
-            token = AliveToken(self._inner.liveliness().declare_token(key))
+            token = Subscriber(self._inner.liveliness().declare_token(key))
         except zenoh.ZError as error:
             raise WireConfigError(f"cannot be seen as {key!r}: {cause_of(error)}.") from error
         self._alive.append(token)  # zenoh withdraws a token that nobody holds
@@ -459,14 +441,8 @@ class WireSession:
         except zenoh.ZError as error:
             raise WireError(f"cannot ask {key_expression}: {cause_of(error)}.") from error
 
-    def watch_alive(
-        self,
-        key_expression: str,
-        callback: Callable[[str, bool], None],
-        *,
-        history: bool = True,
-    ) -> Subscriber:
-        """Hear who comes and goes, on the network thread."""
+    def watch_alive(self, key_expression: str, callback: Callable[[str, bool], None]) -> Subscriber:
+        """Hear who is there, comes and goes, on the network thread."""
 
         def on_sample(sample: Any) -> None:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
@@ -474,11 +450,10 @@ class WireSession:
         handler = zenoh.handlers.Callback(on_sample, indirect=False)
         try:
             declared = self._inner.liveliness().declare_subscriber(
-                key_expression, handler, history=history
+                key_expression, handler, history=True
             )
         except zenoh.ZError as error:
-            message = f"cannot watch {key_expression!r}: {cause_of(error)}."
-            raise WireConfigError(message) from error
+            raise WireConfigError(f"cannot watch {key_expression!r}: {cause_of(error)}.") from error
         return Subscriber(declared)
 
     def close(self) -> None:

@@ -16,11 +16,10 @@ from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare.against import against_tables
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.names import settle_names
-from evaluator.compare.notes import with_notes
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.run import QUIET, ReadRun, compare_read, read_run
-from evaluator.compare.spreadsheet import rollout_note, row_from_record, unknown_sides
+from evaluator.compare.spreadsheet import row_from_record, unknown_sides
 from evaluator.compare.trial import Trial
 from evaluator.result import Cell, Exclusion, Table
 
@@ -217,11 +216,7 @@ def _trials(
             method=method,
             goal=goal,
         )
-    rollouts = {each.kind: rollout_note(each) for each in gathered.taken if each.rollouts}
-    base = replace(base, tables=with_notes(base.tables, [*rollouts.values()]))
-    only_sim = {row.episode for row in rows if row.recorded is None and rollouts}
-    left_out = [item for item in unknown_sides(rows) if item.episode not in only_sim]
-    return _from(base, gathered, left_out, merged)
+    return _from(base, gathered, unknown_sides(rows), merged)
 
 
 def _rates_alone(

@@ -1,4 +1,4 @@
-"""A trials CSV, or another benchmark's results, into a ``Comparison``; a run's trials out again."""
+"""A trials CSV into a ``Comparison``; a run's trials out again."""
 
 from collections.abc import Container, Sequence
 from dataclasses import fields, replace
@@ -11,7 +11,6 @@ from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
 from evaluator.compare.from_rows import compare_rows
 from evaluator.compare.names import settle_names
-from evaluator.compare.notes import with_notes
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_records
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
@@ -60,11 +59,10 @@ def compare_csv(
     goal: float | None = None,
     options: TableOptions = AS_SAVED,
 ) -> Comparison:
-    """Compare a table, or another benchmark's result file or folder; its content tells which.
+    """Compare a table; its content tells which.
 
-    Read are a trials CSV, a rates CSV, a published table (rates with printed figures),
-    ``eval_results.csv`` of PolaRiS, ``eval_info.json`` of LeRobot, a JSON list of trials or rates,
-    and a folder of SIMPLER videos.
+    Read are a trials CSV, a rates CSV, a published table (rates with printed figures) and a JSON
+    list of trials or rates.
 
     Raises:
         TableError: Naming the row that contradicts itself.
@@ -96,20 +94,7 @@ def compare_taken(
     base = compare_rows(
         settled_rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
     )
-    if taken.rollouts:
-        base = replace(base, tables=with_notes(base.tables, [rollout_note(taken)]))
-    left_out = [] if taken.rollouts else unknown_sides(settled_rows)
-    return _with_source(base, path, left_out, [*read_as, *merged])
-
-
-def rollout_note(taken: Taken) -> tuple[str, str]:
-    """Say what closed-loop rollouts of another simulator are, and what they lack."""
-    note = (
-        f"{taken.kind} results are rollouts of a policy in that simulator, entered on the sim "
-        "side: no plan was sent and nothing was replayed. Add real trials of the same starts to "
-        "compare"
-    )
-    return taken.kind, note
+    return _with_source(base, path, unknown_sides(settled_rows), [*read_as, *merged])
 
 
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:

@@ -93,9 +93,9 @@ _Job = tuple[_Files, tuple[_Part, ...]]
 
 
 def evaluation_pool(processes: int | None = None) -> ProcessPool:
-    """Processes for reading and comparing, this one included; one for each core by default."""
+    """Processes for reading and comparing; one for each core by default, none for one."""
     size = min(cores(), MAX_PROCESSES) if processes is None else processes
-    return ProcessPool(size - 1, prepare=get_ready, quiet=True)
+    return ProcessPool(size if size > 1 else 0, prepare=get_ready, quiet=True)
 
 
 def get_ready(_: None) -> None:

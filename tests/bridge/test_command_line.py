@@ -11,13 +11,11 @@ from pathlib import Path
 import pytest
 
 import robot_gst
-from bridge.cli import recording
-from bridge.episode.catalogue import label_episode, list_episodes
+from bridge.episode.catalogue import list_episodes
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.whole_file import write_whole
 
 
 @pytest.fixture
@@ -112,37 +110,12 @@ def test_the_list_fits_eighty_columns_and_gives_the_cause_of_what_is_unknown(
     assert f"outcome: unknown ({why})" in capsys.readouterr().out
 
 
-def test_what_a_recorder_lists_looks_like_what_ls_lists(
-    run_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    entries = [dataclasses.asdict(entry) for entry in list_episodes(RunFolder.open(run_path))]
-    answer = json.loads(json.dumps({"ok": True, "of": 3, "episodes": entries}))
-    answer["episodes"][0]["what_later_versions_add"] = 1
-    more, *lines = recording._describe_list(answer).splitlines()
-    assert more == "(2 more before these)"
-    robot_gst.run(["ls", str(run_path)])
-    assert lines == capsys.readouterr().out.splitlines()
-    assert "no episode" in recording._describe_list({"of": 0, "episodes": []})
-
-
 def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Path) -> None:
     run = RunFolder.open(run_path)
     before = (run.episodes_dir / "t1.mcap").read_bytes()
     assert robot_gst.run(["label", str(run_path), "t1", "--result", "failure"]) == 0
     assert list_episodes(run)[0].outcome == "failure"
     assert (run.episodes_dir / "t1.mcap").read_bytes() == before
-
-
-def test_a_label_that_is_no_outcome_is_refused(
-    run_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert robot_gst.run(["label", str(run_path), "t1", "--result", "maybe"]) == 2
-    assert "maybe" in capsys.readouterr().err
-
-
-def test_labelling_an_unknown_episode_lists_those_that_exist(run_path: Path) -> None:
-    with pytest.raises(UsageError, match="Episodes here: t1"):
-        label_episode(RunFolder.open(run_path), "t9", Outcome(result="success"))
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 200, "a b", "a\n"])
@@ -158,17 +131,6 @@ def test_a_settings_file_fills_in_options(
     settings.write_text("[ls]\njson = true\n")
     assert robot_gst.run(["ls", str(run_path), "--config", str(settings)]) == 0
     assert json.loads(capsys.readouterr().out)["episodes"][0]["id"] == "t1"
-
-
-def test_a_misspelt_setting_is_an_error(run_path: Path, tmp_path: Path) -> None:
-    settings = tmp_path / "settings.toml"
-    settings.write_text("[ls]\njsom = true\n")
-    assert robot_gst.run(["ls", str(run_path), "--config", str(settings)]) == 2
-
-
-def test_a_missing_settings_file_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
-    assert robot_gst.run(["ls", "x", "--config", "none.toml"]) == 2
-    assert "settings file not found" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", [command.name for command in robot_gst.commands()])
@@ -199,11 +161,3 @@ def test_no_help_text_holds_what_the_terminal_would_swallow(target: str) -> None
         if dataclasses.is_dataclass(kind):
             texts.extend(help_sources(kind))
     assert [token for text in texts for token in re.findall(r"<[a-z_ ]+>", text)] == []
-
-
-def test_a_file_written_whole_has_its_bytes_and_leaves_no_part(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("before")
-    write_whole(path, b"after")
-    assert path.read_bytes() == b"after"
-    assert list(tmp_path.iterdir()) == [path]

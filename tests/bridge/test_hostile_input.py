@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 import robot_gst
 from bridge.episode import schema, streams
-from bridge.episode.catalogue import label_episode, list_episodes
+from bridge.episode.catalogue import list_episodes
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import (
     FrameTransform,
@@ -78,26 +78,6 @@ def test_metadata_of_another_program_is_one_sentence(
         assert list_episodes(RunFolder.open(tmp_path / "run"))[0].error
 
 
-def test_one_foreign_file_does_not_hide_the_others(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    with EpisodeWriter(run.episodes_dir / "t1.mcap") as writer:
-        writer.describe(EpisodeInfo(id="t1", kind="trial"))
-    foreign_file(run.episodes_dir / "rosbag 2024.05.01.mcap", {})
-    (run.episodes_dir / "gone.mcap").symlink_to(tmp_path / "nowhere")
-    errors = {entry.file: entry.error for entry in list_episodes(run)}
-    assert errors["t1.mcap"] == ""
-    assert errors["rosbag 2024.05.01.mcap"] == ""
-    assert "not found" in errors["gone.mcap"]
-
-
-def test_a_label_goes_by_the_file_name(tmp_path: Path) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    with EpisodeWriter(run.episodes_dir / "renamed.mcap") as writer:
-        writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
-    label_episode(run, "renamed", Outcome(result="failure"))
-    assert [(entry.id, entry.outcome) for entry in list_episodes(run)] == [("renamed", "failure")]
-
-
 @pytest.mark.parametrize(
     "text", [b"[" * 200_000, b'{"p": NaN}', b'{"p": -Infinity}', b'{"p": 1e999}']
 )
@@ -120,13 +100,6 @@ def test_an_image_that_claims_gigabytes_is_refused(size: tuple[int, int]) -> Non
     for decode in (decode_color, decode_depth_png):
         with pytest.raises(UnreadableImageError, match="pixels"):
             decode(png(*size))
-
-
-@pytest.mark.parametrize("body", [b"", struct.pack(">I4s", 9, b"IDAT"), b"\0\0\0\1pHYs\0\0\0\0\0"])
-def test_a_png_without_its_pixels_is_refused(body: bytes) -> None:
-    for decode in (decode_color, decode_depth_png):
-        with pytest.raises(UnreadableImageError):
-            decode(png(4, 4, body))
 
 
 def sample(stamp_ns: int, names: tuple[str, ...], position: list[float]) -> bytes:
@@ -164,15 +137,6 @@ def test_positions_that_do_not_match_their_names_are_found_by_the_check(tmp_path
     assert "1 positions of 2 joints" in check_episode(path).faults[0]
 
 
-def test_only_cameras_of_ours_are_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "e.mcap"
-    topics = ("/c/cam/side/color/image", "/standin/truth/cam/x/color/image", "/color/image")
-    with EpisodeWriter(path) as writer:
-        for topic in topics:
-            writer.write(topic, b"", type_name=schema.COMPRESSED_IMAGE, log_time_ns=1)
-    assert streams.camera_ids(Episode.open(path)) == ["side"]
-
-
 def transform(parent: str, child: str, stamp_ns: int = 0) -> FrameTransform:
     return FrameTransform(stamp_ns=stamp_ns, parent=parent, child=child, T_parent_child=np.eye(4))
 
@@ -198,23 +162,6 @@ def test_frames_that_hang_together_in_no_single_way_are_refused(
     with pytest.raises(AmbiguousFrameError, match=r"frame '[abc]'"):
         tree.T_root_frame(transforms[-1].child if len(transforms) == 2 else "c", 0)
     assert np.array_equal(tree.T_root_frame("fine", 0), np.eye(4))
-
-
-def test_two_encodings_of_one_type_keep_their_own_schemas(tmp_path: Path) -> None:
-    path = tmp_path / "e.mcap"
-    named = schema.Schema(
-        name=schema.JOINT_STATE, schema_encoding="", message_encoding="json", data=b""
-    )
-    with EpisodeWriter(path) as writer:
-        writer.write("/a", sample(1, (), []), type_name=schema.JOINT_STATE, log_time_ns=1)
-        writer.write_foreign("/b", b"{}", schema_record=named, log_time_ns=2)
-        writer.write_foreign("/a", b"{}", schema_record=named, log_time_ns=3)
-    summary = Episode.open(path).files[0].summary
-    found = {
-        (channel.topic, channel.message_encoding, summary.schemas[channel.schema_id].encoding)
-        for channel in summary.channels.values()
-    }
-    assert found == {("/a", "cdr", "ros2msg"), ("/b", "json", ""), ("/a", "json", "")}
 
 
 @pytest.mark.parametrize("text", [b"objects = 3\nschema_version = 1", b"\xff\xfe", b"[", b""])
@@ -269,13 +216,6 @@ def test_a_reader_that_has_seen_enough_is_no_traceback(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, check=False)
     os.close(write)
     assert done.stderr == b""
-
-
-def test_zenoh_and_settings_files_may_come_in_any_order(tmp_path: Path) -> None:
-    settings = tmp_path / "settings.toml"
-    settings.write_text("")
-    tokens = ["record", "run", "--config", "zenoh.json5", "--config", str(settings)]
-    assert robot_gst._take_config(tokens) == (tokens[:4], settings)
 
 
 @pytest.mark.parametrize(

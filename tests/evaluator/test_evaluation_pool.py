@@ -10,7 +10,7 @@ import pytest
 from other_processes import check_an_interrupted_evaluation
 
 from bridge import process_pool
-from bridge.process_pool import ProcessPool
+from bridge.process_pool import ProcessPool, Worker
 from bridge.terminal import Output
 from evaluator.cache import FOLDER, SummaryCache
 from evaluator.compare import compare_run, run
@@ -38,8 +38,8 @@ def pool() -> Iterator[ProcessPool]:
 
 @pytest.fixture
 def two(pool: ProcessPool) -> ProcessPool:
-    """This process and one beside it."""
-    return begun(pool, 1)
+    """Two processes beside this one."""
+    return begun(pool, 2)
 
 
 @pytest.fixture
@@ -67,16 +67,17 @@ def test_results_are_the_same_bytes_with_and_without_processes(
     two: ProcessPool, six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil(six_trials.run.episodes_dir, six_trials.run.derived("b1.replay.planned*")[0])
-    taken: list[int] = []
+    taken: list[object] = []
     after: list[Callable[[], object]] = []
-    take = process_pool._Shared.take
+    finish = Worker.finish
 
-    def noting(self: Any, worker: Any, answer: Any) -> None:
-        take(self, worker, answer)
+    def noting(self: Worker, timeout_s: float | None = None) -> object:
+        answer = finish(self, timeout_s)
         if isinstance(answer, list):
-            taken.append(len(answer))
+            taken.append(answer)
             for act in after:
                 act()
+        return answer
 
     def results(name: str) -> bytes:
         with SummaryCache(tmp_path / name / FOLDER) as cache:
@@ -85,43 +86,35 @@ def test_results_are_the_same_bytes_with_and_without_processes(
         assert "a1.mcap" in named
         return write_results(comparison.results(), tmp_path / name / "results.json").read_bytes()
 
-    monkeypatch.setattr(process_pool._Shared, "take", noting)
+    monkeypatch.setattr(Worker, "finish", noting)
     alone = results("alone")
     assert taken == []
+    monkeypatch.setattr(process_pool, "WORTH_S", 1e-3)
     monkeypatch.setattr(run, "evaluation_pool", lambda: nullcontext(two))
     assert results("two") == alone
-    assert sum(taken) > 2
-    taken.clear()
+    assert len(taken) > 2
     after.append(two.workers[0].process.kill)
     assert results("killed") == alone
-    assert len(taken) <= process_pool.AHEAD
-    assert two.workers == []
 
 
 INTERRUPTED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in a background
 import robot_gst
-from multiprocessing.connection import wait
 from bridge import process_pool
 from evaluator.compare import summaries
-from evaluator.run_reader import contents
 
-def read_recorded(*_):
-    (worker,) = told
-    wait([worker.outlet], 30)
-    print("reading", flush=True)
-    time.sleep(20)
-
-told = []
 class Told(process_pool.Worker):
     def __init__(self, **settings):
         super().__init__(**settings)
-        told.append(self)
         print(self.process.pid, flush=True)
 
+    def finish(self, timeout_s=None):
+        print("reading", flush=True)
+        time.sleep(20)
+
 process_pool.WORTH_S, process_pool.Worker = 1e-3, Told
-contents.read_recorded, summaries.cores = read_recorded, lambda: 2
+summaries.cores = lambda: 2
 sys.exit(robot_gst.run(["evaluate", sys.argv[1]]))
 """
 
@@ -148,5 +141,3 @@ def test_without_a_further_process_all_is_done_here(nobody: list[bool]) -> None:
     pool = evaluation_pool(2)
     assert list(pool.map(abs, range(9), each_s=process_pool.WORTH_S)) == list(range(9))
     assert nobody == [True]
-    assert list(pool.map(abs, range(9), each_s=process_pool.WORTH_S)) == list(range(9))
-    assert nobody == [True]  # it is not asked for again

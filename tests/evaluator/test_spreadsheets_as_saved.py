@@ -172,22 +172,20 @@ def test_a_folder_of_results_is_read_and_what_is_left_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "results"
-    for policy, successes in (("act", [True, False]), ("dp", [True, True])):
+    for policy, successes in (("act", [1, 0]), ("dp", [1, 1])):
         (folder / policy).mkdir(parents=True)
-        task = {"task_group": "g", "task_id": 0, "metrics": {"successes": successes}}
-        (folder / policy / "eval_info.json").write_text(json.dumps({"per_task": [task]}))
-    (folder / "polaris").mkdir()
-    # As its scripts/eval.py wrote it before it scored anything (github.com/arhanjain/polaris).
-    (folder / "polaris" / "eval_results.csv").write_text("episode,episode_length\n0,100\n")
+        trials = [{"task": "g/0", "policy": policy, "sim_planned": each} for each in successes]
+        (folder / policy / "trials.json").write_text(json.dumps(trials))
+    (folder / "lengths.csv").write_text("episode,episode_length\n0,100\n")
     (folder / "real.json").write_text(json.dumps([{"task": "g/0", "policy": "act", "recorded": 1}]))
     (folder / "rates.csv").write_text("task,side,rate\nx,real,0.5\n")
     (folder / "notes.md").write_text("monday")
     assert evaluate(folder, out=tmp_path / "out") == 0
     err = capsys.readouterr().err
-    assert "no outcome is guessed" in err
+    assert "neither a trials CSV" in err
     taken, left = look_through(folder)
-    assert {each.kind for each in taken} == {"LeRobot", "trials", "rates"}
-    assert {one.path.name for one in left} == {"eval_results.csv", "notes.md"}
+    assert {each.kind for each in taken} == {"trials", "rates"}
+    assert {one.path.name for one in left} == {"lengths.csv", "notes.md"}
     comparison = compare_several([folder])
     sides = {(g.task, g.policy): (g.recorded.n, g.sim.n) for g in comparison.groups}
     assert sides == {("g/0", "act"): (1, 2), ("g/0", "dp"): (0, 2)}

@@ -1,18 +1,16 @@
-"""What Rerun makes of our camera topics, and Google's protobuf of our video message."""
+"""What Rerun makes of our camera topics."""
 
 import subprocess
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
-from video_messages import video_message
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact, image_to_jpeg
-from bridge.episode.cdr.messages import CompressedColor, DepthImage, VideoFrame
+from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.writer import EpisodeWriter
 from bridge.media.depth import RVL_FORMAT, unpack
 
@@ -36,25 +34,14 @@ def color(index: int) -> bytes:
 
 
 def write(path: Path) -> None:
-    av = pytest.importorskip("av")
-    encoder = av.CodecContext.create("libx264", "w")
-    encoder.width, encoder.height, encoder.pix_fmt = 32, 24, "yuv420p"
-    encoder.time_base = Fraction(1, 30)
-    encoder.options = {"tune": "zerolatency", "bf": "0", "x264-params": "annexb=1:repeat-headers=1"}
     with EpisodeWriter(path) as writer:
         for index in range(COUNT):
             stamp_ns = START_NS + index * 33_333_333
             raw = DepthImage(stamp_ns=stamp_ns, frame_id="camera", depth_mm=depth(index)).to_cdr()
-            image = np.zeros((24, 32, 3), dtype=np.uint8)
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
-            picture.pts = index
-            (packet,) = encoder.encode(picture)
-            video = video_message(stamp_ns, "camera", bytes(packet))
             for topic, data, name in (
                 ("/c/cam/raw/depth/image", raw, schema.IMAGE),
                 ("/c/cam/compact/depth/image", depth_to_compact(raw), schema.COMPRESSED_IMAGE),
                 ("/c/cam/raw/color/image", image_to_jpeg(color(index)), schema.COMPRESSED_IMAGE),
-                ("/c/cam/raw/color/preview", video, schema.COMPRESSED_VIDEO),
             ):
                 assert data is not None
                 writer.write(topic, data, type_name=name, log_time_ns=stamp_ns)
@@ -78,7 +65,7 @@ def converted(path: Path) -> dict[str, dict[str, list[object]]]:
 
 
 @pytest.mark.slow
-def test_rerun_sees_depth_colour_and_video(tmp_path: Path) -> None:
+def test_rerun_sees_depth_and_colour(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     path = tmp_path / "cameras.mcap"
     write(path)
@@ -97,7 +84,6 @@ def test_rerun_sees_depth_colour_and_video(tmp_path: Path) -> None:
     ours = image_to_jpeg(color(0))
     assert ours is not None
     assert pixels_of(jpeg[0]).tobytes() == CompressedColor.from_cdr(ours).data
-    assert len(found["/c/cam/raw/color/preview"]["VideoStream:sample"]) == COUNT
 
 
 def pixels_of(value: object) -> np.ndarray:
@@ -107,21 +93,3 @@ def pixels_of(value: object) -> np.ndarray:
         if isinstance(content, bytes)
         else np.array(content, dtype=np.uint8)
     )
-
-
-def test_googles_protobuf_reads_our_video_message_by_our_schema() -> None:
-    pool_module = pytest.importorskip("google.protobuf.descriptor_pool")
-    from google.protobuf import descriptor_pb2, message_factory
-
-    known = schema.schema_for(schema.COMPRESSED_VIDEO)
-    assert known is not None
-    pool = pool_module.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(known.data).file:
-        pool.Add(file)
-    described = pool.FindMessageTypeByName(schema.COMPRESSED_VIDEO)
-    message = message_factory.GetMessageClass(described)()
-    message.ParseFromString(video_message(START_NS + 7, "camera", b"\0\0\0\1 data"))
-    assert (message.timestamp.seconds, message.timestamp.nanos) == (START_NS // 10**9, 7)
-    assert (message.frame_id, message.data, message.format) == ("camera", b"\0\0\0\1 data", "h264")
-    again = VideoFrame.from_protobuf(message.SerializeToString())
-    assert again.stamp_ns == START_NS + 7

@@ -152,7 +152,7 @@ def _stamps(
     if executed and topic is not None:
         found = (
             color_from_message(message.type_name, message.data).stamp_ns
-            for message in streams.image_messages(episode, [topic])
+            for message in episode.messages([topic])
         )
         stamps = [stamp_ns for stamp_ns in found if start_ns <= stamp_ns <= end_ns]
     else:

@@ -165,7 +165,7 @@ def _recorded_stamps(episode: Episode, camera_id: str) -> list[int]:
 
 def _recorded_images(episode: Episode, camera_id: str) -> Iterator[Any]:
     topic = streams.find_camera_topic(episode, camera_id, "color/image")
-    for message in streams.image_messages(episode, [] if topic is None else [topic]):
+    for message in episode.messages([] if topic is None else [topic]):
         yield color_from_message(message.type_name, message.data)
 
 

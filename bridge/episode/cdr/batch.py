@@ -54,8 +54,7 @@ class MessageTemplate:
     def _place(self, mark: bytes) -> int:
         at = self._bytes.find(mark)
         if at < 0 or self._bytes.find(mark, at + 1) >= 0:
-            message = f"{mark!r} is not once in the message"
-            raise ValueError(message)
+            raise ValueError(f"{mark!r} is not once in the message")
         return at
 
     def fill(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
@@ -128,7 +127,6 @@ def joint_messages(
     """Yield sensor_msgs/JointState messages with positions alone.
 
     Args:
-        stamps_ns: Source time of each message [ns since 1970].
         names: Joints, in the order of the columns of ``position``.
         position: One row for each message [rad; m for a gripper's width].
     """
@@ -143,7 +141,6 @@ def pose_messages(
     """Yield geometry_msgs/PoseStamped messages.
 
     Args:
-        stamps_ns: Source time of each message [ns since 1970].
         frame_id: The frame the poses are expressed in.
     """
     q, p = se3.split(Ts_frame_body)

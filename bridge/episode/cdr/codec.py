@@ -165,8 +165,7 @@ def _counter(order: str, *, item_bytes: int = 1) -> Callable[[Buffer, int], tupl
         (length,) = unpack(data, at)
         at += 4
         if length * item_bytes > len(data) - at:
-            message = f"{length} items of {item_bytes} bytes or more run past the end"
-            raise ValueError(message)
+            raise ValueError(f"{length} items of {item_bytes} bytes or more run past the end")
         return length, at
 
     return count
@@ -179,8 +178,7 @@ def _text(order: str) -> Callable[[Buffer, int], tuple[str, int]]:
         at += -at & 3
         end = at + 4 + unpack(data, at)[0]
         if end > len(data):
-            message = f"string of {end - at - 4} bytes runs past the end"
-            raise ValueError(message)
+            raise ValueError(f"string of {end - at - 4} bytes runs past the end")
         return str(data[at + 4 : end], "utf-8").rstrip("\0"), end
 
     return text
@@ -227,8 +225,7 @@ def _extent(field: Field, order: str) -> Callable[[Buffer, int], tuple[int, int]
                 return at, 0
         at += (ORIGIN - at) & mask
         if at + length * size > len(data):
-            message = f"array of {length} x {field.type_name} runs past the end"
-            raise ValueError(message)
+            raise ValueError(f"array of {length} x {field.type_name} runs past the end")
         return at, length
 
     return extent
@@ -349,8 +346,7 @@ def _write_array(out: bytearray, field: Field, value: Any) -> None:
         raw, length = array.astype("<" + code).tobytes(), array.size
     if field.length:
         if length != field.length:
-            message = f"{field.name} needs {field.length} values, got {length}"
-            raise ValueError(message)
+            raise ValueError(f"{field.name} needs {field.length} values, got {length}")
     else:
         _align(out, 4)
         out.extend(struct.pack("<I", length))

@@ -44,7 +44,6 @@ class ImageHeader:
     encoding: str
     is_bigendian: bool
     step: int
-    """Bytes from one row to the next."""
     pixels: memoryview
 
     @property

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from bridge.clock import join_ns, split_ns
-from bridge.episode import protobuf, schema
+from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.codec import MalformedMessageError, Message
+from bridge.episode.cdr.codec import Message
 from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
@@ -25,49 +25,6 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media import depth
 from bridge.media.color import decode_color
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoFrame:
-    """One frame of a video stream; it may need the frames before it to be shown."""
-
-    stamp_ns: int
-    frame_id: str
-    data: bytes
-    format: str
-
-    @staticmethod
-    def from_protobuf(data: bytes) -> "VideoFrame":
-        """Read a foxglove.CompressedVideo."""
-        found: dict[int, bytes] = {}
-        try:
-            for number, value in protobuf.fields(memoryview(data)):
-                if 1 <= number <= 4:
-                    if isinstance(value, int):
-                        message = f"field {number} is a number"
-                        raise ValueError(message)
-                    found[number] = bytes(value)
-            return VideoFrame(
-                stamp_ns=_stamp(found.get(1, b"")),
-                frame_id=found.get(2, b"").decode(),
-                data=found.get(3, b""),
-                format=found.get(4, b"").decode(),
-            )
-        except ValueError as error:
-            raise MalformedMessageError(
-                type_name=schema.COMPRESSED_VIDEO, found=str(error)
-            ) from error
-
-
-def _stamp(data: bytes) -> int:
-    parts = {1: 0, 2: 0}
-    for number, value in protobuf.fields(memoryview(data)):
-        if number in parts:
-            if not isinstance(value, int):
-                message = "the time is not made of numbers"
-                raise ValueError(message)
-            parts[number] = protobuf.signed(value)
-    return join_ns(parts[1], parts[2])
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -186,23 +143,6 @@ class RawColor:
 def _no_color(encoding: str) -> codec.MalformedMessageError:
     found = f"encoding {encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}"
     return codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
-
-
-def raw_color_to_cdr(
-    stamp_ns: int, frame_id: str, image_u8: UInt8[np.ndarray, "height width 3"]
-) -> bytes:
-    """Serialise an sRGB image as sensor_msgs/Image of encoding rgb8."""
-    height, width = image_u8.shape[:2]
-    message = {
-        "header": _header(stamp_ns, frame_id),
-        "height": height,
-        "width": width,
-        "encoding": "rgb8",
-        "is_bigendian": 0,
-        "step": 3 * width,
-        "data": image_u8.tobytes(),
-    }
-    return codec.encode(schema.IMAGE, message)
 
 
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:

@@ -121,8 +121,7 @@ def read_plain(record: bytes) -> McapRecord | None:
     """Return a whole header, schema, channel or metadata record, checked to its end."""
     found = parse(record[0], record[RECORD_HEAD.size :])
     if isinstance(found, Schema) and found.id == 0:
-        message = "a schema has id 0"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("a schema has id 0")
     return found
 
 
@@ -151,8 +150,7 @@ class ChunkHead:
 def parse_chunk_head(front: bytes) -> ChunkHead:
     """Read a chunk's head from the first bytes of its record."""
     if len(front) < _CHUNK_HEAD_BYTES or front[0] != CHUNK:
-        message = "no chunk head"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("no chunk head")
     _, length = RECORD_HEAD.unpack_from(front)
     _, _, size, crc = CHUNK_FIELDS.unpack_from(front, RECORD_HEAD.size)
     at = _CHUNK_HEAD_BYTES
@@ -160,8 +158,7 @@ def parse_chunk_head(front: bytes) -> ChunkHead:
     name = front[at : at + name_bytes] if name_bytes <= len("zstd") else b"?"
     at += name_bytes
     if name not in _COMPRESSIONS or len(front) < at + 8:
-        message = f"its compression {name!r} is not known"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"its compression {name!r} is not known")
     return ChunkHead(
         head_bytes=at + 8,
         record_bytes=RECORD_HEAD.size + length,
@@ -177,11 +174,9 @@ class Contents:
     """The whole records found from the front of a chunk's data."""
 
     size: int = 0
-    """Bytes they fill."""
     index: dict[int, list[int]] = field(default_factory=dict)
     """By channel: log time and offset of each message, one after the other."""
     definitions: list[bytes] = field(default_factory=list)
-    """Schema and channel records."""
 
     @property
     def num_messages(self) -> int:

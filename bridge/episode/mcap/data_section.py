@@ -40,11 +40,7 @@ class Summary:
             self.add_messages(counts, start_ns=place.start_ns, end_ns=place.end_ns)
 
     def add_messages(self, counts: dict[int, int], *, start_ns: int, end_ns: int) -> None:
-        """Book messages by channel, the first and the last log time among them.
-
-        Args:
-            start_ns: Earliest log time among them [ns since 1970].
-        """
+        """Book messages by channel, the first and the last log time among them."""
         for channel_id, count in counts.items():
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
         self.start_ns = start_ns if self.start_ns is None else min(self.start_ns, start_ns)
@@ -61,15 +57,7 @@ class Summary:
         offset: int,
         length: int,
     ) -> None:
-        """Book an attachment record that is in the file.
-
-        Args:
-            log_time_ns: When it was recorded [ns since 1970].
-            create_time_ns: When it was made; 0 for unknown.
-            data_size: Of the attachment alone [bytes].
-            offset: Where its record begins [bytes from the start of the file].
-            length: Of the whole record [bytes].
-        """
+        """Book an attachment record that is in the file."""
         self._attachments.append(
             mcap_format.attachment_index(
                 name,
@@ -133,7 +121,6 @@ class EncodedChunk:
     buffers: list[Buffer]
     length: int
     crc: int
-    """CRC-32 of the whole record."""
     start_ns: int
     end_ns: int
     compression: str
@@ -159,7 +146,6 @@ class OpenChunk:
         self.number = 0
         """Of this chunk among those of its group."""
         self.is_small = gather
-        """Whether it holds small messages."""
         self._compressor = _compressor(gather=gather) if compress else None
         self._gather = gather
         self._clear()
@@ -198,9 +184,7 @@ class OpenChunk:
 
         Args:
             sequence: The publisher's number of the message, 0 to 2^32 - 1.
-            log_time_ns: When it was received [ns since 1970].
             data: The payload; without ``gather`` it must not change before the chunk is written.
-            length: Of the payload, all its pieces together [bytes].
 
         Raises:
             struct.error: When a number does not fit its field; nothing is appended then.
@@ -314,12 +298,7 @@ class DataSection:
     def book(
         self, chunk: EncodedChunk, start: int, offsets: dict[int, int], index_length: int
     ) -> None:
-        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``.
-
-        Args:
-            start: Where the chunk begins [bytes from the start of the file].
-            index_length: Of all its message indexes together [bytes].
-        """
+        """Tell the summary of a chunk at ``start`` with message indexes at ``offsets``."""
         place = ChunkPlace(
             start_ns=chunk.start_ns,
             end_ns=chunk.end_ns,
@@ -337,12 +316,7 @@ class DataSection:
     def add_attachment(
         self, name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
     ) -> None:
-        """Write an attachment.
-
-        Args:
-            log_time_ns: When it was recorded [ns since 1970].
-            create_time_ns: When it was made; 0 for unknown.
-        """
+        """Write an attachment."""
         buffers = mcap_format.attachment(
             name,
             data,
@@ -380,7 +354,6 @@ def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[
 
     Args:
         index: By channel id: log time and offset of each message, one after the other.
-        start: Where the first record will begin [bytes from the start of the file].
     """
     records = [mcap_format.message_index(*item) for item in index.items()]
     offsets = {}

@@ -40,11 +40,7 @@ from bridge.errors import EpisodeError
 
 
 def rebuild_summary(stream: ByteStream, data_end: int) -> Summary:
-    """Read the whole data section once; every chunk is unpacked and its CRC checked.
-
-    Args:
-        data_end: Where its data section ends [bytes from the start of the file].
-    """
+    """Read the whole data section once; every chunk is unpacked and its CRC checked."""
     builder = _Builder()
     for place in walk(stream, len(MAGIC), data_end):
         builder.add(stream, place)
@@ -99,7 +95,6 @@ class Seen:
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel."""
     start_ns: int | None = None
     end_ns: int = 0
     chunks: list[records.ChunkIndex] = field(default_factory=list)
@@ -256,8 +251,7 @@ class McapFile:
         """Return the place of the record an index points at."""
         place = next(walk(stream, offset, self.data_end), None)
         if place is None or place.opcode != opcode:
-            message = f"the index points at byte {offset}, where no such record lies"
-            raise BrokenRecordError(message)
+            raise BrokenRecordError(f"the index points at byte {offset}, where no such record lies")
         return place
 
     def attachment(self, name: str) -> bytes | None:
@@ -317,14 +311,12 @@ def _note(stream: ByteStream, place: RecordSpan, found: LooseMessages) -> None:
 def read_header(stream: ByteStream) -> records.Header:
     """Read magic and first record; raises BrokenRecordError."""
     if stream.read(len(MAGIC)) != MAGIC:
-        message = "it does not begin as an MCAP file does"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("it does not begin as an MCAP file does")
     size = stream.seek(0, 2)
     place = next(walk(stream, len(MAGIC), size), None)
     record = parse(place.opcode, read_body(stream, place)) if place else None
     if not isinstance(record, records.Header):
-        message = "its first record is no header"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("its first record is no header")
     return record
 
 
@@ -334,12 +326,10 @@ def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
     stream.seek(max(at, 0))
     tail = stream.read(_FOOTER_BYTES)
     if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC):
-        message = "it does not end as a finished MCAP file does"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("it does not end as a finished MCAP file does")
     footer = parse(tail[0], tail[RECORD_HEAD.size : -len(MAGIC)])
     if not isinstance(footer, records.Footer):
-        message = "its last record is no footer"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("its last record is no footer")
     if footer.summary_start > at:
         message = f"its summary should begin at byte {footer.summary_start}, behind its footer"
         raise BrokenRecordError(message)
@@ -351,7 +341,6 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
 
     Args:
         footer: The last record, with the summary's place and CRC (0: not checked).
-        footer_at: Where the footer begins [bytes from the start of the file].
     """
     if not footer.summary_start:
         return None
@@ -359,8 +348,7 @@ def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> 
     # The CRC covers everything up to itself, the last field of the footer.
     section = stream.read(footer_at + RECORD_HEAD.size + 16 - footer.summary_start)
     if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
-        message = "its summary has another CRC than it declares"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("its summary has another CRC than it declares")
     summary = Summary()
     start = footer.summary_start
     for place in walk_section(section[: footer_at - start], start):

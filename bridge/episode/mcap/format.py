@@ -27,7 +27,6 @@ MESSAGE_FIELDS = MESSAGE_HEAD.size - RECORD_HEAD.size
 CHUNK_FIELDS = struct.Struct("<QQQI")
 """First and last log time, size and CRC of the records inside before compression."""
 ATTACHMENT_FIELDS = struct.Struct("<QQ")
-"""Log time and create time."""
 FOOTER_FIELDS = struct.Struct("<QQI")
 """Start of the summary, start of its offsets, CRC of the summary."""
 
@@ -44,7 +43,6 @@ class ChunkPlace:
     end_ns: int
     offset: int
     length: int
-    """Of the whole chunk record."""
     index_offsets: Mapping[int, int]
     """Where the message index of each channel lies."""
     index_length: int
@@ -117,8 +115,6 @@ def chunk_head(
     """Encode everything of a chunk that stands before its data.
 
     Args:
-        start_ns: First log time inside.
-        end_ns: Last log time inside.
         compression: Empty, lz4 or zstd.
     """
     fields = CHUNK_FIELDS.pack(start_ns, end_ns, size, crc) + text(compression)
@@ -127,11 +123,7 @@ def chunk_head(
 
 
 def message_index(channel_id: int, entries: list[int]) -> bytes:
-    """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ...
-
-    Args:
-        entries: Log times [ns since 1970] and offsets [bytes into the unpacked chunk] in turn.
-    """
+    """Encode where a channel's messages lie in a chunk: log time, offset, log time, offset ..."""
     head = struct.pack("<HI", channel_id, 8 * len(entries))
     return record(MESSAGE_INDEX, head, struct.pack(f"<{len(entries)}Q", *entries))
 
@@ -154,12 +146,7 @@ def chunk_index(place: ChunkPlace) -> bytes:
 def attachment(
     name: str, data: bytes, *, media_type: str, log_time_ns: int, create_time_ns: int
 ) -> list[Buffer]:
-    """Encode an attachment as buffers to be written one after the other.
-
-    Args:
-        log_time_ns: When it was recorded [ns since 1970].
-        create_time_ns: When it was made; 0 for unknown.
-    """
+    """Encode an attachment as buffers to be written one after the other."""
     fields = ATTACHMENT_FIELDS.pack(log_time_ns, create_time_ns) + text(name) + text(media_type)
     fields += struct.pack("<Q", len(data))
     crc = zlib.crc32(data, zlib.crc32(fields))
@@ -177,15 +164,7 @@ def attachment_index(
     offset: int,
     length: int,
 ) -> bytes:
-    """Encode where an attachment record of ``length`` bytes lies.
-
-    Args:
-        log_time_ns: When it was recorded [ns since 1970].
-        create_time_ns: When it was made; 0 for unknown.
-        data_size: Of the attachment alone [bytes].
-        offset: Where its record begins [bytes from the start of the file].
-        length: Of the whole record [bytes].
-    """
+    """Encode where an attachment record of ``length`` bytes lies."""
     numbers = struct.pack("<QQQQQ", offset, length, log_time_ns, create_time_ns, data_size)
     return record(ATTACHMENT_INDEX, numbers, text(name), text(media_type))
 
@@ -211,12 +190,7 @@ def statistics(
     end_ns: int,
     message_counts: Mapping[int, int],
 ) -> bytes:
-    """Encode the counts of a file; ``message_counts`` is by channel.
-
-    Args:
-        start_ns: Earliest log time [ns since 1970], 0 when there is no message.
-        end_ns: Latest log time, 0 when there is no message.
-    """
+    """Encode the counts of a file; ``message_counts`` is by channel."""
     counts = b"".join(struct.pack("<HQ", *item) for item in message_counts.items())
     numbers = (sum(message_counts.values()), schemas, channels, attachments, metadata_records)
     times = (chunks, start_ns, end_ns, len(counts))
@@ -224,12 +198,7 @@ def statistics(
 
 
 def summary_offset(opcode: int, *, start: int, length: int) -> bytes:
-    """Encode where the summary's records of one kind lie.
-
-    Args:
-        start: Where the first of them begins [bytes from the start of the file].
-        length: Of all of them together [bytes].
-    """
+    """Encode where the summary's records of one kind lie."""
     return record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, length))
 
 

@@ -62,8 +62,7 @@ def _refuse_strays(
     is_known = announced[channel_ids]
     if not is_known.all():
         channel_id = int(channel_ids[int(np.argmin(is_known))])
-        message = f"a message is of channel {channel_id}, which was never announced"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message is of channel {channel_id}, which was never announced")
 
 
 def message_table(data: bytes) -> MessageTable:
@@ -86,7 +85,6 @@ def message_table(data: bytes) -> MessageTable:
 MEMORY_BYTES = 256 << 20
 """Unpacked chunks held at a time; one chunk may be larger."""
 NEVER = 1 << 64
-"""After every log time there can be."""
 
 
 class Stored(NamedTuple):
@@ -106,9 +104,7 @@ class Selection(NamedTuple):
     topics: frozenset[str] | None = None
     """None for all."""
     start_ns: int | None = None
-    """Included."""
     end_ns: int | None = None
-    """Excluded."""
 
     def overlaps(self, start_ns: int, end_ns: int) -> bool:
         """Whether a stretch of time, ends included, holds a wanted one."""
@@ -132,7 +128,6 @@ class _OpenFile:
         self._announced = mask_of(file.summary.channels)
         self._chosen = mask_of(self.wanted_channels)
         self.pending = 0
-        """Sources that still have messages."""
         self._stream: ByteStream | None = None
 
     def stream(self) -> ByteStream:
@@ -229,16 +224,11 @@ def _wanted_of(table: MessageTable, file: _OpenFile) -> _Wanted:
 def read_chunk(
     stream: ByteStream, index: records.ChunkIndex, data_end: int
 ) -> tuple[bytes, MessageTable]:
-    """Unpack a chunk, its CRC checked, and list its messages.
-
-    Args:
-        data_end: Where the data section ends [bytes from the start of the file].
-    """
+    """Unpack a chunk, its CRC checked, and list its messages."""
     offset = index.chunk_start_offset
     place = next(walk(stream, offset, data_end), None)
     if place is None or place.opcode != CHUNK:
-        message = f"the index points at byte {offset}, where no chunk lies"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the index points at byte {offset}, where no chunk lies")
     chunk = parse_chunk(read_body(stream, place))
     data = unpack_chunk(chunk, whose=f"the chunk at byte {offset}")
     return data, message_table(data)

@@ -195,11 +195,10 @@ def open_part(path: Path, *, replace_dead: bool) -> PartFile:
             _remove_dead(part_path)
         file = PartFile.create(part_path)
     except (FileExistsError, BlockingIOError) as error:
-        message = (
+        raise UsageError(
             f"{part_path} exists: another writer has it open, or died. "
             "Choose another name; robot-gst recover finishes what a dead writer left."
-        )
-        raise UsageError(message) from error
+        ) from error
     except OSError as error:
         raise cannot_write(part_path, error) from error
     if path.exists():  # another writer finished it between the two looks

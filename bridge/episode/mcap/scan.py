@@ -4,12 +4,13 @@ Nothing but the front of the file is believed: no summary, no index. Damage is s
 a later chunk can be found. Memory is bounded by one chunk.
 """
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from mcap.records import McapRecord
+from mcap.records import Attachment, McapRecord
 
 from bridge.episode.mcap import format as mcap
 from bridge.episode.mcap.damaged import (
@@ -25,7 +26,8 @@ from bridge.episode.mcap.damaged import (
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,
-    attachment_fields,
+    RecordSpan,
+    attachment_of,
     parse_chunk,
     unpack_chunk,
 )
@@ -59,7 +61,6 @@ class Chunk(Span):
     """A chunk whose CRC and structure are right."""
 
     raw: bytes
-    """The whole record."""
     head: ChunkHead
     contents: Contents
 
@@ -90,10 +91,8 @@ class TopMessage(Span):
 class AttachmentSpan(Span):
     """An attachment whose CRC is right."""
 
-    name: str
-    media_type: str
-    log_time_ns: int
-    create_time_ns: int
+    record: Attachment
+    """Without its data."""
     data_size: int
 
 
@@ -113,8 +112,6 @@ class Damage(Span):
 @dataclass(frozen=True, kw_only=True)
 class DataEnd(Span):
     """The writer got as far as the summary."""
-
-    crc: int
 
 
 Found: TypeAlias = (
@@ -178,19 +175,16 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     """Read the record at an offset; None where the summary begins without an end of the data."""
     front = file.read(offset, _FRONT_BYTES)
     if len(front) < mcap.RECORD_HEAD.size:
-        message = "the file ends inside a record"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("the file ends inside a record")
     opcode, size = mcap.RECORD_HEAD.unpack_from(front)
     if opcode in _SUMMARY_ONLY:
         return None
     if opcode == 0 or (opcode not in _KINDS and opcode < PRIVATE):
-        message = f"there is no record of kind {opcode}"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"there is no record of kind {opcode}")
     length = mcap.RECORD_HEAD.size + size
     kind = _KINDS.get(opcode, "private record")
     if offset + length > file.size:
-        message = f"the file ends inside a {kind}"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the file ends inside a {kind}")
     if opcode == mcap.CHUNK:
         return _read_chunk(file, offset, front)
     if opcode == mcap.MESSAGE:
@@ -200,11 +194,9 @@ def _read_record(file: RecordFile, offset: int) -> Found | None:
     if opcode == mcap.ATTACHMENT:
         return _read_attachment(file, offset, length)
     if opcode == mcap.DATA_END:
-        crc = int.from_bytes(front[mcap.RECORD_HEAD.size :][:4], "little")
-        return DataEnd(offset=offset, length=length, crc=crc)
+        return DataEnd(offset=offset, length=length)
     if length > MAX_PLAIN_BYTES:
-        message = f"a {kind} claims {length} bytes"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a {kind} claims {length} bytes")
     raw = file.read(offset, length)
     return Plain(offset=offset, length=length, opcode=opcode, raw=raw, record=read_plain(raw))
 
@@ -218,15 +210,13 @@ def _read_chunk(file: RecordFile, offset: int, front: bytes) -> Chunk:
     records = unpack_chunk(parse_chunk(raw[mcap.RECORD_HEAD.size :]))
     contents = walk_records(records)
     if contents.size != len(records):
-        message = "a chunk is damaged: its records are torn"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("a chunk is damaged: its records are torn")
     return Chunk(offset=offset, length=len(raw), raw=raw, head=head, contents=contents)
 
 
 def _read_message(offset: int, length: int, front: bytes) -> TopMessage:
     if not mcap.MESSAGE_HEAD.size <= length <= MAX_CHUNK_BYTES:
-        message = f"a message claims {length} bytes"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message claims {length} bytes")
     _, _, channel_id, _, log_time_ns, _ = mcap.MESSAGE_HEAD.unpack_from(front)
     return TopMessage(offset=offset, length=length, channel_id=channel_id, log_time_ns=log_time_ns)
 
@@ -240,8 +230,7 @@ def _read_index(offset: int, length: int, front: bytes) -> IndexSpan:
     """A message whose opcode was altered must not pass for an index: it would be lost unsaid."""
     size = _index_bytes(front)
     if size % _INDEX_ENTRY_BYTES or _INDEX_FRONT.size + size > length:
-        message = "a message index is damaged: its lengths contradict each other"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("a message index is damaged: its lengths contradict each other")
     return IndexSpan(offset=offset, length=length)
 
 
@@ -249,38 +238,20 @@ def _refuse_renamed_index(file: RecordFile, found: TopMessage) -> None:
     """An index whose opcode was altered must not pass for a message that nobody sent."""
     size = _index_bytes(file.read(found.offset, _FRONT_BYTES))
     if size and size % _INDEX_ENTRY_BYTES == 0 and _INDEX_FRONT.size + size == found.length:
-        message = "a message index calls itself a message"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("a message index calls itself a message")
 
 
 def _index_bytes(front: bytes) -> int:
     if len(front) < _INDEX_FRONT.size:
-        message = "the file ends inside a message index"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError("the file ends inside a message index")
     return int(_INDEX_FRONT.unpack_from(front)[3])
 
 
 def _read_attachment(file: RecordFile, offset: int, length: int) -> AttachmentSpan:
-    front = file.read(offset, min(length, BLOCK_BYTES))[mcap.RECORD_HEAD.size :]
-    fields = attachment_fields(front, offset)
-    body = mcap.RECORD_HEAD.size
-    end = body + fields.data_at + fields.data_size
-    if end + 4 > length:  # later versions of the format may add fields behind the CRC
-        message = "the lengths of an attachment contradict each other"
-        raise BrokenRecordError(message)
-    (crc,) = struct.unpack("<I", file.read(offset + end, 4))
-    if crc and crc != file.crc(offset + body, end - body):
-        message = f"the CRC of the attachment {fields.name!r} is wrong"
-        raise BrokenRecordError(message)
-    return AttachmentSpan(
-        offset=offset,
-        length=length,
-        name=fields.name,
-        media_type=fields.media_type,
-        log_time_ns=fields.log_time_ns,
-        create_time_ns=fields.create_time_ns,
-        data_size=fields.data_size,
-    )
+    place = RecordSpan(mcap.ATTACHMENT, offset, length - mcap.RECORD_HEAD.size)
+    with os.fdopen(file.descriptor, "rb", closefd=False) as stream:
+        record, data_size = attachment_of(stream, place, keep=False)
+    return AttachmentSpan(offset=offset, length=length, record=record, data_size=data_size)
 
 
 def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
@@ -288,7 +259,9 @@ def _read_damaged(file: RecordFile, offset: int, what: str) -> Found | None:
     length = _trusted_length(file, offset)
     if length:
         end = offset + length
-        return Damage(offset=offset, length=length, what=_at(offset, what), at_end=end >= file.size)
+        return Damage(
+            offset=offset, length=length, what=f"at byte {offset} {what}", at_end=end >= file.size
+        )
     damage = _step_over(file, offset, what)
     if not damage.at_end:
         return damage
@@ -335,17 +308,13 @@ def _read_cut_chunk(file: RecordFile, offset: int, front: bytes) -> CutChunk | N
     )
 
 
-def _at(offset: int, what: str) -> str:
-    return f"at byte {offset} {what}"
-
-
 def _step_over(file: RecordFile, offset: int, what: str) -> Damage:
     """Find the next thing that looks like a chunk after a damaged place."""
     following = _next_chunk(file, offset)
     return Damage(
         offset=offset,
         length=(file.size if following is None else following) - offset,
-        what=_at(offset, what),
+        what=f"at byte {offset} {what}",
         at_end=following is None,
     )
 

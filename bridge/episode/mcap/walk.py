@@ -69,7 +69,6 @@ class RecordSpan(NamedTuple):
     offset: int
     """Of its opcode, from the start of the file."""
     length: int
-    """Bytes after opcode and length."""
 
     @property
     def end(self) -> int:
@@ -81,7 +80,6 @@ def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
     """Yield the places of all records between two offsets; the stream may be used in between.
 
     Args:
-        start: Where the first record begins [bytes from the start of the stream].
         end: Where the last one must end.
     """
     at = start
@@ -104,12 +102,10 @@ def walk_section(section: bytes, start: int) -> Iterator[RecordSpan]:
 
 def _place(head: bytes, at: int, end: int) -> RecordSpan:
     if len(head) < RECORD_HEAD.size:
-        message = f"the record at byte {at} is cut off"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the record at byte {at} is cut off")
     opcode, length = RECORD_HEAD.unpack(head)
     if opcode == 0:
-        message = f"the record at byte {at} is of kind 0, which there is not"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the record at byte {at} is of kind 0, which there is not")
     if length > end - at - RECORD_HEAD.size:
         message = f"the record at byte {at} claims {length} bytes, {end - at} are left"
         raise BrokenRecordError(message)
@@ -121,8 +117,7 @@ def read_body(stream: ByteStream, place: RecordSpan) -> bytes:
     stream.seek(place.offset + RECORD_HEAD.size)
     body = stream.read(place.length)
     if len(body) < place.length:
-        message = f"the record at byte {place.offset} is cut off"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"the record at byte {place.offset} is cut off")
     return body
 
 
@@ -202,48 +197,28 @@ def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -
         keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
     """
     stream.seek(place.offset + RECORD_HEAD.size)
-    fields = attachment_fields(stream.read(min(place.length, PIECE_BYTES)), place.offset)
-    name, start, size = fields.name, fields.data_at, fields.data_size
+    fields = _Fields(stream.read(min(place.length, PIECE_BYTES)))
+    try:
+        log_ns, create_ns = fields.read8(), fields.read8()
+        name, media_type = fields.read_prefixed_string(), fields.read_prefixed_string()
+        size, start = fields.read8(), fields.count
+    except (McapError, struct.error, ValueError) as error:
+        raise BrokenRecordError(f"the attachment at byte {place.offset} cannot be read") from error
     if size > place.length - start - 4:
         message = f"attachment {name!r} claims {size} bytes, {place.length - start - 4} are there"
         raise BrokenRecordError(message)
     crc, pieces = _attachment_crc(stream, place, start + size, start, keep=keep)
     (declared,) = struct.unpack("<I", stream.read(4))
     if declared and declared != crc:
-        message = f"attachment {name!r} has another CRC than it declares"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"attachment {name!r} has another CRC than it declares")
     record = records.Attachment(
-        create_time=fields.create_time_ns,
-        log_time=fields.log_time_ns,
+        create_time=create_ns,
+        log_time=log_ns,
         name=name,
-        media_type=fields.media_type,
+        media_type=media_type,
         data=b"".join(pieces),
     )
     return FoundAttachment(record, size)
-
-
-class AttachmentFields(NamedTuple):
-    """What stands before the data of an attachment."""
-
-    log_time_ns: int
-    create_time_ns: int
-    name: str
-    media_type: str
-    data_size: int
-    data_at: int
-    """From the start of the record's body."""
-
-
-def attachment_fields(front: bytes, offset: int) -> AttachmentFields:
-    """Read the first bytes of the body of the attachment whose record lies at ``offset``."""
-    fields = _Fields(front)
-    try:
-        times = fields.read8(), fields.read8()
-        names = fields.read_prefixed_string(), fields.read_prefixed_string()
-        return AttachmentFields(*times, *names, fields.read8(), fields.count)
-    except (McapError, struct.error, ValueError) as error:
-        message = f"the attachment at byte {offset} cannot be read"
-        raise BrokenRecordError(message) from error
 
 
 def _attachment_crc(
@@ -256,8 +231,7 @@ def _attachment_crc(
     while left:
         piece = stream.read(min(left, PIECE_BYTES))
         if not piece:
-            message = f"the attachment at byte {place.offset} is cut off"
-            raise BrokenRecordError(message)
+            raise BrokenRecordError(f"the attachment at byte {place.offset} is cut off")
         left -= len(piece)
         crc = zlib.crc32(piece, crc)
         if keep:
@@ -293,8 +267,7 @@ def parse_chunk(body: bytes) -> ChunkHead:
         at += length
         (length,) = struct.unpack_from("<Q", body, at)
     except (struct.error, ValueError) as error:
-        message = f"a chunk record of {len(body)} bytes cannot be read"
-        raise BrokenRecordError(message) from error
+        raise BrokenRecordError(f"a chunk record of {len(body)} bytes cannot be read") from error
     at += 8
     if length > len(body) - at:
         message = f"a chunk claims {length} bytes of data, {len(body) - at} are there"
@@ -306,19 +279,15 @@ def parse_chunk(body: bytes) -> ChunkHead:
 def unpack_chunk(chunk: ChunkHead, *, whose: str = "a chunk") -> bytes:
     """Decompress a chunk and compare its size and CRC."""
     if chunk.size > MAX_CHUNK_BYTES:
-        message = f"{whose} claims {chunk.size} bytes, more than {MAX_CHUNK_BYTES}"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"{whose} claims {chunk.size} bytes, more than {MAX_CHUNK_BYTES}")
     try:
         data = _decompress(chunk)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-        message = f"{whose} cannot be unpacked ({error})"
-        raise BrokenRecordError(message) from error
+        raise BrokenRecordError(f"{whose} cannot be unpacked ({error})") from error
     if len(data) != chunk.size:
-        message = f"{whose} has {len(data)} bytes, {chunk.size} are declared"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"{whose} has {len(data)} bytes, {chunk.size} are declared")
     if chunk.crc and crc32(data, 0) != chunk.crc:
-        message = f"{whose} has another CRC than it declares"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"{whose} has another CRC than it declares")
     return data
 
 
@@ -336,8 +305,7 @@ def _decompress(chunk: ChunkHead) -> bytes:
     if chunk.compression == "lz4":
         unpacker = lz4.frame.LZ4FrameDecompressor()
         return bytes(unpacker.decompress(chunk.data, max_length=chunk.size))
-    message = f"compression {chunk.compression!r} is not known"
-    raise BrokenRecordError(message)
+    raise BrokenRecordError(f"compression {chunk.compression!r} is not known")
 
 
 class MessageHead(NamedTuple):
@@ -347,7 +315,6 @@ class MessageHead(NamedTuple):
     at: int
     """Where the record begins: in a chunk's data, or in the file."""
     length: int
-    """Of the payload."""
     channel_id: int
     sequence: int
     publish_time_ns: int
@@ -361,8 +328,7 @@ def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
     """
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
-        message = f"a message record of {length} bytes"
-        raise BrokenRecordError(message)
+        raise BrokenRecordError(f"a message record of {length} bytes")
     return MessageHead(log_ns, where, length - MESSAGE_FIELDS, channel_id, sequence, publish_ns)
 
 
@@ -372,8 +338,7 @@ def records_in(data: Buffer) -> Iterator[tuple[int, int, int]]:
     head_bytes, unpack = RECORD_HEAD.size, RECORD_HEAD.unpack_from
     while at < end:
         if end - at < head_bytes:
-            message = f"{end - at} bytes too many at the end of a chunk"
-            raise BrokenRecordError(message)
+            raise BrokenRecordError(f"{end - at} bytes too many at the end of a chunk")
         opcode, length = unpack(data, at)
         after = at + head_bytes + length
         if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_FIELDS):

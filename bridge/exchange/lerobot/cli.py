@@ -32,7 +32,6 @@ def export_lerobot(
         out: The folder to make.
         config: Rate, actions, which episodes.
         force: Replace an earlier export.
-        output: How to talk.
     """
     from bridge.exchange.lerobot.export import export_lerobot as write_dataset
     from bridge.exchange.lerobot.export import select_episodes
@@ -73,7 +72,6 @@ def import_lerobot(
         cell: Name of the cell in topics.
         episodes: Which ones, for example 0-9,12; all without it.
         task: Name or file of the task they are trials of.
-        output: How to talk.
     """
     from bridge.episode.catalogue import task_of_run
     from bridge.episode.run_folder import RunFolder

@@ -25,7 +25,6 @@ from bridge.episode.streams import (
     events,
     execution_ns,
     find_camera_topic,
-    image_messages,
     joint_track,
     plans,
 )
@@ -158,7 +157,7 @@ def row_images(
         wanted: Number of the image that each row takes, counted from 0 in log order.
     """
     row = 0
-    for number, message in enumerate(image_messages(episode, [_topic(episode, camera)])):
+    for number, message in enumerate(episode.messages([_topic(episode, camera)])):
         if row == len(wanted):
             return
         if number != wanted[row]:
@@ -204,7 +203,7 @@ def _image_stamps(
     stamps: list[int] = []
     numbers: list[int] = []
     read = color_from_message if ending == COLOR_IMAGE else DepthImage.from_message
-    for number, message in enumerate(image_messages(episode, [_topic(episode, camera, ending)])):
+    for number, message in enumerate(episode.messages([_topic(episode, camera, ending)])):
         with message_named(episode, message.topic, number + 1):
             stamp_ns = read(message.type_name, message.data).stamp_ns
         if not stamps or stamp_ns > stamps[-1]:

@@ -10,7 +10,7 @@ from bridge.errors import UsageError, refuse_outside
 class FolderError(UsageError):
     """An RGB-D folder breaks its contract."""
 
-    def __init__(self, *, path: Path, found: str, hint: str) -> None:
+    def __init__(self, *, path: Path, found: str, hint: str = "Restore the file.") -> None:
         """Remember the file and what was found in it."""
         self.path = path
         self.found = found

@@ -40,7 +40,6 @@ class FolderIndex:
     path: Path
     """The file that lists the frames, or the folder where file names do."""
     layout: str
-    """scene.json, TUM or 7-Scenes."""
     name: str
     depth_unit_m: float
     depth_invalid_values: tuple[int, ...]

@@ -117,11 +117,10 @@ def frame_times_ns(
         stamps = [(start_ns or 0) + number * period_ns for number in range(count)]
         return [(stamp_ns, stamp_ns) for stamp_ns in stamps]
     if config.rate_hz is not None:
-        message = (
+        raise UsageError(
             f"--rate-hz {config.rate_hz:g} was given, but {index.path} says when each frame was "
             "taken. Leave the option out."
         )
-        raise UsageError(message)
     times = [
         (frame.color_stamp_ns or 0, frame.depth_stamp_ns or 0) for frame in index.frames[:count]
     ]

@@ -35,7 +35,6 @@ PARAMETERS = {
 BENDING_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
 MOST_PX = 65_500
-"""Of a JPEG's side."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 SPARSE_PERCENT = (2.0, 98.0)
 """Sparse points nearer or farther than these percentiles are taken for outliers."""
@@ -57,11 +56,9 @@ class PosedIndex:
 
     path: Path
     layout: str
-    """COLMAP or transforms.json."""
     name: str
     cameras: dict[str, Camera]
     images: tuple[PosedImage, ...]
-    """In the order of their names."""
     sparse_range: tuple[float, float] | None
     """Distances of COLMAP's points along the optical axes; None without points."""
     assumed: dict[str, str] = field(default_factory=dict)
@@ -143,7 +140,7 @@ def _colmap_cameras(path: Path) -> dict[str, Camera]:
         width, height, *numbers = _numbers(path, words[2:], f"camera {words[0]}")
         if len(numbers) != len(names):
             found = f"camera {words[0]}: {len(numbers)} numbers, {model} has {len(names)}"
-            raise FolderError(path=path, found=found, hint="Restore the file.")
+            raise FolderError(path=path, found=found)
         of = dict(zip(names, numbers, strict=True))
         cameras[words[0]] = _camera(path, int(width), int(height), of)
     return cameras
@@ -160,7 +157,7 @@ def _colmap_image(
     w, x, y, z, *p = _numbers(path, words[1:8], f"image {number}")
     q = np.array([w, x, y, z])
     if not 0.5 < np.linalg.norm(q) < 2:
-        raise FolderError(path=path, found=f"image {number}: no quaternion", hint="Restore it.")
+        raise FolderError(path=path, found=f"image {number}: no quaternion")
     if words[8] not in cameras:
         raise FolderError(
             path=path,
@@ -202,7 +199,7 @@ def _sparse_depths(path: Path) -> Float[np.ndarray, "num_points 3"]:
     ]
     if any(len(row) < 3 for row in rows):
         found = "a point has fewer than three coordinates"
-        raise FolderError(path=path, found=found, hint="Restore the file.")
+        raise FolderError(path=path, found=found)
     return np.array(rows).reshape(-1, 3)
 
 
@@ -226,15 +223,13 @@ def _read_transforms(folder: Path) -> PosedIndex:
         record = json.loads(path.read_text())
         frames = list(record["frames"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise FolderError(
-            path=path, found=f"no list of frames ({error})", hint="Restore the file."
-        ) from error
+        raise FolderError(path=path, found=f"no list of frames ({error})") from error
     cameras: dict[str, Camera] = {}
     names: dict[Camera, str] = {}
     images, assumed = [], {}
     for number, frame in enumerate(frames, start=1):
         if not isinstance(frame, dict):
-            raise FolderError(path=path, found=f"frame {number} is no object", hint="Restore it.")
+            raise FolderError(path=path, found=f"frame {number} is no object")
         camera, centred = _frame_camera(path, number, {**record, **frame})
         if centred:
             assumed["principal point"] = "the centre of the image"
@@ -248,7 +243,7 @@ def _read_transforms(folder: Path) -> PosedIndex:
             )
         )
     if not images:
-        raise FolderError(path=path, found="no frame", hint="Restore the file.")
+        raise FolderError(path=path, found="no frame")
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
     return PosedIndex(
         path=path, layout=TRANSFORMS, name=folder.resolve().name, cameras=cameras, images=ordered,
@@ -294,12 +289,10 @@ def _frame_pose(path: Path, number: int, frame: dict[str, Any]) -> Float[np.ndar
         T = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, ValueError, TypeError) as error:
         found = f"frame {number} has no transform_matrix ({error})"
-        raise FolderError(path=path, found=found, hint="Restore the file.") from error
+        raise FolderError(path=path, found=found) from error
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
-        raise FolderError(
-            path=path, found=f"frame {number}: transform_matrix is no 4 x 4 of numbers",
-            hint="Restore the file.",
-        )  # fmt: skip
+        found = f"frame {number}: transform_matrix is no 4 x 4 of numbers"
+        raise FolderError(path=path, found=found)
     T = np.vstack([T[:3], [0.0, 0.0, 0.0, 1.0]])
     T[:3, :3] = checked_rotation(path, T[:3, :3], f"frame {number}")
     return np.asarray(T @ OPENCV_FROM_OPENGL)
@@ -321,9 +314,7 @@ def _numbers(path: Path, words: list[Any], what: str) -> list[float]:
     try:
         numbers = [float(word) for word in words]
     except (TypeError, ValueError, OverflowError) as error:
-        raise FolderError(
-            path=path, found=f"{what}: no number ({error})", hint="Restore the file."
-        ) from error
+        raise FolderError(path=path, found=f"{what}: no number ({error})") from error
     if not np.isfinite(numbers).all():
-        raise FolderError(path=path, found=f"{what}: not finite", hint="Restore the file.")
+        raise FolderError(path=path, found=f"{what}: not finite")
     return numbers

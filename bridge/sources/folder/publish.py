@@ -29,7 +29,6 @@ class FolderSource:
 
     index: FolderIndex
     config: FolderConfig
-    """Names and rate."""
     fast: bool = False
     """Do not wait between frames; stamps keep their distance."""
 

@@ -141,10 +141,8 @@ def _matrix(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "rows colum
     try:
         numbers = np.array(rows, dtype=np.float64)
     except ValueError as error:
-        raise FolderError(
-            path=path, found=f"not a matrix of numbers ({error})", hint="Restore the file."
-        ) from error
+        raise FolderError(path=path, found=f"not a matrix of numbers ({error})") from error
     if numbers.shape != shape:
         found = f"{len(rows)} rows of numbers, expected {shape[0]} x {shape[1]}"
-        raise FolderError(path=path, found=found, hint="Restore the file.")
+        raise FolderError(path=path, found=found)
     return numbers

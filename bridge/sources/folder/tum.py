@@ -140,9 +140,7 @@ def _rows(path: Path, counts: tuple[int, ...]) -> Iterator[tuple[int, list[str]]
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise FolderError(
-            path=path, found=f"not readable as text ({error})", hint="Restore the file."
-        ) from error
+        raise FolderError(path=path, found=f"not readable as text ({error})") from error
     for line, row in enumerate(text.splitlines(), start=1):
         cells = row.replace(",", " ").split()
         if not cells or cells[0].startswith("#"):
@@ -316,8 +314,7 @@ def _own_cameras(path: Path) -> TumCameras:
         depth, color = (_camera(record[name]) for name in ("depth", "color"))
         T_color_depth = np.array(record["T_color_depth"], dtype=np.float64)
         if T_color_depth.shape != (4, 4) or not np.isfinite(T_color_depth).all():
-            message = "T_color_depth is not 4 x 4"
-            raise ValueError(message)
+            raise ValueError("T_color_depth is not 4 x 4")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FolderError(
             path=path,

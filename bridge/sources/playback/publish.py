@@ -42,7 +42,6 @@ class Due(NamedTuple):
     """A message and its place in the time of the playback."""
 
     at_ns: int
-    """Log time."""
     item: Stored
 
 

@@ -35,7 +35,6 @@ def publish_realsense(
         duration_s: Stop after this long [s].
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.realsense.device import describe_device
     from bridge.sources.realsense.publish import RealSenseSource, attached_devices

@@ -33,7 +33,6 @@ def publish_standin(
         config: What the session does.
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.source import run_source
     from bridge.sources.standin.session import StandinSource, describe

@@ -36,7 +36,6 @@ def publish_ur(
         duration_s: Stop after this long [s].
         connect: Where the recorder listens.
         zenoh_config: zenoh configuration (JSON5).
-        output: How to talk.
     """
     from bridge.sources.source import run_source
     from bridge.sources.ur.publish import UrSource, describe_counts

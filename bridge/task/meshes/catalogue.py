@@ -40,7 +40,6 @@ def toy_mesh(name: str, size_m: tuple[float, float, float]) -> ToyMesh:
 
     Args:
         name: One of ``toys.DESIGNS``.
-        size_m: Outer extents [m].
     """
     design = DESIGNS.get(name)
     if design is None:
@@ -75,8 +74,7 @@ def basket_mesh(inner_m: tuple[float, float, float], wall_m: float) -> ToyMesh:
 def object_mesh(model: ObjectModel) -> ToyMesh:
     """Make the mesh of an object of a task whose shape is ``mesh``."""
     if model.mesh is None:
-        message = f"{model.id} is a {model.shape}, not a mesh: its panels() are its shape."
-        raise UsageError(message)
+        raise UsageError(f"{model.id} is a {model.shape}, not a mesh: its panels() are its shape.")
     if model.mesh == BASKET:
         return basket_mesh(model.inner_m, model.wall_m)
     return toy_mesh(model.mesh, model.size_m)

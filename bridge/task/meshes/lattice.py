@@ -29,7 +29,6 @@ class Lattice:
 
     points_m: Float[np.ndarray, "num_points 3"]
     tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
-    """Positively oriented."""
 
     def volume_m3(self) -> float:
         """Sum over the tetrahedra."""
@@ -62,8 +61,7 @@ def fill(
     distance = solid(low + step * (centres.reshape(-1, 3) + 0.5)).reshape(*counts)
     kept = distance < KEPT_DISTANCE * float(step.min())
     if not kept.any():
-        message = f"cells of {cell_m} m are too coarse for a body of {high - low} m."
-        raise UsageError(message)
+        raise UsageError(f"cells of {cell_m} m are too coarse for a body of {high - low} m.")
     cells = np.argwhere(kept)
     nodes = _node_ids(cells, counts + 1)
     used, index = np.unique(nodes, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Solids as signed distances: negative inside, blended where they meet.
+"""Solids as signed distances in metres: negative inside, blended where they meet.
 
 The formulas are the usual ones of constructive solid geometry by distance functions; ellipsoids use
 a first-order estimate, which is enough for surfaces that are found where the value is zero.
@@ -21,13 +21,7 @@ def ellipsoid(
     centre: tuple[float, float, float],
     radii: tuple[float, float, float],
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to an ellipsoid with its axes along x, y and z, to first order.
-
-    Args:
-        p: Where the distance is wanted [m].
-        centre: Of the ellipsoid [m].
-        radii: Half axes along x, y and z [m].
-    """
+    """Distance to an ellipsoid with its axes along x, y and z, to first order."""
     q = p - np.array(centre)
     scaled = np.linalg.norm(q / np.array(radii), axis=1)
     slope = np.linalg.norm(q / np.array(radii) ** 2, axis=1)
@@ -43,15 +37,7 @@ def capsule(
     radius_start: float,
     radius_end: float,
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to a rod with round ends whose radius changes along it.
-
-    Args:
-        p: Where the distance is wanted [m].
-        start: Centre of the first round end [m].
-        end: Centre of the other one, elsewhere [m].
-        radius_start: At ``start`` [m].
-        radius_end: At ``end`` [m].
-    """
+    """Distance to a rod with round ends whose radius changes along it."""
     a, b = np.array(start), np.array(end)
     along = np.clip((p - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
     nearest = a + along[:, None] * (b - a)
@@ -63,14 +49,7 @@ def capsule(
 def cylinder(
     p: Float[np.ndarray, "num_points 3"], radius: float, low: float, high: float
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to an upright cylinder around the z axis between two heights.
-
-    Args:
-        p: Where the distance is wanted [m].
-        radius: Of the cylinder [m].
-        low: Height of its bottom [m].
-        high: Height of its top [m].
-    """
+    """Distance to an upright cylinder around the z axis between two heights."""
     side = np.hypot(p[:, 0], p[:, 1]) - radius
     ends = np.abs(p[:, 2] - (low + high) / 2) - (high - low) / 2
     return _corner(side, ends)
@@ -84,16 +63,7 @@ def rounded_column(
     low: float,
     high: float,
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to an upright column over a rectangle with round corners.
-
-    Args:
-        p: Where the distance is wanted [m].
-        half_x: Half extent of the rectangle along x [m].
-        half_y: Half extent along y [m].
-        corner: Radius of its vertical edges [m].
-        low: Height of its bottom [m].
-        high: Height of its top [m].
-    """
+    """Distance to an upright column over a rectangle with round corners."""
     ends = np.abs(p[:, 2] - (low + high) / 2) - (high - low) / 2
     return _corner(outline(p, half_x, half_y, corner), ends)
 
@@ -101,14 +71,7 @@ def rounded_column(
 def outline(
     p: Float[np.ndarray, "num_points 3"], half_x: float, half_y: float, corner: float
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance in the horizontal plane to a rectangle with round corners.
-
-    Args:
-        p: Where the distance is wanted; z does not matter [m].
-        half_x: Half extent of the rectangle along x [m].
-        half_y: Half extent along y [m].
-        corner: Radius of the corners, at most the smaller half extent [m].
-    """
+    """Distance in the horizontal plane to a rectangle with round corners."""
     x = np.abs(p[:, 0]) - (half_x - corner)
     y = np.abs(p[:, 1]) - (half_y - corner)
     return np.asarray(_corner(x, y) - corner)
@@ -124,11 +87,7 @@ def ring(
     """Distance to a torus: ``radius`` to the middle of the bead, ``thickness`` its own radius.
 
     Args:
-        p: Where the distance is wanted [m].
-        centre: Of the torus [m].
         axis: What it lies around: 0 for x, 1 for y, 2 for z.
-        radius: From the centre to the middle of the bead [m].
-        thickness: Radius of the bead [m].
     """
     q = p - np.array(centre)
     others = [k for k in range(3) if k != axis]
@@ -142,8 +101,6 @@ def blend(
     """Smallest of two distances with a fillet about ``width`` wide: a polynomial smooth minimum.
 
     Args:
-        first: Signed distances of some points to one solid [m].
-        second: Of the same points to the other [m].
         width: Points whose two distances are this near to each other are in the fillet; above 0
             [m].
     """
@@ -161,12 +118,7 @@ def blend_all(
 def cut(
     solid: Float[np.ndarray, " num_points"], tool: Float[np.ndarray, " num_points"], width: float
 ) -> Float[np.ndarray, " num_points"]:
-    """Take ``tool`` out of ``solid``, with an edge about ``width`` round.
-
-    Args:
-        solid: Signed distances to what is cut [m].
-        tool: Of the same points to what is taken away [m].
-    """
+    """Take ``tool`` out of ``solid``, with an edge about ``width`` round."""
     return np.asarray(-blend(-solid, tool, width))
 
 
@@ -267,7 +219,6 @@ def project(
     """Move points onto the surface along the gradient of the distance.
 
     Args:
-        points: Near the surface [m].
         largest_step_m: No point moves farther than this in one of ``PROJECTIONS`` steps.
     """
     for _ in range(PROJECTIONS):
@@ -283,11 +234,7 @@ def project(
 def gradient_of(
     solid: Solid, points: Float[np.ndarray, "num_points 3"]
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Central differences of a signed distance.
-
-    Args:
-        points: Where the gradient is wanted [m].
-    """
+    """Central differences of a signed distance."""
     columns = []
     for axis in range(3):
         shift = np.zeros(3)

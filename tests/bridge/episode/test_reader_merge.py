@@ -155,31 +155,3 @@ def test_chunks_that_all_overlap_are_read_in_order_with_bounded_memory(
     tracemalloc.stop()
     assert found == sorted(times)
     assert peak < 3_000_000
-
-
-@pytest.mark.parametrize("chunked", [True, False])
-def test_reading_a_long_file_needs_no_more_memory_than_a_short_one(
-    tmp_path: Path, chunked: bool
-) -> None:
-    peaks = []
-    for count in (100, 500):
-        path = tmp_path / f"{count}.mcap"
-        messages = (("/a", n, random.Random(n).randbytes(30_000)) for n in range(count))
-        path.write_bytes(mcap_bytes(messages, chunk_size=300_000, use_chunking=chunked))
-        episode = Episode.open(path)
-        tracemalloc.start()
-        assert sum(1 for _ in episode.messages()) == count
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < 1.2 * peaks[0] + 100_000
-
-
-def test_a_reader_that_stops_early_leaves_no_file_open(tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(mcap_bytes([("/a", n, bytes(100)) for n in range(50)], chunk_size=100))
-    for _ in range(20):
-        messages = Episode.open(path).messages()
-        next(messages)
-        messages.close()
-    open_files = [link for link in Path("/proc/self/fd").iterdir() if link.exists()]
-    assert not any(link.resolve() == path for link in open_files)

@@ -114,14 +114,6 @@ def test_a_missing_part_in_the_middle_is_named_and_the_others_are_read(tmp_path:
     assert report.faults == ["part t1.2.mcap of this split episode is missing"]
 
 
-def test_a_missing_part_behind_a_recovered_one_is_named(tmp_path: Path) -> None:
-    path = write_part(tmp_path, 1, [10], last=None, recovered=True)
-    write_part(tmp_path, 3, [40], last=True, sequence=4)
-    assert Episode.open(path).missing_parts == (tmp_path / "t1.2.mcap",)
-    (report,) = check_all(tmp_path.glob("*.mcap"))
-    assert report.faults == ["part t1.2.mcap of this split episode is missing"]
-
-
 def test_a_missing_last_part_is_named(tmp_path: Path) -> None:
     path = split_in_three(tmp_path)
     (tmp_path / "t1.3.mcap").rename(tmp_path / "t1.3.mcap.part")
@@ -140,27 +132,9 @@ def test_a_part_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path) -> 
     assert "t1.2.mcap cannot be read" in check_episode(path).faults[0]
 
 
-def test_the_end_of_a_recovered_recording_is_lost_but_no_part_is_missing(tmp_path: Path) -> None:
-    path = write_part(tmp_path, 1, [10])
-    write_part(tmp_path, 2, [20], last=None, recovered=True, sequence=1)
-    episode = Episode.open(path)
-    assert len(episode.parts) == 2
-    assert episode.missing_parts == ()
-    report = check_episode(path)
-    assert (report.exit_code, report.summary) == (3, "drops logged")
-    assert report.recovered == {"reason": "killed", "bytes_lost": 7}
-    assert "7 bytes were lost" in report.notes[0]
-
-
 def test_parts_of_another_episode_are_left_alone(tmp_path: Path) -> None:
     path = write_part(tmp_path, 1, [10], last=None)
     write_part(tmp_path, 2, [20], last=True, episode_id="other")
-    assert Episode.open(path).parts == (path,)
-
-
-def test_nothing_follows_a_part_that_says_it_is_the_last(tmp_path: Path) -> None:
-    path = write_part(tmp_path, 1, [10], last=True)
-    write_part(tmp_path, 2, [20])
     assert Episode.open(path).parts == (path,)
 
 

@@ -1,6 +1,5 @@
 """Cut files of several writers, and kill the recovery; what was whole must come back."""
 
-import fcntl
 import functools
 import json
 import os
@@ -12,13 +11,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_samples import linear, put, read_all, some_messages, write_official, write_ours
 
-from bridge.episode.recover import RecoveryError, RecoveryReport, recover, recover_parts
+from bridge.episode.recover import RecoveryError, recover, recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import PathNotFoundError, UsageError
 
 MESSAGES = some_messages(40)
-NUM_CUT = int(os.environ.get("GST_CUT_MESSAGES", "6"))
 """In the file that is cut at every byte; ``make soak`` takes twelve, which makes six chunks."""
 
 
@@ -61,35 +59,6 @@ def test_a_file_cut_anywhere_gives_back_every_whole_record(whole: Path) -> None:
         found = read_all(report.output)
         assert set(expected) <= set(found) <= set(MESSAGES), at
         assert report.messages == len(found)
-        report.output.unlink()
-
-
-@pytest.mark.slow
-def test_a_file_cut_at_every_single_byte_is_recovered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for call in ("fsync", "fdatasync"):  # no power is cut here, and the disk is slow
-        monkeypatch.setattr(os, call, lambda _: None)
-    whole = tmp_path / "whole.mcap"
-    with EpisodeWriter(whole, config=WriterConfig(chunk_bytes=120)) as writer:
-        writer.add_metadata("m", {"a": "b"})
-        for index in range(NUM_CUT):
-            writer.write_foreign(
-                f"/{index % 2}", bytes([index]) * 9, schema_record=None, log_time_ns=index
-            )
-        writer.attach("x", b"yz", media_type="", log_time_ns=1)
-    messages = read_all(whole)
-    assert len(messages) == NUM_CUT
-    for at in range(whole.stat().st_size + 1):
-        part = cut(whole, at)
-        expected = linear(part)
-        report = recover(part)
-        if report.output is None:
-            assert not expected
-            assert part.read_bytes() == whole.read_bytes()[:at]
-            continue
-        found = read_all(report.output)
-        assert set(expected) <= set(found) <= set(messages), at
         report.output.unlink()
 
 
@@ -309,14 +278,3 @@ def test_the_command_lists_losses_and_answers_json(
     answer = json.loads(capsys.readouterr().out)
     assert [bool(item["output"]) for item in answer["files"]] == [True, False]
     assert run(["recover", str(tmp_path / "gone.mcap")]) == 2
-
-
-def test_the_lock_of_a_reader_is_respected(tmp_path: Path) -> None:
-    whole = write_ours(tmp_path / "w.mcap", MESSAGES)
-    part = cut(whole, 6000)
-    descriptor = os.open(part, os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    with pytest.raises(RecoveryError, match="still being written"):
-        recover(part)
-    os.close(descriptor)
-    assert isinstance(recover(part), RecoveryReport)

@@ -35,15 +35,6 @@ def summary_of(path: Path) -> Summary:
     return summary
 
 
-class Clock:
-    """Seconds that pass when told to."""
-
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
 U64 = st.integers(0, 2**64 - 1)
 STORED = st.builds(
     Stored,
@@ -84,12 +75,6 @@ def test_one_topic_keeps_its_order_when_it_grows_large(tmp_path: Path) -> None:
             writer.write_foreign("/cloud", data, schema_record=None, log_time_ns=7)
     assert [item.data[0] for item in read_all(path)] == list(range(20))
     assert len(summary_of(path).chunk_indexes) > 1
-
-
-def test_the_same_messages_give_the_same_bytes(tmp_path: Path) -> None:
-    first = write_ours(tmp_path / "a.mcap", MESSAGES)
-    second = write_ours(tmp_path / "b.mcap", MESSAGES)
-    assert first.read_bytes() == second.read_bytes()
 
 
 def test_large_streams_have_chunks_of_their_own_and_packed_images_stay_as_they_are(
@@ -135,32 +120,6 @@ def test_one_topic_with_two_schemas_of_one_name_has_two_channels(tmp_path: Path)
     assert summary.statistics is not None
     assert summary.statistics.channel_message_counts == {1: 3, 2: 3}
     assert [item.sequence for item in read_all(path)] == [0, 0, 1, 1, 2, 2]
-
-
-def written(writer: EpisodeWriter) -> int:
-    writer.wait_for_disk()
-    return writer.part_path.stat().st_size
-
-
-def test_tick_writes_what_has_waited_long_enough(tmp_path: Path) -> None:
-    clock = Clock()
-    config = WriterConfig(flush_s=0.25)
-    writer = EpisodeWriter(tmp_path / "e.mcap", config=config, monotonic=clock)
-    empty = written(writer)
-    put(writer, MESSAGES[0])
-    writer.tick()
-    assert written(writer) == empty
-    clock.now_s = 0.2
-    put(writer, MESSAGES[1])
-    clock.now_s = 0.25
-    writer.tick()
-    joints_only = written(writer)
-    assert joints_only > empty
-    clock.now_s = 0.45
-    writer.tick()
-    assert written(writer) > joints_only
-    writer.close()
-    assert len(read_all(writer.path)) == 2
 
 
 def test_attachments_and_metadata_are_in_the_file_at_once(tmp_path: Path) -> None:
@@ -334,16 +293,3 @@ def test_a_folder_that_cannot_be_written_is_said_in_a_sentence(tmp_path: Path) -
     (tmp_path / "file").touch()
     with pytest.raises(BridgeError, match="Choose another folder"):
         EpisodeWriter(tmp_path / "file" / "e.mcap")
-
-
-def test_many_writers_leave_no_threads_and_no_open_files(tmp_path: Path) -> None:
-    config = WriterConfig(flush_s=0.25, sync_s=1.0)
-    before = (threading.active_count(), _open_files())
-    for index in range(50):
-        with EpisodeWriter(tmp_path / f"{index}.mcap", config=config) as writer:
-            put(writer, MESSAGES[0])
-    assert (threading.active_count(), _open_files()) == before
-
-
-def _open_files() -> int:
-    return sum(1 for _ in Path("/proc/self/fd").iterdir())

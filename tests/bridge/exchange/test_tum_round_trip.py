@@ -178,44 +178,6 @@ def test_poses_of_a_real_sequence_come_through_the_import(tmp_path: Path) -> Non
     assert 80 <= sent <= 85
 
 
-def test_raw_colour_and_packed_depth_are_written_too(tmp_path: Path) -> None:
-    from bridge.episode import schema
-    from bridge.episode.cdr import codec
-    from bridge.episode.cdr.images import depth_to_compact
-    from bridge.episode.cdr.messages import CameraInfo, FrameTransform, transforms_to_cdr
-    from bridge.episode.metadata import EpisodeInfo
-    from bridge.episode.writer import EpisodeWriter
-    from bridge.geometry.camera import Camera
-
-    rng = np.random.default_rng(0)
-    pixels = rng.integers(0, 255, (6, 8, 3)).astype(np.uint8)
-    depth = DepthImage(
-        stamp_ns=1, frame_id="e", depth_mm=rng.integers(0, 9000, (6, 8)).astype(np.uint16)
-    )
-    compact = depth_to_compact(depth.to_cdr())
-    assert compact is not None
-    header = {"stamp": {"sec": 0, "nanosec": 1}, "frame_id": "e"}
-    raw = {"header": header, "height": 6, "width": 8, "encoding": "bgr8", "is_bigendian": 0,
-           "step": 24, "data": pixels.tobytes()}  # fmt: skip
-    camera = Camera(width=8, height=6, fx=9.0, fy=9.0, cx=4.0, cy=3.0)
-    info = CameraInfo(stamp_ns=1, frame_id="e", camera=camera).to_cdr()
-    pose = FrameTransform(stamp_ns=1, parent="base", child="e", T_parent_child=np.eye(4))
-    with EpisodeWriter(tmp_path / "e.mcap") as writer:
-        writer.describe(EpisodeInfo(id="e", kind="scan"))
-        for topic, data, name in (
-            ("/tf_static", transforms_to_cdr([pose]), schema.TF_MESSAGE),
-            ("/x/cam/e/color/info", info, schema.CAMERA_INFO),
-            ("/x/cam/e/color/image", codec.encode(schema.IMAGE, raw), schema.IMAGE),
-            ("/x/cam/e/depth/image", compact, schema.COMPRESSED_IMAGE),
-        ):
-            writer.write(topic, data, type_name=name, log_time_ns=1)
-    assert run("export", "tum", tmp_path / "e.mcap", tmp_path / "out") == 0
-    with Image.open(tmp_path / "out/rgb/0.000000001.png") as image:
-        np.testing.assert_array_equal(np.asarray(image), pixels[..., ::-1])
-    with Image.open(tmp_path / "out/depth/0.000000001.png") as image:
-        np.testing.assert_array_equal(np.asarray(image), 5 * depth.depth_mm.astype(int))
-
-
 def test_names_from_a_recording_cannot_leave_the_folder_or_meet() -> None:
     from bridge.exchange.output import safe_names
 

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
-from bridge.media.depth import ROTATED_ENCODING, decode_depth_png, to_millimetres, undo_rotation
+from bridge.media.depth import decode_depth_png
 
 depths = hnp.arrays(np.uint16, (4, 5))
 
@@ -45,30 +45,6 @@ def test_a_truncated_jpeg_is_refused(cut: int) -> None:
 def test_arbitrary_bytes_are_no_image(data: bytes) -> None:
     with pytest.raises(UnreadableImageError):
         decode_color(data)
-
-
-@given(depths)
-def test_depth_png_round_trip_is_exact(depth: np.ndarray) -> None:
-    np.testing.assert_array_equal(decode_depth_png(png(depth)), depth)
-
-
-@given(depths)
-def test_undoing_the_rotation_inverts_it(depth: np.ndarray) -> None:
-    rotated = (depth << np.uint16(3)) | (depth >> np.uint16(13))
-    np.testing.assert_array_equal(undo_rotation(rotated), depth)
-
-
-def test_every_invalid_code_becomes_zero() -> None:
-    stored = np.array([[0, 65535, 800]], dtype=np.uint16)
-    result = to_millimetres(stored, unit_m=1e-3, invalid_values=(0, 65535))
-    np.testing.assert_array_equal(result, [[0, 0, 800]])
-
-
-def test_tenths_of_a_millimetre_are_rounded_after_unrotating() -> None:
-    values = np.array([[5_004, 5_006, 0]], dtype=np.uint16)
-    stored = (values << np.uint16(3)) | (values >> np.uint16(13))
-    result = to_millimetres(stored, unit_m=1e-4, encoding=ROTATED_ENCODING)
-    np.testing.assert_array_equal(result, [[500, 501, 0]])
 
 
 def test_an_eight_bit_image_is_no_depth() -> None:

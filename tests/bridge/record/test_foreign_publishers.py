@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from video_messages import video_message
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
@@ -63,7 +62,6 @@ NOTHING = {"source_ns": None, "sequence": None, "source_gid": None}
     ("type_name", "encoding", "data", "expected_ns"),
     [
         (schema.IMAGE, "cdr", image("mono8", np.zeros((2, 2), np.uint8)), STAMP_NS),
-        (schema.COMPRESSED_VIDEO, "protobuf", video_message(STAMP_NS, "eye", b"x"), STAMP_NS),
         (schema.JOINT_STATE, "cdr", b"\0\1\0\0" + bytes(8 + 4 + 4 + 16), None),  # never set
         (schema.JOINT_STATE, "cdr", b"\0\1\0\0" + struct.pack("<iI", 1, 2**31), None),
         (schema.JOINT_STATE, "cdr", b"\0", None),

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 from bridge.clock import AnchoredClock
-from bridge.episode.check import check_episode
 from bridge.episode.mcap.part_file import PartFile
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
 from bridge.episode.recover import recover_parts
 from bridge.episode.run_folder import RunFolder
 from bridge.record.config import DiskConfig, RecorderConfig
-from bridge.record.errors import DiskError, NoSpaceError
+from bridge.record.errors import NoSpaceError
 from bridge.record.lifecycle import DiskReserve
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -68,52 +66,6 @@ def fill(recorder: Recorder, make_sample: MakeSample) -> int:
         recorder.receive(make_sample(topic="/bulk", data=RNG.bytes(60_000), type_name="x"))
         time.sleep(0.002)
     raise AssertionError("the disk never filled")
-
-
-def test_a_full_disk_finishes_the_file_and_counts_what_it_could_not_keep(
-    small_disk: Path, make_recorder: MakeRecorder, make_sample: MakeSample
-) -> None:
-    run = RunFolder.create(small_disk / "run")
-    recorder = make_recorder(run, min_free_mb=0, footer_mb=2)
-    recorder.start(INFO)
-    recorder.receive(make_sample())
-    sent = 1 + fill(recorder, make_sample)
-    assert recorder.failed.wait(60.0)
-    status = recorder.status()
-    assert status["state"] == "failed"
-    assert "No space left on device" in status["error"]
-    assert "was finished" in status["error"]
-    with pytest.raises(DiskError, match="Free some space"):
-        recorder.start(EpisodeInfo(id="t2", kind="trial"))
-    assert [path.name for path in run.episodes_dir.iterdir()] == ["t1.mcap"]
-    path = run.episodes_dir / "t1.mcap"
-    assert check_episode(path).faults == []
-    episode = Episode.open(path)
-    drops = episode.metadata_records["drops"]
-    # One may have been on its way when the end was decided: it is of no episode.
-    assert sent - 1 <= drops["received"] + drops["queue_drops"] <= sent
-    written = sum(1 for _ in episode.messages(["/cell/joint_states", "/bulk"]))
-    assert written == drops["received"]
-    assert "No space left" in episode.metadata_records["recorder"]["stopped_by"]
-
-
-def test_an_episode_ends_before_the_last_free_space_is_used(
-    small_disk: Path, make_recorder: MakeRecorder, make_sample: MakeSample
-) -> None:
-    run = RunFolder.create(small_disk / "run")
-    recorder = make_recorder(run, min_free_mb=6, footer_mb=1)
-    recorder.start(INFO)
-    sent = 0
-    end_s = time.monotonic() + 20.0
-    while not recorder.failed.is_set():
-        assert time.monotonic() < end_s
-        recorder.receive(make_sample(topic="/bulk", data=RNG.bytes(60_000), type_name="x"))
-        sent += 1
-        time.sleep(0.02)
-    assert "must be left" in recorder.status()["error"]
-    assert check_episode(run.episodes_dir / "t1.mcap").faults == []
-    received = Episode.open(run.episodes_dir / "t1.mcap").metadata_records["drops"]["received"]
-    assert sent - 3 <= received <= sent  # what came after the decision is of no episode
 
 
 def test_a_start_without_space_is_refused(
@@ -206,18 +158,3 @@ def test_a_status_answers_while_the_disk_hangs(
     gate.set()
     stopping.join(10.0)
     assert recorder.status()["state"] == "idle"
-
-
-def test_two_recorders_in_one_folder_cannot_write_one_episode(
-    run: RunFolder, make_recorder: MakeRecorder, make_sample: MakeSample
-) -> None:
-    first, second = make_recorder(run), make_recorder(run)
-    first.start(INFO)
-    with pytest.raises(Exception, match="being written"):
-        second.start(INFO)
-    assert recover_parts(run) == []  # the file is alive
-    second.start(EpisodeInfo(id="t2", kind="trial"))
-    for recorder in (first, second):
-        recorder.receive(make_sample())
-        assert recorder.stop()["messages"] == 1
-    assert [path.name for path in run.episodes()] == ["t1.mcap", "t2.mcap"]

@@ -1,6 +1,5 @@
 """The recorder on the wire: from Python, with status, liveliness, previews and departures."""
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import UsageError
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.record.config import RecorderConfig
@@ -166,29 +164,6 @@ def test_what_a_departed_source_said_is_not_repeated(
     assert "/lab/cam/a/color/info" in topics[0]
     assert "/lab/cam/a/color/info" not in topics[1]
     assert "/tf_static" in topics[1]  # of a source that declared nothing: still true
-
-
-def test_what_a_crash_left_is_recovered_and_said(tmp_path: Path, wire: WireConfig) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    now_s = [0.0]
-    writer = EpisodeWriter(
-        run.episodes_dir / "old.mcap",
-        config=WriterConfig(flush_s=0.01),
-        monotonic=lambda: now_s[0],
-    )
-    writer.describe(EpisodeInfo(id="old", kind="trial"))
-    for number in range(10):
-        writer.write_json("/a/event", {}, type_name=schema.EVENT, log_time_ns=number)
-    now_s[0] = 0.02
-    writer.tick()
-    writer.abandon()
-    said: list[str] = []
-    with open_recorder(run.path, wire=wire, say=said.append) as recorder:
-        [report] = recorder.status()["recovered"]
-    assert (report["output"], report["messages"]) == ("old.mcap", 10)
-    assert said[0].startswith("recovered old.mcap: 10 messages")
-    assert Episode.open(run.episodes_dir / "old.mcap").info.id == "old"
-    assert json.dumps(report)
 
 
 def test_messages_of_ones_own_type_carry_their_definition(

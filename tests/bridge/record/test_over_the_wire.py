@@ -1,8 +1,6 @@
 """Recorder, control keys and the folder source joined by real sessions, in one process."""
 
-import contextlib
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,14 +15,9 @@ from bridge.data_files import datasets_folder
 from bridge.episode import schema
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
-from bridge.episode.topics import DROPS
 from bridge.record.control import RecorderClient, serve_control
 from bridge.record.recorder import Recorder
 from bridge.record.status import describe_status
-from bridge.sources.folder.config import FolderConfig
-from bridge.sources.folder.messages import read_index
-from bridge.sources.folder.publish import FolderSource
-from bridge.terminal import Advance, Output
 from bridge.wire.config import WireConfig
 from bridge.wire.errors import RemoteError
 from bridge.wire.session import WireSession, open_session
@@ -120,33 +113,6 @@ def test_a_folder_with_an_unreadable_image_leaves_no_episode(
     assert robot_gst.run(["publish", "folder", str(tmp_path), *arguments]) == 2
     assert "c2.jpg: unreadable image" in capsys.readouterr().err
     assert list(joined.run.episodes_dir.iterdir()) == []
-
-
-def test_a_folder_is_recorded_as_a_camera(joined: Joined, tmp_path: Path) -> None:
-    write_folder(tmp_path, frames=5)
-    client = RecorderClient(joined.client, timeout_s=10.0)
-    client.start("scan", {"kind": "scan"})
-    progress: list[int] = []
-    stop = threading.Event()
-
-    class Watched(Output):
-        @contextlib.contextmanager
-        def progress(self, label: str, total: int) -> Iterator[Advance]:
-            def advance(done: int, note: str) -> None:
-                progress.append(done)
-                if done == 4:
-                    stop.set()
-
-            yield advance
-
-    config = FolderConfig(cell="lab", camera="eye", rate_hz=100.0)
-    sent = FolderSource(read_index(tmp_path), config).run(joined.client, stop, Watched())
-    answer = client.stop()
-    assert (sent["frames"], sent["of"], progress) == (4, 5, [1, 2, 3, 4])
-    assert answer["messages"] == sent["messages"] == 4 * 3 + 3
-    topics = Episode.open(joined.run.episodes_dir / "scan.mcap").topics()
-    counts = {topic: item.count for topic, item in topics.items() if topic != DROPS}
-    assert counts == sent["topics"]
 
 
 def test_ctl_sends_the_task_file_that_a_person_names(

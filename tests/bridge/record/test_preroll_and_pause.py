@@ -4,7 +4,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import events
 from bridge.episode.topics import DROPS
 from bridge.errors import UsageError
-from bridge.record.config import DiskConfig, RecorderConfig
+from bridge.record.config import RecorderConfig
 from bridge.record.errors import LifecycleError
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -131,18 +130,6 @@ def test_without_a_preroll_there_is_no_snapshot(make_recorder: MakeRecorder) -> 
         make_recorder().snapshot(info())
 
 
-def test_a_refused_start_costs_no_preroll(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    recorder = make_recorder(preroll_s=30.0)
-    recorder.receive(make_sample())
-    (run.episodes_dir / "taken.mcap").write_bytes(b"")
-    with pytest.raises(UsageError, match="exists already"):
-        recorder.start(info("taken"))
-    recorder.start(info())
-    assert recorder.stop()["messages"] == 1
-
-
 def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
     make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
 ) -> None:
@@ -173,28 +160,6 @@ def test_a_pause_leaves_messages_out_and_calls_none_of_them_lost(
     assert episode_of(run).metadata_records["recorder"]["paused"] == [span]
     report = check_episode(run.episodes_dir / "t1.mcap")
     assert (report.declared_losses, report.undeclared_losses, report.faults) == (1, 0, [])
-
-
-def test_stopping_a_paused_episode_finishes_it(make_recorder: MakeRecorder, run: RunFolder) -> None:
-    recorder = make_recorder()
-    recorder.start(info())
-    recorder.pause()
-    recorder.stop()
-    record = episode_of(run).metadata_records["recorder"]
-    assert [end_ns for _, end_ns in record["paused"]] == [record["end_ns"]]
-    recorder.start(info("t2"))
-    assert recorder.status()["state"] == "recording"
-
-
-def test_what_others_say_is_kept_in_the_episode(
-    make_recorder: MakeRecorder, run: RunFolder
-) -> None:
-    recorder = make_recorder()
-    recorder.also_tell("ros2_warnings", lambda: ["/map: another definition"])
-    recorder.start(info())
-    recorder.stop()
-    record = episode_of(run).metadata_records["recorder"]
-    assert record["ros2_warnings"] == recorder.status()["ros2_warnings"]
 
 
 def test_a_start_beside_later_parts_is_refused(make_recorder: MakeRecorder, run: RunFolder) -> None:
@@ -258,31 +223,3 @@ def test_ledger_records_say_how_things_stood(
         assert record["disk_free_bytes"] > 0
         assert record["queue_bytes"] >= 0
     assert episode_of(run).metadata_records["drops"]["clock_offset_ns"] == 3_000_000
-
-
-@pytest.mark.slow
-def test_episodes_kept_and_discarded_leave_no_threads_files_or_memory(
-    make_recorder: MakeRecorder, run: RunFolder, make_sample: MakeSample
-) -> None:
-    import gc
-    import os
-    import threading
-
-    def resources() -> tuple[int, int, int]:
-        gc.collect()
-        rss = int(Path("/proc/self/statm").read_text().split()[1])
-        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count(), rss
-
-    recorder = make_recorder(disk=DiskConfig(sync_s=100.0))
-    before = (0, 0, 0)
-    for number in range(300):  # test_endurance.py records a thousand, between processes
-        recorder.start(info(f"t{number}"))
-        for _ in range(5):
-            recorder.receive(make_sample())
-        recorder.stop(discard=number % 2 == 1)
-        if number == 100:
-            before = resources()
-    files, threads, pages = resources()
-    assert (files, threads) == before[:2]
-    assert (pages - before[2]) * os.sysconf("SC_PAGE_SIZE") < 20e6
-    assert len(run.episodes()) == 150

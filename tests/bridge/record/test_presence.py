@@ -69,39 +69,12 @@ def test_a_stream_that_stops_is_told_once_within_a_second_and_its_return_too(cel
     assert not cell.silent()
 
 
-def test_what_comes_now_and_then_is_never_missed(cell: Cell) -> None:
-    cell.run(60.0, joints=500, events=0.5)
-    cell.run(30.0, joints=500)
-    assert not cell.news
-
-
-def test_a_stream_that_hesitates_by_habit_is_given_more_time(cell: Cell) -> None:
-    for _ in range(20):
-        cell.run(0.5, joints=500)
-        cell.run(0.5)
-    cell.run(0.8)
-    assert not cell.silent()
-    cell.run(1.0)
-    assert cell.silent() == [JOINTS]
-
-
 def test_a_recorder_that_stood_still_blames_nobody_but_itself(cell: Cell) -> None:
     cell.run(5.0, joints=500)
     cell.time_s += 5.0
     cell.run(0.5, joints=500)
     assert cell.kinds() == ["starved"]
     assert cell.monitor.status()["starved_s"] == pytest.approx(5.1)
-
-
-def test_a_deaf_recorder_blames_nobody_but_itself(cell: Cell) -> None:
-    cell.run(5.0, joints=500)
-    cell.run(3.0, hearing=False)
-    assert cell.kinds() == ["deaf"]
-    assert cell.monitor.status()["deaf_s"] == pytest.approx(3.0)
-    assert not cell.silent()
-    cell.run(1.0, joints=500)
-    assert cell.kinds() == ["deaf", "hears_again"]
-    assert cell.monitor.status()["deaf_s"] == 0.0
 
 
 def test_deafness_is_told_within_a_second(cell: Cell) -> None:
@@ -175,10 +148,3 @@ def test_what_else_is_known_is_given_as_the_cause(
     assert silence.cause == cause
     assert str(silence).startswith(f"{JOINTS} silent for 1.0 s")
     assert (f"({cause})" in str(silence)) == bool(cause)
-
-
-def test_a_link_that_closed_long_before_is_no_cause(cell: Cell) -> None:
-    cell.monitor.link_closed()
-    cell.run(5.0, joints=500)
-    cell.run(1.0)
-    assert cell.monitor.silences()[0].cause == ""

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -134,32 +133,6 @@ def test_everything_a_publisher_sent_is_in_the_file(cell: Cell, tmp_path: Path) 
     assert "PROBLEM" not in checked.stdout
 
 
-def test_a_publisher_killed_in_mid_flight_ends_nothing(cell: Cell, tmp_path: Path) -> None:
-    recorder = cell.record("--episode", "t1")
-    cell.wait_until_ready()
-    first = cell.publish(tmp_path / "first", "100000", "0.002")
-    cell.wait_for_messages(150)
-    first.kill()
-    first.communicate()
-    time.sleep(0.2)
-    of_first = int(cell.status()["messages"])  # type: ignore[call-overload]
-    second = cell.publish(tmp_path / "second", "20", "0.001")
-    assert second.wait(timeout=WAIT_S) == 0
-    cell.wait_for_messages(of_first + 60)
-    recorder.send_signal(signal.SIGINT)
-    out, err = recorder.communicate(timeout=WAIT_S)
-    assert recorder.returncode == 0, err
-    assert "0 lost" in out
-    found, first_sent = recorded(cell.run_path / "episodes" / "t1.mcap"), sent(tmp_path / "first")
-    second_sent = sent(tmp_path / "second")
-    # The second publisher counts from 0 again: its 20 messages replace those in this mapping.
-    assert {key: found[key] for key in second_sent} == second_sent
-    rest = {key: digest for key, digest in found.items() if key not in second_sent}
-    assert rest.items() <= first_sent.items()
-    numbers = sorted(number for topic, number in rest if topic == "/child/joint_states")
-    assert numbers == list(range(20, numbers[-1] + 1))  # only the tail is missing
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_finishes_the_open_episode(
     cell: Cell, tmp_path: Path, number: signal.Signals
@@ -176,30 +149,6 @@ def test_a_signal_finishes_the_open_episode(
     assert recorded(cell.run_path / "episodes" / "t1.mcap") == sent(tmp_path / "account")
 
 
-def test_the_duration_ends_the_recording(cell: Cell) -> None:
-    recorder = cell.record("--episode", "t1", "--duration", "0.5")
-    _, err = recorder.communicate(timeout=WAIT_S)
-    assert recorder.returncode == 0, err
-    assert (cell.run_path / "episodes" / "t1.mcap").is_file()
-
-
-def test_commands_control_a_recorder(cell: Cell) -> None:
-    cell.record()
-    cell.wait_until_ready()
-    assert cell.command("ctl", "start", "--id", "t1", "--task", "x").returncode == 0
-    assert "recording t1" in cell.command("ctl", "status").stdout
-    assert cell.command("ctl", "mark", "here").returncode == 0
-    stopped = cell.command("ctl", "stop", "--result", "failure", "--json")
-    assert json.loads(stopped.stdout)["episode"] == "t1"
-    refused = cell.command("ctl", "start", "--id", "../evil")
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert "not usable as a file name" in refused.stderr
-    unknown = cell.command("ctl", "status", "--recorder", "other")
-    assert unknown.returncode == 1
-    assert "nobody answered on rec/other/ctl/status" in unknown.stderr
-    assert [path.name for path in cell.run_path.parent.rglob("*.mcap*")] == ["t1.mcap"]
-
-
 def test_nobody_there_and_port_taken_are_one_sentence(cell: Cell) -> None:
     alone = cell.command("ctl", "status")
     assert alone.returncode == 1
@@ -211,18 +160,3 @@ def test_nobody_there_and_port_taken_are_one_sentence(cell: Cell) -> None:
     _, err = second.communicate(timeout=WAIT_S)
     assert second.returncode == 1
     assert "in use by another process" in err
-
-
-def test_a_disk_that_refuses_more_ends_with_status_one(cell: Cell, tmp_path: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
-
-    recorder = cell.record("--episode", "t1", preexec_fn=limit)
-    cell.wait_until_ready()
-    publisher = cell.publish(tmp_path / "account", "400", "0")
-    _, err = recorder.communicate(timeout=WAIT_S)
-    assert recorder.returncode == 1
-    assert "t1.mcap.part: File too large. The recorder stopped" in err
-    assert "Traceback" not in err
-    assert [p.name for p in (cell.run_path / "episodes").iterdir()] == ["t1.mcap.part"]
-    publisher.kill()

@@ -19,10 +19,7 @@ from bridge.record.queue import (
     Entry,
     InputQueue,
     Item,
-    LoadShedding,
     Merge,
-    keep_every,
-    next_level,
 )
 from bridge.wire.session import WireSample
 
@@ -168,20 +165,6 @@ def test_an_image_from_behind_a_command_does_not_overtake_it() -> None:
     assert kinds == [Item, Command, Item]
 
 
-def test_what_is_given_up_ends_at_the_next_barrier() -> None:
-    queues, merge = Queues(), Merge()
-    stop = command()
-    queues.input_queue.put(image(0, 10))
-    queues.input_queue.put(image(1, 10, topic="/a", type_name="x"))
-    queues.input_queue.put_command(stop)
-    queues.input_queue.put(image(2, 10, topic="/b", type_name="x"))
-    queues.encode()
-    merge.feed(*queues.input_queue.take())
-    given_up = [entry.ticket for entry in merge.rest()]
-    assert sorted(given_up) == [0, 1]
-    assert [entry.ticket for entry in merge.ready()] == [stop.ticket, 3]
-
-
 def test_a_quiet_intake_queues_only_what_is_latched(make_sample: MakeSample) -> None:
     queues = Queues()
     queues.input_queue.be_quiet(0)
@@ -215,33 +198,6 @@ def test_too_large_and_too_many_are_dropped_and_said(make_sample: MakeSample) ->
         "/huge: messages over 0.1 MB are dropped",
         "/cell/joint_states: over 5 messages a second are dropped",
     ]
-
-
-def test_shedding_keeps_its_order_and_comes_back() -> None:
-    levels, level = [], LoadShedding.NOTHING
-    for fill in (0.1, 0.3, 0.6, 0.75, 0.9, 0.7, 0.6, 0.4, 0.2, 0.1):
-        level = next_level(level, fill)
-        levels.append(int(level))
-    assert levels == [0, 1, 2, 3, 4, 4, 2, 2, 0, 0]
-    assert [keep_every(item, "color") for item in LoadShedding] == [1, 1, 1, 2, 4]
-    assert [keep_every(item, "depth") for item in LoadShedding] == [1, 1, 1, 1, 2]
-    assert [keep_every(item, "") for item in LoadShedding] == [1] * 5
-
-
-def test_shed_images_are_counted_as_such() -> None:
-    queues = Queues(camera_queue_mb=1)
-    queues.kinds["/color"] = "color"
-    for number in range(16):
-        queues.input_queue.put(image(number, 50_000, topic="/color"))
-    ledger, kept = Ledger(), 0
-    for entry in queues.drain():
-        if isinstance(entry, Item):
-            kept += 1
-        elif isinstance(entry, Dropped):
-            ledger.count_dropped(entry)
-    assert ledger.total().shed > 0
-    assert ledger.total().queue_drops == 0
-    assert kept + ledger.total().shed == 16
 
 
 @pytest.mark.slow

@@ -114,17 +114,6 @@ def test_colour_as_is_and_depth_raw_keep_every_byte(
     assert messages_of(run, DEPTH) == [(schema.IMAGE, depth)]
 
 
-def test_compact_depth_is_smaller_and_the_same(make_recorder: MakeRecorder, run: RunFolder) -> None:
-    recorder = make_recorder(depth="compact")
-    recorder.receive(sample_of(DEPTH, depth_image()))
-    recorder.stop()
-    [(type_name, data)] = messages_of(run, DEPTH)
-    assert type_name == schema.COMPRESSED_IMAGE
-    assert len(data) < len(depth_image())
-    restored = DepthImage.from_message(type_name, data)
-    np.testing.assert_array_equal(restored.depth_mm, DepthImage.from_cdr(depth_image()).depth_mm)
-
-
 @pytest.mark.parametrize(
     ("data", "undecodable"),
     [
@@ -144,20 +133,6 @@ def test_what_cannot_be_encoded_is_recorded_as_it_came(
     answer = recorder.stop()
     assert (answer["messages"], answer["lost"], answer["undecodable"]) == (1, 0, undecodable)
     assert messages_of(run, COLOR) == [(schema.IMAGE, data)]
-
-
-def test_a_cut_jpeg_is_recorded_and_flagged(make_recorder: MakeRecorder, run: RunFolder) -> None:
-    jpeg = encode_jpeg(smooth())
-    messages = [
-        CompressedColor(stamp_ns=0, frame_id="", format="jpeg", data=data).to_cdr()
-        for data in (jpeg, jpeg[:-40])
-    ]
-    recorder = make_recorder()
-    for number, data in enumerate(messages):
-        recorder.receive(sample_of(COLOR, data, number, schema.COMPRESSED_IMAGE))
-    answer = recorder.stop()
-    assert (answer["messages"], answer["undecodable"]) == (2, 1)
-    assert [data for _, data in messages_of(run, COLOR)] == messages
 
 
 def test_each_stream_keeps_its_order_and_a_stop_waits_for_all_encoders(

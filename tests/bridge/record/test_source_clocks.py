@@ -17,8 +17,7 @@ from bridge.episode.cdr.messages import JointSample
 from bridge.episode.clocks import Reading, clocks_of, open_episode
 from bridge.episode.reader import Episode
 from bridge.record import clocks as record_clocks
-from bridge.record.clocks import ClockBook, StampJumps
-from bridge.record.presence import News
+from bridge.record.clocks import ClockBook
 from bridge.record.status import describe_status
 from bridge.wire.clocks import ClockAnswer, announce, ask_clocks
 from bridge.wire.config import WireConfig
@@ -162,20 +161,6 @@ def test_what_was_measured_before_begins_an_episode_in_few_records() -> None:
     (record,) = book.earlier()
     assert len(record["readings"]) <= record_clocks.EARLIER
     assert {reading[2] for reading in record["readings"]} == {100}
-
-
-def test_the_topics_of_one_publisher_are_named_in_one_sentence() -> None:
-    news: list[News] = []
-    jumps = StampJumps()
-    for second in range(8):
-        delay_ns = 10**6 if second < 4 else 10**6 - 10 * NS_PER_S
-        topics = ("/lab/a", "/lab/b", "/lab/c")
-        records = [
-            {"topic": topic, "second": second, "clock_offset_ns": delay_ns} for topic in topics
-        ]
-        news += jumps.look([*records, {"topic": "/x", "second": second, "clock_offset_ns": None}])
-    (told,) = news
-    assert told.text.startswith("the stamps of /lab/a and 2 more jumped ahead by 10.000 s")
 
 
 def test_a_jump_that_answers_have_shown_is_not_told_again_for_its_stamps() -> None:

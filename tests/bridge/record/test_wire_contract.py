@@ -146,27 +146,6 @@ def test_the_bytes_of_every_language_are_the_same(tmp_path: Path, language: str)
     assert codec.encode(schema.JOINT_STATE, codec.decode(schema.JOINT_STATE, message)) == message
 
 
-@pytest.mark.parametrize(
-    ("header", "command"),
-    [
-        ("zenoh.h", ["gcc", "-std=c11", "publish_joints.c", "-lzenohc", "-lm"]),
-        ("zenoh.hxx", ["g++", "-std=c++17", "-DZENOHCXX_ZENOHC", "publish_joints.cpp", "-lzenohc"]),
-    ],
-)
-def test_the_example_in_c_and_c_plus_plus_is_recorded_where_zenoh_is_installed(
-    router: WireSession, endpoint: str, tmp_path: Path, header: str, command: list[str]
-) -> None:
-    found = [Path(folder) / header for folder in ("/usr/include", "/usr/local/include")]
-    if shutil.which(command[0]) is None or not any(path.is_file() for path in found):
-        pytest.skip(f"not run: {command[0]} with {header} is not here")
-    program = str(tmp_path / "program")
-    subprocess.run([*command, "-o", program], cwd=EXAMPLES, check=True)
-    listener = WireListener(router, "demo/**", enough=59)
-    subprocess.run([program, endpoint, "demo", "60", "1000", "7"], timeout=WAIT_S, check=True)
-    assert listener.is_enough.wait(WAIT_S)
-    assert list(findings(listener.finish())) == ["wrong sequence"]
-
-
 @pytest.mark.parametrize("left_out", [(), (7, 8, 20)])
 def test_the_example_is_recorded_clean_and_its_losses_are_seen_exactly(
     router: WireSession, endpoint: str, run: RunFolder, spawn: Spawn, left_out: tuple[int, ...]
@@ -245,10 +224,17 @@ def findings(heard: list[TopicHeard]) -> dict[str, str]:
 
 
 def listen(router: WireSession, act: Callable[[], None], *, messages: int) -> list[TopicHeard]:
-    listener = WireListener(router, "demo/**", enough=messages)
+    listener = WireListener(router, "demo/**")
     act()
-    assert listener.is_enough.wait(WAIT_S)
+    wait_for(listener, messages)
     return listener.finish()
+
+
+def wait_for(listener: WireListener, messages: int) -> None:
+    ends_s = time.monotonic() + WAIT_S
+    while sum(each.messages for each in listener._heard.values()) < messages:
+        assert time.monotonic() < ends_s
+        time.sleep(0.01)
 
 
 def test_who_keeps_the_contract_has_no_findings(router: WireSession, wild: Wild) -> None:
@@ -288,9 +274,9 @@ def test_every_breach_is_named(
 
 
 def test_a_missing_token_and_a_wrong_rate_are_named(router: WireSession, wild: Wild) -> None:
-    listener = WireListener(router, "demo/**", enough=5)
+    listener = WireListener(router, "demo/**")
     wild.send()
-    assert listener.is_enough.wait(WAIT_S)
+    wait_for(listener, 5)
     found = findings(listener.finish(rate_hz=1e6 * 0.9))
     assert "no token demo/alive" in found["missing liveliness"]
     assert "expected 900000 Hz" in found["wrong rate"]

@@ -4,8 +4,6 @@ import copy
 import io
 import json
 import os
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -302,58 +300,10 @@ def test_a_failed_import_leaves_no_episode(folder: Path, tmp_path: Path) -> None
     assert list(run.episodes_dir.iterdir()) == []
 
 
-def read_png16(path: Path) -> np.ndarray:
-    """A PNG reader of our own: filters undone row by row (PNG specification, section 9)."""
-    data, at, compressed, width, height = path.read_bytes(), 8, b"", 0, 0
-    while at < len(data):
-        (length,), kind = struct.unpack(">I", data[at : at + 4]), data[at + 4 : at + 8]
-        body = data[at + 8 : at + 8 + length]
-        if kind == b"IHDR":
-            width, height = struct.unpack(">II", body[:8])
-        elif kind == b"IDAT":
-            compressed += body
-        at += 12 + length
-    rows = np.frombuffer(zlib.decompress(compressed), np.uint8).reshape(height, 1 + 2 * width)
-    out = np.zeros((height, 2 * width), np.uint8)
-    before = [0] * (2 * width)
-    for number, row in enumerate(rows.tolist()):
-        kind, line = row[0], row[1:]
-        for i in range(2 * width):
-            left, up = (line[i - 2] if i > 1 else 0), before[i]
-            corner = before[i - 2] if i > 1 else 0
-            if kind == 4:
-                guess = left + up - corner
-                costs = (abs(guess - left), abs(guess - up), abs(guess - corner))
-                add = (left, up, corner)[costs.index(min(costs))]
-            else:
-                add = (0, left, up, (left + up) // 2)[kind]
-            line[i] = (line[i] + add) & 255
-        out[number] = before = line  # type: ignore[assignment]
-    return out.view(">u2").astype(np.uint16)
-
-
 def need(folder: Path) -> Path:
     if not (folder / "scene.json").is_file():
         pytest.skip(f"{folder} is not on this machine (set GST_SHARED_DATA)")
     return folder
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("folder_path", [KITCHEN, SHELF], ids=["kitchen", "shelf"])
-def test_real_depth_is_what_another_reader_reads(folder_path: Path) -> None:
-    folder = need(folder_path)
-    index = read_index(folder)
-    frame = next(iter(folder_messages(index, FolderConfig(max_frames=1), 0)))
-    stored = read_png16(index.frames[0].depth_path).astype(np.int64)
-    if folder_path == SHELF:
-        tenths = ((stored >> 3) | (stored << 13)) & 0xFFFF
-        expected = tenths * 0.1
-        share_invalid = (tenths == 0).mean()
-        assert 0.6 < share_invalid < 0.85  # its README says about 73 %
-        assert np.abs(depth_of(frame) - expected).max() <= 0.5 + 1e-9
-    else:
-        expected = np.where(stored == 65535, 0, stored)
-        np.testing.assert_array_equal(depth_of(frame), expected)
 
 
 @pytest.mark.slow

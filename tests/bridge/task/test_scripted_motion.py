@@ -64,10 +64,3 @@ def test_a_record_reads_back_as_it_was_written() -> None:
 def test_a_damaged_record_is_refused(change: dict[str, Any], match: str) -> None:
     with pytest.raises(InvalidRecordError, match=match):
         ScriptedMotion.from_record(parsed(MOTION.to_record()) | change)
-
-
-def test_a_missing_field_is_named() -> None:
-    record = parsed(MOTION.to_record())
-    del record["hand_link"]
-    with pytest.raises(InvalidRecordError, match="hand_link"):
-        ScriptedMotion.from_record(record)

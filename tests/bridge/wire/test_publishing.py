@@ -130,16 +130,6 @@ def test_who_comes_and_goes_is_seen(router: WireSession, client: WireSession) ->
     wait_for(lambda: ("rec/two/alive", False) in seen, "the end of the session")
 
 
-def test_without_history_only_news_is_told(router: WireSession, client: WireSession) -> None:
-    client.declare_alive("rec/one/alive")
-    wait_for(lambda: bool(router.query_alive("rec/*/alive")), "the token")
-    seen: list[str] = []
-    router.watch_alive("rec/*/alive", lambda key, alive: seen.append(key), history=False)
-    client.declare_alive("rec/two/alive")
-    wait_for(lambda: bool(seen), "the news")
-    assert seen == ["rec/two/alive"]
-
-
 @pytest.mark.parametrize("key", ["", "/a", "a//b"])
 def test_a_bad_key_is_one_sentence(client: WireSession, key: str) -> None:
     with pytest.raises(WireConfigError, match="cannot be seen as"):

@@ -21,7 +21,7 @@ def test_a_publisher_is_read() -> None:
     assert (found.kind, found.domain, found.node) == (EntityKind.PUBLISHER, 2, "/talker")
     assert (found.topic, found.type_name) == ("/chatter", "std_msgs/msg/String")
     assert found.session == "8b20917502ee955ac4476e0266340d5c"
-    assert found.qos == RosQos(reliable=True, transient_local=False, depth=7)
+    assert found.qos == RosQos(transient_local=False, depth=7)
     assert found.key == f"2/chatter/{STRING}/{STRING_HASH}"
     assert keys.read_key(found.key) == ("/chatter", "std_msgs/msg/String", STRING_HASH)
 
@@ -51,8 +51,8 @@ def test_names_with_slashes_and_later_parts_are_read() -> None:
     [
         ("::,10:,:,:,,", RosQos(depth=10)),
         (":1:,1:,:,:,,", RosQos(transient_local=True, depth=1)),
-        ("2::,5:,:,:,,", RosQos(reliable=False, depth=5)),
-        ("1:1:2,10", RosQos(transient_local=True, depth=10, keep_all=True)),
+        ("2::,5:,:,:,,", RosQos(depth=5)),
+        ("1:1:2,10", RosQos(transient_local=True, depth=10)),
         ("::,", RosQos()),
         ("", None),
         ("::", RosQos()),

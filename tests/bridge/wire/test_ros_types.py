@@ -69,20 +69,6 @@ def test_a_definition_nobody_knows_is_none() -> None:
     assert ros_schema("std_msgs/msg/String", type_hash="RIHS01_" + "0" * 64) is None
 
 
-def test_definitions_of_a_folder_are_used(tmp_path: Path) -> None:
-    write(tmp_path, "Grip", "std_msgs/Header header\nfloat64[3] force_N\nPad[] pads\n")
-    write(tmp_path, "Pad", "string name\n")
-    assert ros_schema("my_msgs/msg/Grip") is None
-    found = ros_schema("my_msgs/msg/Grip", folder=tmp_path)
-    assert found is not None
-    text = found.data.decode()
-    assert "float64[3] force_N" in text
-    assert "MSG: my_msgs/Pad" in text
-    assert "MSG: builtin_interfaces/Time" in text
-    assert str(type_hash_of("my_msgs/msg/Grip", folder=tmp_path)).startswith("RIHS01_")
-    assert type_hash_of("std_msgs/msg/String", folder=tmp_path) == STRING_HASH
-
-
 def test_a_type_made_of_an_unknown_one_is_unknown(tmp_path: Path) -> None:
     write(tmp_path, "Grip", "other_msgs/Missing part\n")
     assert ros_schema("my_msgs/msg/Grip", folder=tmp_path) is None

@@ -66,7 +66,7 @@ def _pairs(episode: Episode, camera_id: str, *, keep: bool) -> Iterator[tuple[St
     )
     colors: list[Stamped] = []
     depths: list[Stamped] = []
-    for message in streams.image_messages(episode, [each for each in (color, depth) if each]):
+    for message in episode.messages([each for each in (color, depth) if each]):
         stamp = stamp_of(decode(message.type_name, message.data))
         item = (stamp, message if keep else None)
         (colors if message.topic == color else depths).append(item)
@@ -127,7 +127,7 @@ def check_camera(episode: Episode, camera_id: str) -> None:
 def _first_size(episode: Episode, camera_id: str, stream: str) -> tuple[int, int] | None:
     """Width and height of the first image; None without any."""
     topic = streams.find_camera_topic(episode, camera_id, f"{stream}/image")
-    for message in streams.image_messages(episode, [topic] if topic else []):
+    for message in episode.messages([topic] if topic else []):
         if stream == "color":
             height, width = color_from_message(message.type_name, message.data).image_u8().shape[:2]
         else:

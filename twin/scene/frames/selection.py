@@ -134,7 +134,7 @@ def sharpness_at(episode: Episode, camera_id: str, stamps_ns: Collection[int]) -
     topic = streams.find_camera_topic(episode, camera_id, "color/image")
     wanted = set(stamps_ns)
     found: dict[int, float] = {}
-    for message in streams.image_messages(episode, [topic] if topic else []):
+    for message in episode.messages([topic] if topic else []):
         image = color_from_message(message.type_name, message.data)
         if image.stamp_ns in wanted:
             found[image.stamp_ns] = sharpness(image.image_u8())
