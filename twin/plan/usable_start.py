@@ -59,9 +59,6 @@ def start_posture(
 
     Returns:
         None with the reason in words, or the joints and nothing.
-
-    Raises:
-        NoPlanError: What was recorded then is not made of numbers.
     """
     found = recorded_start(episode, stamp_ns, joints)
     if found is not None:

@@ -46,13 +46,7 @@ class VideoWriter:
         """Create the file; sizes that are odd get full chroma, for the usual one needs even.
 
         Args:
-            path: The file; its folder is made where needed.
-            width: Of every frame [px].
-            height: Of every frame [px].
             is_depth: Frames are 12-bit codes, kept without loss.
-
-        Raises:
-            MissingDependencyError: Without PyAV, or with one that has no encoder for this.
         """
         av = _av()
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -107,12 +101,7 @@ class VideoWriter:
 def read_frames(
     path: Path, times_s: Sequence[float], tolerance_s: float, pixels: str = RGB
 ) -> Iterator[np.ndarray]:
-    """Yield the frame nearest to each time; times ascend [s].
-
-    Raises:
-        LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder
-            says of the file.
-    """
+    """Yield the frame nearest to each time; times ascend [s]."""
     if not len(times_s):
         return
     av = _av()

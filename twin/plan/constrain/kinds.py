@@ -48,10 +48,6 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
 
     Args:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
-
-    Raises:
-        UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
-            an object that was not localised.
     """
     vocabulary = Vocabulary.of_task(problem.scene.task, num_keypoints=len(problem.keypoints))
     _refuse_unknown_keypoints(record, problem)
