@@ -160,7 +160,9 @@ def _start(
         )
     seen_ns = max(item.stamp_ns for item in found.values())
     start_rad, unknown = start_posture(episode, seen_ns, robot_of(urdf).joints)
-    problem = problem_of(run, task, found, urdf, start_rad)
+    poses = {key: T for key, item in found.items() if (T := item.T_base_object) is not None}
+    sure = {key: item.covariance for key, item in found.items() if item.covariance is not None}
+    problem = problem_of(run, task, urdf, poses, sure, start_rad)
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
