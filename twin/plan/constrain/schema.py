@@ -218,7 +218,9 @@ def shown(value: Any) -> str:
     if isinstance(value, str):
         cut = "..." if len(value) > MOST_SHOWN else ""
         return json.dumps(value[:MOST_SHOWN]) + cut
-    return {dict: "an object", list: "a list"}.get(type(value)) or f"{json.dumps(value):.60}"
+    if isinstance(value, dict | list):
+        return "an object" if isinstance(value, dict) else "a list"
+    return f"{json.dumps(value):.60}"
 
 
 @dataclass(frozen=True)

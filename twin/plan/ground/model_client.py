@@ -30,8 +30,8 @@ from bridge.task.model_policy import server_of
 from bridge.task.plan import Stage
 from bridge.whole_file import write_whole
 from twin.errors import TwinError
-from twin.plan.constrain.reply import MAX_BYTES, ReplyError, printable, read_reply
-from twin.plan.constrain.schema import Vocabulary
+from twin.plan.constrain.reply import MAX_BYTES, ReplyError, read_reply
+from twin.plan.constrain.schema import Vocabulary, printable
 
 Messages = list[dict[str, Any]]
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
