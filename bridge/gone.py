@@ -25,10 +25,7 @@ GONE: dict[str, str] = {
     "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
     "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
     "ls --no-flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
-    "dashboard --console": (
-        "Go through the design's order.csv with robot-gst ctl start and stop, and label on the "
-        "dashboard's page label."
-    ),
+    "dashboard --console": "Use robot-gst ctl start and stop, and the dashboard's page label.",
     "prune": (
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."

@@ -42,11 +42,7 @@ class SoftNodes:
 
 
 def read_soft_nodes(replay: Recording, name: str) -> SoftNodes | None:
-    """Read the nodes of a soft object; None where the replay holds none that can be drawn.
-
-    Raises:
-        GstError: When the file cannot be read.
-    """
+    """Read the nodes of a soft object; None where the replay holds none that can be drawn."""
     track = replay.objects.get(name)
     episode = Episode.open(replay.path)
     topic = streams.object_pose_topics(episode).get(name)

@@ -32,11 +32,7 @@ def write_semantics(folder: Path, scene: SemanticScene, rows: Mapping[str, int])
     """Write labels and parts of a scene; return what ``scene.json`` says about it.
 
     Args:
-        scene: Labels of all Gaussians: those of the background, then of each object.
         rows: How many Gaussians each of them has, in that order: ``background``, object ids.
-
-    Raises:
-        SemanticsError: When the numbers do not add up.
     """
     if sum(rows.values()) != len(scene.labels):
         message = f"{len(scene.labels)} labels for files with {dict(rows)} Gaussians."
@@ -111,10 +107,6 @@ def read_semantics(folder: Path, rows: Mapping[str, int]) -> SemanticScene:
     Args:
         rows: How many Gaussians each file has, in the order of the labels: ``background``, object
             ids.
-
-    Raises:
-        PathNotFoundError: When the scene has none.
-        UnreadableSemanticsError: When the file is damaged or belongs to other splats.
     """
     path = folder / SEMANTICS_FILE
     if not path.is_file():

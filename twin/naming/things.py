@@ -95,11 +95,7 @@ class SemanticScene:
     """Why there is nothing, or what was left out; empty when there is nothing to say."""
 
     def instance(self, number: int) -> Instance:
-        """Return the instance with an id.
-
-        Raises:
-            SemanticsError: When there is none; names those that exist.
-        """
+        """Return the instance with an id."""
         for item in self.instances:
             if item.id == number:
                 return item

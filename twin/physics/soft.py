@@ -26,10 +26,6 @@ def rigid_fit(
     """Rigid motion that brings the nodes at rest nearest to where they are.
 
     Squared distances are weighted by mass. Nodes that are no numbers give a pose that is none.
-
-    Args:
-        rest_m: Where the nodes are at rest, in the body's own frame.
-        nodes_m: Where they are now, in the frame the pose is wanted in.
     """
     if not np.isfinite(nodes_m).all():
         T = np.eye(4)
@@ -74,11 +70,7 @@ def bind_points(
     nodes_m: Float[np.ndarray, "num_nodes 3"],
     tets: Int32[np.ndarray, "num_tets 4"],
 ) -> Skin:
-    """Barycentric coordinates in the tetrahedron that holds a point, or leaves it out the least.
-
-    Args:
-        points_m: Points at rest, in the frame of the nodes.
-    """
+    """Barycentric coordinates in the tetrahedron that holds a point, or leaves it out the least."""
     corner = nodes_m[tets[:, 0]]
     to_weights = np.linalg.inv(np.swapaxes(nodes_m[tets[:, 1:]] - corner[:, None], 1, 2))
     best = np.full(len(points_m), -np.inf)
@@ -240,11 +232,7 @@ class SoftModel:
     """Points of the true surface, which may lie outside of the lattice; None: the nodes."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated.
-
-        Raises:
-            SoftBodyError: No tetrahedra, inverted ones, or impossible material.
-        """
+        """Refuse what cannot be simulated."""
         low, high = POISSON_RANGE
         numbers = (self.mass_kg, self.young_pa, self.spacing_m)
         if len(self.tets) == 0:
@@ -270,11 +258,7 @@ class SoftModel:
 
     @staticmethod
     def from_task(model: ObjectModel) -> "SoftModel":
-        """Fill the mesh that a task names with its own lattice (``bridge.task.meshes``).
-
-        Raises:
-            SoftBodyError: The object is rigid.
-        """
+        """Fill the mesh that a task names with its own lattice (``bridge.task.meshes``)."""
         if model.soft is None:
             raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
         mesh, lattice = _mesh_and_lattice(model.mesh or "", model.size_m, model.soft.cell_m)
@@ -295,9 +279,6 @@ class SoftModel:
         Args:
             arrays: What ``objects/<id>/soft.npz`` holds: ``nodes_m``, ``tets``, ``mass_fraction``
                 and ``spacing_m`` (``twin.scene.shape.lattice``).
-
-        Raises:
-            SoftBodyError: Arrays are missing or unusable, or the object is rigid.
         """
         if model.soft is None:
             raise SoftBodyError(found=f"no soft table: {model.id} is rigid")
@@ -393,11 +374,7 @@ class SoftHealth:
 
 
 def health_of(model: SoftModel, nodes_m: Float[np.ndarray, "num_nodes 3"]) -> SoftHealth:
-    """Compare a body's nodes with its rest state.
-
-    Args:
-        nodes_m: Where its nodes are now, in any frame.
-    """
+    """Compare a body's nodes with its rest state."""
     if not np.isfinite(nodes_m).all():
         return SoftHealth(num_inverted=0, max_stretch=np.inf, is_finite=False)
     edges, rest_m = model.rest_edges

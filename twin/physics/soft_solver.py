@@ -55,7 +55,6 @@ def link_pieces(urdf: str, mesh_hulls_m: Hulls) -> dict[str, list[ConvexPiece]]:
     """Return the pieces of each link that has any, in the link's frame.
 
     Args:
-        urdf: Description; its boxes and cylinders are taken from it.
         mesh_hulls_m: Per link, hulls that stand for its collision meshes [m].
     """
     found = {}
@@ -118,10 +117,6 @@ def add_body(
     friction: float,
 ) -> tuple[int, Float[np.ndarray, " num_nodes"]]:
     """Hand a body at rest to a solver.
-
-    Args:
-        model: Shape and mass.
-        T_base_object: Where its object frame is.
 
     Returns:
         The solver's number for it, and the masses of its nodes [kg].

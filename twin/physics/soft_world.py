@@ -41,12 +41,7 @@ class Reaction:
         pushes: Float[np.ndarray, "num_pieces 15"],
         poses: Mapping[str, LinkPose],
     ) -> None:
-        """Push the arm and slow the fingers.
-
-        Args:
-            pushed: Pieces that anything pushed.
-            pushes: Momentum and its moment about the frame, per piece, of the last step.
-        """
+        """Push the arm and slow the fingers."""
         opening = 0.0
         wrenches: dict[str | None, list[float]] = {}
         for piece in pushed:
@@ -129,11 +124,7 @@ class SoftWorld:
     def __init__(
         self, client: int, arm: Arm, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig
     ) -> None:
-        """Remember what soft bodies will meet.
-
-        Args:
-            mesh_hulls_m: Per link, hulls that stand for its collision meshes [m].
-        """
+        """Remember what soft bodies will meet."""
         self.names: dict[str, _SoftBody] = {}
         self._client, self._arm, self._config = client, arm, config
         self._description = (urdf, mesh_hulls_m)
@@ -247,11 +238,7 @@ class SoftWorld:
     def add(
         self, object_id: str, model: SoftModel, T_base_object: Float[np.ndarray, "4 4"]
     ) -> None:
-        """Add a soft body at rest.
-
-        Args:
-            T_base_object: Where its own frame begins; the lattice is laid there undeformed.
-        """
+        """Add a soft body at rest."""
         rest = model.nodes_m.astype(np.float64)
         friction = self._config.object_friction if model.friction is None else model.friction
         index, _ = add_body(

@@ -32,9 +32,8 @@ from twin.plan.loop.nominal import POLICIES, PlanProposer
 from twin.plan.loop.propose import Candidate, NoPlanError, Proposer, choose
 from twin.plan.model_stages import Asked, ask_about, client_of
 from twin.plan.problem import Problem
-from twin.plan.shapes import keypoints_of, shapes_of
+from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
-from twin.replay.rebuilt_scene import read_rebuilt_scene
 from twin.robot.model import load_robot
 
 PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
@@ -179,17 +178,8 @@ class LivePlanner:
             raise NoPlanError(
                 f"the request and task {task.name} differ in objects: {', '.join(unknown)}."
             )
-        scene = read_rebuilt_scene(self._run, task).scene(
-            task, urdf, poses, covariances=covariances
-        )
         start_rad = np.array(request.joints_rad, dtype=np.float64)
-        shapes = shapes_of(self._run.scene_dir, task)
-        problem = Problem(
-            scene=replace(scene, start_rad=start_rad),
-            robot=robot,
-            shapes=shapes,
-            keypoints=keypoints_of(shapes),
-        )
+        problem = problem_of(self._run, task, urdf, poses, covariances, start_rad)
         if not self._config.robot:
             refuse_other_robot(self._run, robot.record)
         refuse_unusable(problem)

@@ -150,11 +150,7 @@ def retasked(problem: Problem, task: Task) -> Problem:
 def goals_in(
     stages: Sequence[Stage], words: str, vocabulary: Things, explanation: str
 ) -> Grounding:
-    """The goals in a model's stages: where each object ends that is let go, in that order.
-
-    Raises:
-        GroundingError: When it is not said where an object ends, or it cannot end there.
-    """
+    """The goals in a model's stages: where each object ends that is let go, in that order."""
     goals = Goals(vocabulary)
     for stage in stages:
         if stage.release is None:

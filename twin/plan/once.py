@@ -160,7 +160,9 @@ def _start(
         )
     seen_ns = max(item.stamp_ns for item in found.values())
     start_rad, unknown = start_posture(episode, seen_ns, robot_of(urdf).joints)
-    problem = problem_of(run, task, found, urdf, start_rad)
+    poses = {key: T for key, item in found.items() if (T := item.T_base_object) is not None}
+    sure = {key: item.covariance for key, item in found.items() if item.covariance is not None}
+    problem = problem_of(run, task, urdf, poses, sure, start_rad)
     if not robot:
         refuse_other_robot(run, problem.robot.record)
     refuse_unusable(problem)
@@ -422,11 +424,7 @@ def _state(problem: Problem, plan: Plan, stage: Stage | None) -> State:
             if each.grasp is not None and closed:  # from here on it moves with the tool
                 T_tcp_object = se3.invert(_tool(closed[0])) @ Ts[each.grasp]
                 Ts[each.grasp] = _tool(at) @ T_tcp_object
-    return State(
-        Ts_base_object={key: T[None] for key, T in Ts.items()},
-        T_base_tcp=_tool(at)[None],
-        width_m=np.array([at.width_m or 0.0]),
-    )
+    return State.single(Ts, _tool(at), at.width_m or 0.0)
 
 
 def _tool(at: Waypoint) -> Float[np.ndarray, "4 4"]:

@@ -82,6 +82,19 @@ class State:
     width_m: Any
     """``(num_states,)``, between the finger pads."""
 
+    @staticmethod
+    def single(
+        Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+        T_base_tcp: Float[np.ndarray, "4 4"],
+        width_m: float,
+    ) -> "State":
+        """A batch of one."""
+        return State(
+            Ts_base_object={name: T[None] for name, T in Ts_base_object.items()},
+            T_base_tcp=T_base_tcp[None],
+            width_m=np.array([width_m]),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:

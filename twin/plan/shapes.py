@@ -22,10 +22,9 @@ from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.naming.scene_file import BACKGROUND_KEY, SEMANTICS_FILE, read_semantics
 from twin.plan.problem import Keypoint, Problem, Shape
-from twin.replay.rebuilt_scene import MOST_OFF, RebuiltScene, read_rebuilt_scene
+from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
 from twin.scene.gaussians import read_ply
-from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
@@ -36,38 +35,16 @@ GUESSED_SHARE = 0.1
 
 
 def problem_of(
-    run: RunFolder | None,
+    run: RunFolder,
     task: Task,
-    localised: Mapping[str, LocalisedObject],
     urdf: str,
-    start_rad: Float[np.ndarray, " num_joints"] | None = None,
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+    covariances: Mapping[str, Float[np.ndarray, "6 6"]],
+    start_rad: Float[np.ndarray, " num_joints"] | None,
 ) -> Problem:
-    """Put together what the planner knows when it plans.
-
-    Args:
-        run: Its scene and calibration are used; None: there is none, the task file says all.
-        localised: Where they were found; those that were not keep the reason.
-        start_rad: Where the arm stands, base to hand; None: not known.
-    """
-    found = {
-        key: item
-        for key, item in localised.items()
-        if key in task.objects and item.T_base_object is not None
-    }
-    poses = {
-        key: item.T_base_object for key, item in found.items() if item.T_base_object is not None
-    }
-    reasons = {
-        key: localised[key].reason or "not found" if key in localised else "was not looked for"
-        for key in task.objects
-        if key not in found
-    }
-    covariances = {
-        key: item.covariance for key, item in found.items() if item.covariance is not None
-    }
-    rebuilt = RebuiltScene() if run is None else read_rebuilt_scene(run, task)
-    scene = rebuilt.scene(task, urdf, poses, reasons=reasons, covariances=covariances)
-    shapes = shapes_of(None if run is None else run.scene_dir, task)
+    """Put together what the planner knows when it plans; no joints where nobody knows them."""
+    scene = read_rebuilt_scene(run, task).scene(task, urdf, Ts_base_object, covariances=covariances)
+    shapes = shapes_of(run.scene_dir, task)
     return Problem(
         scene=replace(scene, start_rad=start_rad),
         robot=load_robot(urdf),

@@ -12,7 +12,6 @@ from bridge.episode.topics import JOINT_STATES
 from bridge.errors import BridgeError
 from bridge.robots.robot import Robot
 from bridge.task.check import TABLE
-from twin.plan.constrain.kinds import outer_reach
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.replay.rebuilt_scene import scene_of_other_robot
@@ -59,9 +58,6 @@ def start_posture(
 
     Returns:
         None with the reason in words, or the joints and nothing.
-
-    Raises:
-        NoPlanError: What was recorded then is not made of numbers.
     """
     found = recorded_start(episode, stamp_ns, joints)
     if found is not None:
@@ -144,7 +140,7 @@ def _refuse_far_place(
     problem: Problem, what: str, name: str, p_m: Float[np.ndarray, "3"], hint: str
 ) -> None:
     """Beyond what the links laid out straight reach, with the object's own size to spare."""
-    p_shoulder, length_m = outer_reach(problem)
+    p_shoulder, length_m = _outer_reach(problem)
     away_m = float(np.linalg.norm(p_m - p_shoulder))
     if away_m - float(np.linalg.norm(problem.model(name).size_m)) > length_m:
         x, y, z = p_m * 1e3
@@ -153,3 +149,18 @@ def _refuse_far_place(
             f"first joint of {problem.robot.record.name}, which reaches {length_m:.2f} m",
             hint,
         )
+
+
+def _outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
+    """Where the arm's first joint is in the base frame, and the lengths of the links behind it [m].
+
+    The placements of the joints and the tool in the robot description, one behind the other.
+    """
+    model, tool = problem.robot.model, problem.robot.tcp_id
+    frame = model.frames[tool]
+    length = float(np.linalg.norm(frame.placement.translation))
+    joint = int(frame.parentJoint)
+    while int(model.parents[joint]):
+        length += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        joint = int(model.parents[joint])
+    return np.array(model.jointPlacements[joint].translation), length

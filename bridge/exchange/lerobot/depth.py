@@ -33,11 +33,7 @@ class DepthCoding:
     use_log: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what has no inverse.
-
-        Raises:
-            ValueError: Saying what.
-        """
+        """Refuse what has no inverse."""
         numbers = (self.min_m, self.max_m, self.shift_m)
         low_m = self.min_m + (self.shift_m if self.use_log else 0.0)
         if not all(map(math.isfinite, numbers)) or self.max_m <= self.min_m or self.min_m < 0:
@@ -49,11 +45,7 @@ class DepthCoding:
 
     @staticmethod
     def from_info(info: Mapping[str, Any]) -> "DepthCoding | None":
-        """Read the ``info`` of a feature; None for a video of colours.
-
-        Raises:
-            ValueError: When it makes no sense.
-        """
+        """Read the ``info`` of a feature; None for a video of colours."""
         if not (info.get("is_depth_map") is True or info.get("video.is_depth_map") is True):
             return None
         if "video.depth_min" not in info:  # an older depth video, of another kind

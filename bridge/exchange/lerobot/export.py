@@ -78,14 +78,7 @@ def choose_fps(episode: Episode) -> int:
 
 
 def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
-    """Put an episode on the grid, over the time in which joints and all cameras are there.
-
-    Args:
-        episode: Must have joints; gripper and cameras are taken where they are there.
-
-    Raises:
-        EpisodeError: When it has no joints, or its streams never overlap.
-    """
+    """Put an episode on the grid, over the time in which joints and all cameras are there."""
     tracks = [joint_track(episode)]
     if any(topic.endswith(GRIPPER_STATE) for topic in episode.topics_of_type(schema.JOINT_STATE)):
         tracks.append(joint_track(episode, GRIPPER_STATE))
@@ -151,11 +144,7 @@ def _at(
 def row_images(
     episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Yield the decoded image of each row; ``wanted`` never decreases.
-
-    Args:
-        wanted: Number of the image that each row takes, counted from 0 in log order.
-    """
+    """Yield the decoded image of each row; ``wanted`` never decreases."""
     row = 0
     for number, message in enumerate(episode.messages([_topic(episode, camera)])):
         if row == len(wanted):
@@ -172,11 +161,7 @@ def row_images(
 def row_depths(
     episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
 ) -> Iterator[UInt16[np.ndarray, "height width"]]:
-    """Yield the depth of each row [mm]; ``wanted`` never decreases.
-
-    Args:
-        wanted: Number of the depth image that each row takes, counted from 0 in log order.
-    """
+    """Yield the depth of each row [mm]; ``wanted`` never decreases."""
     row = 0
     for number, message in enumerate(episode.messages([_topic(episode, camera, DEPTH_IMAGE)])):
         if row == len(wanted):
@@ -355,9 +340,6 @@ def select_episodes(source: Path, config: LeRobotConfig) -> tuple[list[Path], li
 
     Args:
         config: Its ``episodes``, where given, are taken whatever their kind.
-
-    Raises:
-        UsageError: When nothing is left, or a named episode is not there.
     """
     if not source.is_dir():
         return [source], []
@@ -392,7 +374,6 @@ def export_lerobot(
         advance: Told how many episodes are done; each counts twice, once for looking at it.
 
     Raises:
-        EpisodeError: When an episode lacks joints, or differs from the first in joints or cameras.
         UsageError: When there is nothing to export, or ``out`` may not be replaced.
     """
     files, left_out = select_episodes(source, config)

@@ -85,11 +85,7 @@ class EpisodeRows:
 
 
 def parse_selection(text: str | None) -> list[range] | None:
-    """Read "0-9,12": which episodes are wanted; None is all.
-
-    Raises:
-        UsageError: When it is no such list.
-    """
+    """Read "0-9,12": which episodes are wanted; None is all."""
     if text is None:
         return None
     ranges = []
@@ -107,10 +103,6 @@ def read_episodes(info: DatasetInfo, wanted: Sequence[range] | None) -> list[Epi
 
     Args:
         wanted: Ranges of episode indices; None for all.
-
-    Raises:
-        LeRobotFormatError: Naming the file and row that cannot be believed.
-        UsageError: When none of the wanted episodes is there.
     """
     _, pq = parquet()
     paths = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
@@ -182,11 +174,7 @@ def _entry(info: DatasetInfo, path: Path, number: int, row: dict[str, Any]) -> E
 
 
 def iterate_rows(entries: Sequence[EpisodeEntry]) -> Iterator[EpisodeRows]:
-    """Yield the rows of each wanted episode; every data file is read once, from front to back.
-
-    Raises:
-        LeRobotFormatError: Naming the file and row where an episode is not as its entry says.
-    """
+    """Yield the rows of each wanted episode; every data file is read once, from front to back."""
     by_file: dict[Path, dict[int, EpisodeEntry]] = {}
     for entry in entries:
         by_file.setdefault(entry.data_path, {})[entry.index] = entry
@@ -297,10 +285,6 @@ def import_lerobot(
     Args:
         wanted: Numbers of episodes; None is all.
         task: Name of the task they are trials of; "": they are not known to be any.
-
-    Raises:
-        LeRobotFormatError: Naming the file, and the row or frame, that cannot be believed.
-        UsageError: When another episode with the same id is in the run.
     """
     info = read_info(folder)
     plan = _plan(info, cell)

@@ -105,21 +105,11 @@ class DatasetInfo:
     version: str
 
     def data_file(self, chunk_index: int, file_index: int) -> Path:
-        """Return a data file by its indices.
-
-        Args:
-            chunk_index: Number of the folder, from 0.
-            file_index: Number of the file in it, from 0.
-        """
+        """Return a data file by its indices."""
         return self._inside(self.data_path, chunk_index=chunk_index, file_index=file_index)
 
     def video_file(self, video_key: str, chunk_index: int, file_index: int) -> Path:
-        """Return a video file by its camera and indices.
-
-        Args:
-            chunk_index: Number of the folder, from 0.
-            file_index: Number of the file in it, from 0.
-        """
+        """Return a video file by its camera and indices."""
         return self._inside(
             self.video_path or VIDEO_PATH,
             video_key=video_key,
@@ -155,7 +145,6 @@ def read_info(folder: Path) -> DatasetInfo:
 
     Raises:
         PathNotFoundError: When it is not there.
-        LeRobotFormatError: When it is another version, or a key is missing or makes no sense.
     """
     path = folder / INFO_PATH
     if not path.is_file():
@@ -220,11 +209,7 @@ def _flat_names(names: object) -> list[str]:
 
 
 def parquet() -> tuple[Any, Any]:
-    """Return ``pyarrow`` and ``pyarrow.parquet``; an extra brings them.
-
-    Raises:
-        MissingDependencyError: When they are not installed.
-    """
+    """Return ``pyarrow`` and ``pyarrow.parquet``; an extra brings them."""
     try:
         import pyarrow as pa  # noqa: PLC0415
         import pyarrow.parquet as pq  # noqa: PLC0415

@@ -13,12 +13,7 @@ from bridge.media.video_writer import RGB, pyav
 def read_frames(
     path: Path, times_s: Sequence[float], tolerance_s: float, pixels: str = RGB
 ) -> Iterator[np.ndarray]:
-    """Yield the frame nearest to each time; times ascend [s].
-
-    Raises:
-        LeRobotFormatError: Naming the time at which no frame is close enough, or what the decoder
-            says of the file.
-    """
+    """Yield the frame nearest to each time; times ascend [s]."""
     if not len(times_s):
         return
     av = pyav()

@@ -204,7 +204,6 @@ class DatasetWriter:
 
         Args:
             success: Only written where all episodes are labelled.
-            images: By camera, one per row: RGB, or depth [mm].
         """
         length = len(state)
         columns = self._columns(task, state, action, success)

@@ -171,14 +171,7 @@ class CameraDevice:
     def __init__(
         self, device: Any, config: RealSenseConfig, *, camera: str, now_ns: Callable[[], int]
     ) -> None:
-        """Open both sensors and start them.
-
-        Args:
-            now_ns: The host's clock.
-
-        Raises:
-            CameraStreamError: When it has no such stream, or another program has it open.
-        """
+        """Open both sensors and start them."""
         self._camera = f"{camera} ({describe_device(device)})"
         self._now_ns = now_ns
         self._stamps = FrameStamps()

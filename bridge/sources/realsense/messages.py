@@ -32,11 +32,7 @@ Mount = tuple[str, Float[np.ndarray, "4 4"]]
 
 
 def read_mounts(path: Path, cameras: list[str]) -> dict[str, Mount]:
-    """Read the pose of the colour cameras.
-
-    Raises:
-        MountsError: When an entry is not a pose of a known camera.
-    """
+    """Read the pose of the colour cameras."""
     if not path.is_file():
         raise PathNotFoundError(path=path, what="mounts file", hint="Check --mounts.")
     try:
@@ -121,7 +117,6 @@ class CameraMessages:
 
         Args:
             calibration: Intrinsics of both streams, and ``T_color_depth``.
-            mount: Parent frame and pose of the colour camera in it; None leaves that out.
         """
         transforms = [
             FrameTransform(

@@ -161,11 +161,7 @@ class RealSenseSource:
     """Cameras as a ``bridge.sources.source.Source``."""
 
     def __init__(self, config: RealSenseConfig, list_devices: ListDevices) -> None:
-        """Look for every camera asked for.
-
-        Raises:
-            CameraNotFoundError: When one of them is not attached.
-        """
+        """Look for every camera asked for."""
         self._config, self._list_devices = config, list_devices
         self._wanted = choose_cameras(config, list_devices)
 
@@ -187,14 +183,8 @@ class RealSenseSource:
     ) -> dict[str, dict[str, int]]:
         """Publish every camera until stopped, by the caller or because one failed.
 
-        Args:
-            stop: Ends all cameras; also set here when one of them fails.
-
         Returns:
             Frames sent and lost by camera.
-
-        Raises:
-            CameraStreamError: When one of them cannot be opened at the start.
         """
         config = self._config
         mounts = {} if config.mounts is None else read_mounts(config.mounts, list(self._wanted))
@@ -234,9 +224,6 @@ def choose_cameras(config: RealSenseConfig, list_devices: ListDevices) -> dict[s
 
     Args:
         config: Names and serial numbers wanted; without any, the only camera is taken.
-
-    Raises:
-        CameraNotFoundError: When one is not, or none was named and there is not just one.
     """
     found = list_devices()
     listed = [describe_device(device) for device in found]

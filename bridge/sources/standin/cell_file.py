@@ -97,7 +97,6 @@ class CellFile:
     test_seeds: tuple[int, int]
     development_seeds: tuple[int, int]
     clutter: tuple[Clutter, ...] = ()
-    """What else stands on the table."""
     planner_of: dict[str, PlannerNoise] = field(default_factory=dict)
     """Tasks the planner is differently wrong at."""
     deviations: dict[str, tuple[float, float]] = field(default_factory=dict)

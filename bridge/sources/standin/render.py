@@ -55,7 +55,6 @@ class _Posed:
     scene: Any
     indices: Int[np.ndarray, " num_surfaces"]
     first: Int[np.ndarray, " num_surfaces"]
-    """Number of each surface's first triangle."""
     corner_normals: Float[np.ndarray, "num_triangles 3 3"]
     eye_m: Float[np.ndarray, "3"]
 

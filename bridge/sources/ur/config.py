@@ -61,11 +61,7 @@ class Gripper:
 
 
 def parse_signal(text: str) -> Signal:
-    """Read ``digital_in:16`` and the like.
-
-    Raises:
-        UsageError: When there is no such signal.
-    """
+    """Read ``digital_in:16`` and the like."""
     match = _SIGNAL.fullmatch(text)
     kind, number = (match[1], int(match[2])) if match else ("", 0)
     variable, count = _VARIABLES.get(kind, ("", 0))

@@ -107,13 +107,7 @@ def wrench_template(base_frame: str) -> MessageTemplate:
 def mode_event(
     cell: str, robot_mode: int | None, safety_mode: int | None, stamp_ns: int
 ) -> StampedMessage:
-    """What the controller says of itself, as an event (type note).
-
-    Args:
-        robot_mode: The controller's number of it; None when it does not say.
-        safety_mode: The controller's number of it; None when it does not say.
-        stamp_ns: Source time of the sample that says so [ns since 1970].
-    """
+    """What the controller says of itself, as an event (type note)."""
     robot = None if robot_mode is None else robot_mode_name(robot_mode)
     safety = None if safety_mode is None else safety_mode_name(safety_mode)
     record = {

@@ -257,13 +257,7 @@ def describe_counts(counts: dict[str, Any]) -> str:
 
 
 def read_urdf(config: UrConfig) -> str | None:
-    """The robot's description: a file, that of a robot file, or none.
-
-    Raises:
-        PathNotFoundError: When the file is not there.
-        MissingDependencyError: When the data package of its URDF is not installed.
-        UsageError: When there is no such robot.
-    """
+    """The robot's description: a file, that of a robot file, or none."""
     if config.urdf is not None:
         return _read_urdf_file(config.urdf)
     if config.robot == "none":
@@ -274,11 +268,7 @@ def read_urdf(config: UrConfig) -> str | None:
 
 
 def _robot(config: UrConfig, urdf: str | None) -> Robot:
-    """The robot whose joints the controller moves.
-
-    Raises:
-        UsageError: A robot that does not have the six joints of a UR.
-    """
+    """The robot whose joints the controller moves."""
     if config.urdf is not None and config.robot not in ("none", BARE_UR5):
         robot = read_robot(config.robot)
     else:

@@ -60,11 +60,7 @@ class Package:
 
 
 def encode_package(kind: int, payload: bytes = b"") -> bytes:
-    """Put the header before a payload.
-
-    Args:
-        kind: Code of the kind of package, 0 to 255.
-    """
+    """Put the header before a payload."""
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
@@ -76,11 +72,7 @@ class PackageSplitter:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Package]:
-        """Add bytes and yield every package that is complete.
-
-        Raises:
-            BrokenPackageError: When a size or a kind cannot be RTDE's.
-        """
+        """Add bytes and yield every package that is complete."""
         self._buffer += data
         while len(self._buffer) >= HEADER.size:
             size, kind = HEADER.unpack_from(self._buffer)
@@ -98,11 +90,7 @@ class Recipe:
     """The layout of the data packages: which variables in which order."""
 
     def __init__(self, names: tuple[str, ...], types: tuple[str, ...], number: int) -> None:
-        """Prepare for unpacking.
-
-        Raises:
-            BrokenPackageError: When a type is not one of the guide's.
-        """
+        """Prepare for unpacking."""
         unknown = sorted(set(types) - set(_FORMATS))
         if unknown or len(names) != len(types):
             message = f"{len(names)} variables were answered with the types {', '.join(types)}"
@@ -117,11 +105,7 @@ class Recipe:
         self._layout = struct.Struct(">B" + "".join(_FORMATS[name] for name in types))
 
     def unpack(self, payload: bytes) -> dict[str, Value]:
-        """Read one data package.
-
-        Raises:
-            BrokenPackageError: When it has another length or another recipe's number.
-        """
+        """Read one data package."""
         if len(payload) != self._layout.size:
             message = f"a data package of {len(payload)} bytes, expected {self._layout.size}"
             raise BrokenPackageError(message)
@@ -156,11 +140,7 @@ class RtdeLink:
     """One connection; it never waits longer than the limits above."""
 
     def __init__(self, host: str, port: int, *, on_text: Callable[[str], None]) -> None:
-        """Connect.
-
-        Raises:
-            ControllerError: When nobody answers.
-        """
+        """Connect."""
         self.where = f"{host}:{port}"
         self._on_text = on_text
         self._splitter = PackageSplitter()
@@ -177,12 +157,7 @@ class RtdeLink:
         self._agreed_by_s = time.monotonic() + AGREE_S
 
     def ask(self, kind: Kind, payload: bytes = b"") -> bytes:
-        """Send a request and return the payload of its answer.
-
-        Raises:
-            ControllerError: When the controller goes away or takes too long.
-            BrokenPackageError: When something else is answered.
-        """
+        """Send a request and return the payload of its answer."""
         try:
             self._socket.sendall(encode_package(kind, payload))
         except OSError as error:
@@ -201,12 +176,7 @@ class RtdeLink:
             self._on_text(text_of(package.payload))
 
     def next_data(self) -> list[bytes]:
-        """Wait for more and return the payloads of all data packages that are complete.
-
-        Raises:
-            ControllerError: When the controller went away.
-            BrokenPackageError: When what came is no RTDE package.
-        """
+        """Wait for more and return the payloads of all data packages that are complete."""
         if not self._waiting:
             self._receive()
         payloads = []
@@ -286,12 +256,6 @@ class RtdeClient:
 
         Args:
             port: 30004, unless forwarded.
-            now_ns: The host's clock.
-
-        Raises:
-            ControllerError: When nobody answers, a required variable is unknown, or the
-                controller refuses to start.
-            NotRtdeError: When what answers does not speak RTDE.
         """
         self._now_ns = now_ns
         required = ("timestamp", *wish.required)
@@ -367,12 +331,7 @@ class RtdeClient:
             )
 
     def samples(self) -> Iterator[Sample]:
-        """Yield every data package in the order it was sent, until the connection ends.
-
-        Raises:
-            ControllerError: When the controller went away.
-            NotRtdeError: When a package is broken.
-        """
+        """Yield every data package in the order it was sent, until the connection ends."""
         try:
             while True:
                 payloads = self._link.next_data()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from bridge.data_files import dataset_file
-from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
@@ -150,13 +149,6 @@ def test_what_stands_in_the_way_is_put_to_its_mark_before_the_cube_is_touched(
     assert underside < block.size_m[2] - 0.01
     aside = np.linalg.norm(way[:, :2] - starts["block"][:2, 3], axis=1).min()
     assert aside < (cube.size_m[0] + block.size_m[1]) / 2
-
-
-def test_an_object_that_belongs_between_two_is_not_planned(arm: Kinematics) -> None:
-    task = load_task("cube_beside_cube")
-    between = {"kind": "between", "object": "cube", "first": "other", "second": "cube"}
-    with pytest.raises(UsageError, match="beside what, or at which mark"):
-        planned(arm, replace(task, success=(between,)), task.draw_start(np.random.default_rng(1)))
 
 
 @pytest.mark.parametrize(("cleared", "result"), [(True, "success"), (False, "failure")])

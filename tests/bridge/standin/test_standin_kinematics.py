@@ -82,16 +82,6 @@ def test_no_joint_moves_faster_than_the_cell_allows(
     assert speed.max() <= cell_file.max_joint_speed_rad_s + 1e-9
 
 
-def test_the_stages_of_a_plan_are_those_of_the_task_and_cover_it(
-    plan_of: Callable[..., Plan], task: Task
-) -> None:
-    plan = plan_of()
-    assert [stage.id for stage in plan.stages] == [stage["id"] for stage in task.stages]
-    assert plan.stages[0].t_start_ns == 0
-    assert plan.stages[0].t_end_ns == plan.stages[1].t_start_ns
-    assert plan.stages[1].t_end_ns == plan.tau[-1].t_ns
-
-
 def test_a_grasp_is_never_turned_more_than_an_eighth_from_the_cube(
     plan_of: Callable[..., Plan], starts: dict[str, np.ndarray]
 ) -> None:

@@ -64,15 +64,6 @@ def test_the_push_is_level_straight_even_and_closed(push: Task, seed: int) -> No
     assert predicted[:2, 3] == pytest.approx(mark, abs=1e-6)
 
 
-def test_a_plan_that_pushes_survives_the_wire_and_others_do_not_mention_it(push: Task) -> None:
-    plan = planned(push, push.draw_start(np.random.default_rng(SEED)))
-    assert Plan.from_json(plan.to_json()) == plan
-    cube = load_task("cube_into_box")
-    other = planned(cube, cube.draw_start(np.random.default_rng(SEED)))
-    assert b'"push"' not in other.to_json()
-    assert Plan.from_json(other.to_json()) == other
-
-
 def test_without_a_mark_or_beside_it_nothing_is_planned(push: Task) -> None:
     starts = push.draw_start(np.random.default_rng(SEED))
     with pytest.raises(UsageError, match="where cube is to be pushed"):

@@ -2,8 +2,6 @@
 
 import json
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -19,13 +17,12 @@ from bridge.episode.cdr.messages import (
     transforms_from_cdr,
 )
 from bridge.episode.topics import is_truth, type_of_topic
-from bridge.errors import UsageError
 from bridge.media.color import decode_color
 from bridge.sources.standin import decisions, operator
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import Operator, Treatment
-from bridge.sources.standin.scan import ScanConfig, scan_joints
+from bridge.sources.standin.scan import ScanConfig
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS
@@ -298,14 +295,6 @@ def test_the_limit_of_waiting_for_the_gate_is_named_when_it_strikes(
     assert "wall-clock limit of 100 s (--gate-timeout-s)" in session.events()[0]["text"]
 
 
-def test_an_unknown_condition_is_refused(
-    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
-) -> None:
-    session = make_session()
-    with pytest.raises(UsageError, match="without_replanning, with_replanning"):
-        Operator(make_cell(session), session, settings(conditions=("sometimes",)))
-
-
 def test_a_stopped_session_finishes_its_episode(make_session: Callable[..., Any]) -> None:
     session = make_session()
     summary = run_session(session, settings(), QUIET, should_stop=lambda: len(session.sent) > 100)
@@ -349,14 +338,6 @@ def test_a_whole_session_records_scan_and_trials_and_labels_by_the_predicate(
     assert stamps == sorted(stamps)
 
 
-def test_the_arm_reaches_most_of_the_dome_of_a_scan(
-    make_session: Callable[..., Any], make_cell: Callable[..., StandinCell]
-) -> None:
-    cell = make_cell(make_session())
-    (mount,) = [item for item in cell.file.cameras.values() if item.moving]
-    assert len(scan_joints(mount, cell.kinematics, cell.home_rad, ScanConfig())) >= 30
-
-
 def truth_rollout(sent: list[Any]) -> Rollout:
     poses: dict[str, list[np.ndarray]] = {}
     stamps = []
@@ -371,15 +352,6 @@ def truth_rollout(sent: list[Any]) -> Rollout:
         Ts_base_object={key: np.array(rows) for key, rows in poses.items()},
         finger_contact={},
     )
-
-
-def test_importing_the_package_and_the_settings_loads_no_physics() -> None:
-    code = (
-        "import sys, bridge.sources, bridge.sources.standin.settings;"
-        "print([m for m in ('mujoco', 'open3d', 'pinocchio', 'zenoh') if m in sys.modules])"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
 
 
 def test_a_session_that_fails_leaves_no_half_episode(

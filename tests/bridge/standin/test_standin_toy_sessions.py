@@ -18,7 +18,6 @@ from bridge.sources.standin.operator import Operator, label_trial, void_trial
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import Streams
-from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 
@@ -52,21 +51,6 @@ def test_a_duck_beside_the_basket_costs_one_of_five(ducks: Task) -> None:
     assert results["carry_4"] == results["release_4"] == "failure"
     assert results["carry_1"] == results["release_1"] == "success"
     assert (void_trial(ducks, "nobody").unit, void_trial(ducks, "nobody").n) == ("object", 5)
-
-
-def test_clutter_stands_on_the_table_and_out_of_the_way(toys_cell: CellFile) -> None:
-    assert len(toys_cell.clutter) >= 5
-    assert load_cell("standin").clutter == ()
-    reach = [load_task(name).start for name in TOYS]
-    for item in toys_cell.clutter:
-        p = item.T_base_clutter[:3, 3]
-        radius = float(np.hypot(*item.size_m[:2])) / 2
-        assert np.all(np.abs(p[:2] - TABLE_CENTRE_M) + radius < np.array(TABLE_SIZE_M[:2]) / 2)
-        for start in reach:
-            for limits in start.values():
-                x = np.clip(p[0], *limits.x_m)
-                y = np.clip(p[1], *limits.y_m)
-                assert np.hypot(p[0] - x, p[1] - y) > radius + 0.13
 
 
 def test_toys_need_their_own_cell_and_a_session_takes_the_one_its_task_names(

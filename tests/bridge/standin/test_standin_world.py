@@ -70,16 +70,6 @@ def test_a_grasp_six_centimetres_off_fails(
     assert outcome.stages[0]["result"] == "failure"
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
-def test_a_release_beside_the_box_fails_although_the_grasp_held(
-    attempt: Callable[..., tuple[Outcome, Any]],
-) -> None:
-    outcome, _ = attempt(replace(NO_ERROR, release_m=(0.16, 0.0)))
-    assert outcome.stages[0]["result"] == "success"
-    assert outcome.result == "failure"
-
-
 def test_the_same_seed_gives_the_same_joint_log_and_another_seed_another(
     make_session: Callable[..., Any],
     make_cell: Callable[..., StandinCell],
@@ -172,12 +162,6 @@ def test_a_seed_draws_one_laboratory_within_the_ranges_of_the_cell_file(
         assert low <= getattr(drawn, name) <= high
 
 
-def test_test_seeds_and_development_seeds_never_meet(cell_file: CellFile) -> None:
-    low, high = cell_file.development_seeds
-    first, last = cell_file.test_seeds
-    assert low <= high < first <= last
-
-
 def test_an_unknown_cell_lists_those_that_exist() -> None:
     with pytest.raises(UsageError, match="standin"):
         load_cell("no_such_cell")
@@ -204,19 +188,3 @@ def test_a_cell_like_another_differs_in_what_it_names_only(tmp_path: Path) -> No
     assert calm.noise_for(ducks) == replace(toys.noise_for(ducks), release_m=0.01)
     assert (calm.sensors, calm.normal) == (toys.sensors, toys.normal)
     assert len(calm.clutter) == len(toys.clutter)
-
-
-@pytest.mark.parametrize(
-    ("said", "found"),
-    [
-        ('"{0}"', "which itself is like"),
-        ('"no_such_cell"', "no cell named 'no_such_cell'"),
-        ("3", "is not a cell file"),
-    ],
-)
-def test_what_no_cell_can_be_like_is_refused(tmp_path: Path, said: str, found: str) -> None:
-    other, path = tmp_path / "other.toml", tmp_path / "broken.toml"
-    other.write_text('name = "other"\nlike = "standin"\n')
-    path.write_text(f'name = "broken"\nlike = {said.format(other)}\n')
-    with pytest.raises(UsageError, match=found):
-        load_cell(str(path))

@@ -1,10 +1,7 @@
 """A planner on the wire: what it answers, that it remembers nothing, and that there is one."""
 
 import json
-import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +15,6 @@ sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / 
 from foreign_scene import write_scene_of
 from hostile_replies import valid_reply
 from loopback import free_endpoint
-from own_process import ROOT
 from scripted_plans import scene_of_test
 from test_model_client import Server, says, serving
 
@@ -131,22 +127,6 @@ def test_what_cannot_be_planned_has_a_reason(
     assert words in answer.reason
 
 
-def test_a_start_that_cannot_be_used_is_refused_whatever_the_policy(planner: LivePlanner) -> None:
-    """As for a plan from words: what was found, where, and what to do."""
-
-    def reason(**changes: Any) -> str:
-        answer = planner.answer(request(**changes).to_json())
-        assert answer.plan is None
-        return answer.reason
-
-    cube, box = request().objects
-    vague = {**box, "covariance": (9e-4 * np.eye(6)).ravel().tolist()}
-    assert "position of box is known to 30 mm" in reason(objects=(cube, vague))
-    away = {**box, "T_base_object": {**box["T_base_object"], "p_m": [0.5, 2.5, 0.0]}}
-    assert "box at (500, 2500, 0) mm is out of reach" in reason(objects=(cube, away))
-    assert "beyond its limits" in reason(joints_rad=(9.0, *HOME[1:]))
-
-
 def test_a_scene_of_another_robot_is_not_planned_in(tmp_path: Path) -> None:
     run = RunFolder.create(tmp_path / "run")
     other = read_robot("ur10_parallel_gripper")
@@ -240,15 +220,6 @@ def test_policy_model_without_a_model_has_a_reason(planner: LivePlanner) -> None
     assert "model" not in planner.policies
 
 
-def test_live_with_a_model_of_no_address_is_wrong_use(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = RunFolder.create(tmp_path / "run")
-    words = ["--model", "nowhere", "--model-name", "stub"]
-    assert robot_gst.run(["plan", str(run.path), "--live", *words]) == 2
-    assert "must begin with http" in capsys.readouterr().err
-
-
 def test_live_with_a_task_is_wrong_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = RunFolder.create(tmp_path / "run")
     for option in (["--task", "cube_into_box"], ["--dry"]):
@@ -322,47 +293,3 @@ def test_a_cell_asks_over_the_wire_and_hears_plans_and_reasons(
         nobody = WirePlanner(cell, "lab2", 5.0).ask(request())
         assert (nobody.plan, nobody.heard) == (None, False)
         assert "no planner answers on lab2/plan" in nobody.reason
-
-
-HANGS = """
-import sys, threading
-from bridge.wire.config import WireConfig
-from bridge.wire.session import open_session
-def hang(payload):
-    print("asked", flush=True)
-    threading.Event().wait()
-with open_session(WireConfig(connect=(sys.argv[1],))) as session:
-    session.serve("lab/plan", hang)
-    session.declare_alive("lab/serves")
-    threading.Event().wait()
-"""
-
-
-def test_a_planner_killed_in_the_middle_leaves_the_cell_with_a_reason(
-    router: WireSession, endpoint: str
-) -> None:
-    answers: list[Any] = []
-    process = subprocess.Popen(
-        [sys.executable, "-c", HANGS, endpoint], stdout=subprocess.PIPE, text=True, cwd=ROOT
-    )
-    try:
-        assert process.stdout is not None
-        # Who sees the token knows of the service, which was declared before it.
-        for _ in range(600):
-            if router.query_alive("lab/serves"):
-                break
-            assert process.poll() is None
-            time.sleep(0.1)
-        asking = WirePlanner(router, "lab", 300.0)
-        thread = threading.Thread(target=lambda: answers.append(asking.ask(request())))
-        thread.start()
-        assert process.stdout.readline() == "asked\n"
-        process.kill()
-        thread.join(60.0)
-        assert not thread.is_alive()
-    finally:
-        process.kill()
-        process.communicate()
-    (answer,) = answers
-    assert (answer.plan, answer.heard) == (None, False)
-    assert "no planner answers on lab/plan" in answer.reason

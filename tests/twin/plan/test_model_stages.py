@@ -177,7 +177,7 @@ def test_a_model_is_asked_before_the_grammar_refuses(
     [
         ({"kind": "height", "a": TOP, "min": 0.0}, "no subgoal says where cube is to end"),
         ({"kind": "beside", "obj": "box", "reference": "cube"}, "unknown"),
-        ({"kind": "moved", "obj": "cube", "by": 9.0, "way": "left"}, "makes no sense"),
+        ({"kind": "moved", "obj": "cube", "by": 9.0, "way": "left"}, "greater than the maximum"),
         ({"kind": "inside", "obj": "cube", "container": "cube"}, "unknown"),
     ],
 )

@@ -22,7 +22,6 @@ from twin.plan.problem import Problem
 from twin.plan.shapes import GUESSED_SHARE, keypoints_of, problem_of, shapes_of
 from twin.robot.model import load_robot
 from twin.scene.gaussians import GaussianCloud, write_ply
-from twin.scene.localise.result import LocalisedObject, missing
 from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import mesh_ply
@@ -122,28 +121,18 @@ def test_without_a_scene_every_object_has_the_task_files_shape(task: Task) -> No
     assert "only the box around it" in guess.source
 
 
-def test_a_problem_knows_what_was_found_and_why_the_rest_was_not(
-    tmp_path: Path, task: Task
-) -> None:
+def test_a_problem_knows_where_everything_is(tmp_path: Path, task: Task) -> None:
     (tmp_path / "scene").mkdir()
     written(tmp_path / "scene", task)
     T = np.eye(4)
     T[:3, 3] = (0.5, -0.1, 0.02)
-    cube = LocalisedObject(
-        object_id="cube", found=True, T_base_object=T, covariance=np.eye(6) * 1e-6,
-        confidence=1.0, method="test", reason=None, stamp_ns=0,
-    )  # fmt: skip
-    start = np.array(ROBOT.home_rad)
+    start, sure = np.array(ROBOT.home_rad), np.eye(6) * 1e-6
     given = problem_of(
-        RunFolder(tmp_path),
-        task,
-        {"cube": cube, "box": missing(task.objects["box"], 0, "3 points", {})},
-        ROBOT.description(),
-        start,
+        RunFolder(tmp_path), task, ROBOT.description(), {"cube": T}, {"cube": sure}, start
     )
     np.testing.assert_array_equal(given.scene.Ts_base_object["cube"], T)
-    np.testing.assert_array_equal(given.scene.covariances["cube"], np.eye(6) * 1e-6)
-    assert given.scene.reasons == {"box": "3 points"}
+    np.testing.assert_array_equal(given.scene.covariances["cube"], sure)
+    assert given.scene.missing() == ["box"]
     assert given.scene.start_rad is start
     assert given.shapes["cube"].source.startswith("scan")
     assert given.shapes["box"].source.startswith("task file")

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
@@ -29,7 +28,7 @@ from twin.plan.constrain.bodies import (
     pose_of,
     surface_points,
 )
-from twin.plan.constrain.constraint import SCALES, Constraint, Term, flattened
+from twin.plan.constrain.constraint import Constraint, Term, flattened
 from twin.plan.constrain.relations import RELATIONS
 from twin.plan.constrain.schema import (
     BASE,
@@ -40,18 +39,12 @@ from twin.plan.constrain.schema import (
 )
 from twin.plan.problem import Problem, State
 
-HOLD_TOLERANCE_M, HOLD_TOLERANCE_DEG = 0.005, 5.0
-
 
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
     """Make a constraint of a record that fits the schema of constraints.
 
     Args:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
-
-    Raises:
-        UsageError: When it asks for what the problem does not have, such as a rebuilt scene, or
-            an object that was not localised.
     """
     vocabulary = Vocabulary.of_task(problem.scene.task, num_keypoints=len(problem.keypoints))
     _refuse_unknown_keypoints(record, problem)
@@ -348,62 +341,6 @@ def _nothing(state: State) -> Array:
     return 0.0 * state.T_base_tcp[:, 0, 0]
 
 
-def _hold(record: Record, problem: Problem) -> Constraint:
-    obj = record["obj"]
-    limits = {
-        "tol": record.get("tol", HOLD_TOLERANCE_M),
-        "tol_deg": record.get("tol_deg", HOLD_TOLERANCE_DEG),
-    }
-
-    def along(states: State, times_s: Array | None) -> Array:
-        num_states, num_steps = states.T_base_tcp.shape[:2]
-        steps = flattened(states)
-        T_tcp, T_object = steps.T_base_tcp, pose_of(steps, obj)
-        R_in_hand = T_tcp[:, :3, :3].swapaxes(1, 2) @ T_object[:, :3, :3]
-        p_in_hand = arrays.seen_from(T_tcp, T_object[:, None, :3, 3])[:, 0]
-        R = R_in_hand.reshape(num_states, num_steps, 3, 3)
-        p = p_in_hand.reshape(num_states, num_steps, 3)
-        slid = norm(p - p[:, :1]) - limits["tol"]
-        turned = arrays.turn(R[:, :1].swapaxes(2, 3) @ R) - np.radians(limits["tol_deg"])
-        scale = SCALES["m"] / SCALES["rad"]
-        return np.amax(np.maximum(slid, turned * scale), axis=-1)
-
-    what = f"the way {obj} has slid in the hand"
-    term = Term(what=what, measure=_nothing, high=limits["tol"])
-    return replace(Constraint.of(record, term), along=along)
-
-
-def _reach(record: Record, problem: Problem) -> Constraint:
-    """A necessary condition: the links, laid out straight, are as long as the way to the tool.
-
-    Inverse kinematics decides; this says by how much a tool is too far off, which that does not.
-    """
-    p_shoulder, length_m = outer_reach(problem)
-    return Constraint.of(
-        record,
-        Term(
-            what="the distance of the tool from the arm's first joint",
-            measure=lambda state: norm(state.T_base_tcp[:, :3, 3] - p_shoulder),
-            high=length_m - record.get("margin", 0.0),
-        ),
-    )
-
-
-def outer_reach(problem: Problem) -> tuple[Float[np.ndarray, "3"], float]:
-    """Where the arm's first joint is in the base frame, and the lengths of the links behind it [m].
-
-    The placements of the joints and the tool in the robot description, one behind the other.
-    """
-    model, tool = problem.robot.model, problem.robot.tcp_id
-    frame = model.frames[tool]
-    length = float(np.linalg.norm(frame.placement.translation))
-    joint = int(frame.parentJoint)
-    while int(model.parents[joint]):
-        length += float(np.linalg.norm(model.jointPlacements[joint].translation))
-        joint = int(model.parents[joint])
-    return np.array(model.jointPlacements[joint].translation), length
-
-
 _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     **RELATIONS,
     "distance": _distance,
@@ -414,7 +351,5 @@ _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "keepout": _keepout,
     "height": _height,
     "speed": _speed,
-    "hold": _hold,
-    "reach": _reach,
 }
 KINDS = tuple(_KINDS)

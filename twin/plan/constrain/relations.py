@@ -271,27 +271,6 @@ def _upright(record: Record, problem: Problem) -> Constraint:
     )
 
 
-def _stable(record: Record, problem: Problem) -> Constraint:
-    """The middle stays over the face that the object stands on, and over its support."""
-    obj, support = record["obj"], record.get("support", TABLE)
-    half, margin = half_extents_m(problem.model(obj)), record.get("margin", 0.0)
-
-    def beyond(state: State) -> Array:
-        """How far the plumb line through the middle leaves the face that looks down."""
-        down = -pose_of(state, obj)[:, 2, :3]  # in the object frame
-        steep = abs(down)
-        lower = steep == np.amax(steep, axis=-1)[:, None]
-        length = np.where(lower, half / np.where(lower, steep, 1.0), 0.0).sum(-1)
-        aside = abs(down) * length[:, None] - half
-        return np.amax(np.where(lower, -np.inf, aside), axis=-1)
-
-    what = f"the plumb line of {obj} beyond its own lower face"
-    terms = [Term(what=what, measure=beyond, high=-margin)]
-    if support != TABLE:
-        terms.append(_over_support(record, problem, support, margin))
-    return Constraint.of(record, *terms)
-
-
 def _moved(record: Record, problem: Problem) -> Constraint:
     obj = record["obj"]
     if obj not in problem.scene.Ts_base_object:
@@ -338,7 +317,6 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "beside": _beside,
     "between": _between,
     "upright": _upright,
-    "stable": _stable,
     "moved": _moved,
 }
 

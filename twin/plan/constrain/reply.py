@@ -7,7 +7,7 @@ success come from the task file; a reply that allows or asks for anything else i
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from bridge.errors import UsageError
@@ -34,7 +34,6 @@ MAX_VALUES = 5000
 MAX_CONSTRAINTS = 16
 """Of one stage, subgoal and path together."""
 _MOST_DIGITS = 18
-_PATH_ONLY = ("speed", "hold")
 
 
 class ReplyError(UsageError):
@@ -144,11 +143,9 @@ def _contradictions(record: Mapping[str, Any], vocabulary: Vocabulary, task: str
         for key in ("subgoal", "path"):
             for number, constraint in enumerate(stage[key]):
                 yield from meaning_problems(constraint, (*where, key, number))
-                if key == "subgoal" and constraint["kind"] in _PATH_ONLY:
-                    kind = constraint["kind"]
-                    yield (*where, key, number), f"{kind} is about a path and belongs to path"
+                if key == "subgoal" and constraint["kind"] == "speed":
+                    yield (*where, key, number), "speed is about a path and belongs to path"
     yield from _hand(record["stages"])
-    yield from _rests(record["stages"])
     yield from _contacts(record["stages"], vocabulary)
 
 
@@ -175,32 +172,6 @@ def _hand(stages: list[dict[str, Any]]) -> Problems:
             held = None
     if held is not None:
         yield ("stages", len(stages) - 1), f"{held} is never released"
-
-
-def _rests(stages: list[dict[str, Any]]) -> Problems:
-    """Nothing rests on itself, not even by way of others."""
-    below: dict[str, str] = {}
-    for index, stage in enumerate(stages):
-        for number, constraint in enumerate(stage["subgoal"]):
-            if constraint["kind"] not in ("on", "inside") or "obj" not in constraint:
-                continue
-            obj = constraint["obj"]
-            below[obj] = constraint.get("support") or constraint["container"]
-            chain = list(_chain(obj, below))
-            if chain[-1] == obj:
-                way = " on ".join([obj, *chain])
-                yield ("stages", index, "subgoal", number), f"{obj} would rest on itself: {way}"
-
-
-def _chain(obj: str, below: Mapping[str, str]) -> Iterator[str]:
-    """What an object rests on, what that rests on, and so on; ends where it comes back."""
-    at, seen = obj, set[str]()
-    while at in below and at not in seen:
-        seen.add(at)
-        at = below[at]
-        yield at
-        if at == obj:
-            return
 
 
 def _contacts(stages: list[dict[str, Any]], vocabulary: Vocabulary) -> Problems:

@@ -155,11 +155,7 @@ class GraspSearcher:
     """Searches grasps in one start; made once per problem, asked per object."""
 
     def __init__(self, problem: Problem, config: GraspConfig | None = None) -> None:
-        """Lay out what all searches share.
-
-        Raises:
-            NoGraspError: The robot has nothing that closes.
-        """
+        """Lay out what all searches share."""
         self.problem = problem
         self.config = GraspConfig() if config is None else config
         robot = problem.robot

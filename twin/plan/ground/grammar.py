@@ -38,11 +38,7 @@ _SLOTS = {"inside": "container", "outside": "container", "on": "support"}
 
 
 def ground(text: str, vocabulary: Vocabulary) -> Grounding:
-    """Turn an instruction into goals and their order.
-
-    Raises:
-        GroundingError: When it is not understood whole, or cannot be done; never a guess.
-    """
+    """Turn an instruction into goals and their order."""
     return _Reader(text, vocabulary).read()
 
 

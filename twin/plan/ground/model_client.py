@@ -79,11 +79,7 @@ class ModelConfig:
 
     @property
     def key(self) -> str:
-        """The key, or nothing.
-
-        Raises:
-            UsageError: It is no word of printable ASCII, which no header can hold.
-        """
+        """The key, or nothing."""
         key = os.environ.get(self.key_variable, "").strip()
         if key and not (key.isascii() and key.isprintable() and " " not in key):
             message = f"{self.key_variable} is not a key: it has spaces or odd characters."
@@ -291,12 +287,7 @@ def _text_of(record: Any, config: ModelConfig) -> str:
 
 
 def _post(body: Mapping[str, Any], config: ModelConfig) -> Any:
-    """Send one request and read its answer within all limits.
-
-    Raises:
-        EndpointError: Whatever is not an answer of 200 with JSON of bounded size in time.
-        UsageError: The key would be sent without encryption.
-    """
+    """Send one request and read its answer within all limits."""
     scheme, host, port, path = server_of(config.url)
     if config.key and scheme == "http" and host not in _LOOPBACK:
         message = (

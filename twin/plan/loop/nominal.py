@@ -8,6 +8,7 @@ states. What a refusal asks to change is left out, or tried first.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from math import erfc, sqrt
 from typing import Any
 
@@ -194,38 +195,23 @@ class PlanProposer:
         return found
 
 
-class _Lazy:
-    """A list that is made as it is asked for."""
-
-    def __init__(self, make: Iterator[Transfer]) -> None:
-        self._make, self._made = make, list[Transfer]()
-
-    def nearest(self, index: int) -> Transfer | None:
-        """The one at an index; the last where there are fewer, None where there are none."""
-        while len(self._made) <= index:
-            try:
-                self._made.append(next(self._make))
-            except StopIteration:
-                break
-        return self._made[min(index, len(self._made) - 1)] if self._made else None
-
-
 class _Search:
     """Ways to move all objects, the best first."""
 
     def __init__(self, problem: Problem, policy: Policy, seed: int, steer: Steer | None) -> None:
         self._problem, self._policy, self._seed, self._steer = problem, policy, seed, steer
-        self._known: dict[tuple[int, ...], _Lazy] = {}
+        self._known: dict[tuple[int, ...], tuple[Iterator[Transfer], list[Transfer]]] = {}
+        """By what was moved before: transfers of the next object as they are asked for."""
         self.why = "no candidate is left that was not refused"
 
     def sequences(self) -> Iterator[list[Transfer]]:
         """Each candidate takes of every object the next transfer; the last ones are kept."""
-        before: list[Any] = []
+        before: list[list[int]] = []
         for number in range(MOST_TRIED):
             transfers = self._sequence(number)
-            if transfers is None or any(_same(transfers, other) for other in before):
+            if transfers is None or list(map(id, transfers)) in before:
                 return
-            before.append(transfers)
+            before.append(list(map(id, transfers)))
             yield transfers
 
     def _sequence(self, number: int) -> list[Transfer] | None:
@@ -234,12 +220,13 @@ class _Search:
         for key in self._problem.scene.task.manipulated:
             prefix = tuple(id(each) for each in transfers)
             if prefix not in self._known:
-                self._known[prefix] = _Lazy(self._transfers(problem, key))
-            found = self._known[prefix].nearest(number)
-            if found is None:
+                self._known[prefix] = self._transfers(problem, key), []
+            making, made = self._known[prefix]
+            made += islice(making, max(0, number + 1 - len(made)))
+            if not made:
                 return None
-            transfers.append(found)
-            problem = _after(problem, found)
+            transfers.append(made[min(number, len(made) - 1)])
+            problem = _after(problem, transfers[-1])
         return transfers
 
     def _transfers(self, problem: Problem, key: str) -> Iterator[Transfer]:
@@ -342,10 +329,6 @@ def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
 def _miss_probability(margin: float) -> float:
     """Of a normal variable, beyond so many standard deviations."""
     return erfc(margin / sqrt(2.0)) / 2
-
-
-def _same(one: list[Transfer], other: list[Transfer]) -> bool:
-    return all(a is b for a, b in zip(one, other, strict=True))
 
 
 def _after(problem: Problem, moved: Transfer) -> Problem:
@@ -506,7 +489,11 @@ def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]
     asked = _subgoals(problem, grasps[0].object_id, "grasp")
     if not asked:
         return list(grasps)
-    states = [_state_at(problem, grasp) for grasp in grasps]
+    Ts = problem.scene.Ts_base_object
+    states = [
+        State.single(Ts, Ts[grasp.object_id] @ grasp.T_object_tcp, grasp.width_m)
+        for grasp in grasps
+    ]
     violations = [violated(asked, state) for state in states]
     kept = [grasp for grasp, wrong in zip(grasps, violations, strict=True) if not wrong]
     if not kept:
@@ -516,16 +503,6 @@ def _kept_at_the_grasp(problem: Problem, grasps: Sequence[Grasp]) -> list[Grasp]
         )
         raise NoPlanError(message)
     return kept
-
-
-def _state_at(problem: Problem, grasp: Grasp) -> State:
-    """As the fingers have closed."""
-    Ts = problem.scene.Ts_base_object
-    return State(
-        Ts_base_object={name: T[None] for name, T in Ts.items()},
-        T_base_tcp=(Ts[grasp.object_id] @ grasp.T_object_tcp)[None],
-        width_m=np.array([grasp.width_m]),
-    )
 
 
 def _kept_on_the_way(problem: Problem, grasp: Grasp) -> Callable[[tuple[Leg, ...]], None]:

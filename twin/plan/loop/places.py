@@ -63,11 +63,7 @@ def places_on_table(
     if not (total <= 0).any():
         best = int(total.argmin())
         worst = (*goals, *gaps)[int(excess[:, best].argmax())]
-        one = State(
-            Ts_base_object={name: T[best : best + 1] for name, T in state.Ts_base_object.items()},
-            T_base_tcp=Ts[best : best + 1],
-            width_m=np.zeros(1),
-        )
+        one = State.single({k: T[best] for k, T in state.Ts_base_object.items()}, Ts[best], 0.0)
         message = (
             f"no free place on the table fits {key}. In the best one {worst.explain(one)}. Clear "
             "the table there, or ask for less."

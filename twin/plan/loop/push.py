@@ -78,11 +78,7 @@ def push_choices(problem: Problem) -> Iterator[PushChoice]:
 def pushed(
     problem: Problem, choice: PushChoice
 ) -> tuple[tuple[Waypoint, ...], dict[str, tuple[int, int]], dict[str, Pose]]:
-    """Waypoints, when each stage begins and ends [ns], and where everything then lies.
-
-    Raises:
-        NoPlanError: The arm cannot follow, or an object has no mark or is too near to it.
-    """
+    """Waypoints, when each stage begins and ends [ns], and where everything then lies."""
     scene, robot = problem.scene, problem.robot
     start_rad = robot.home_rad if scene.start_rad is None else scene.start_rad
     there = dict(scene.Ts_base_object)

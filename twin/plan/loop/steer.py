@@ -38,12 +38,8 @@ class Tried:
     object_id: str
     T_object_tcp: Float[np.ndarray, "4 4"]
     """Tool where the gripper is told to close, in the object's frame at the start."""
-    width_m: float | None
-    """Commanded width; None where the plan does not say."""
     T_base_release: Float[np.ndarray, "4 4"] | None = None
     """Tool where the gripper is told to open; None where it never is."""
-    joints_rad: tuple[float, ...] | None = None
-    """Arm at the grasp."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,9 +167,7 @@ def tried_in(plan: Plan) -> tuple[Tried, ...]:
             Tried(
                 object_id=stage.grasp,
                 T_object_tcp=se3.invert(T_base_object) @ _pose(closing),
-                width_m=closing.width_m,
                 T_base_release=None if opening is None else _pose(opening),
-                joints_rad=closing.joints_rad,
             )
         )
     return tuple(found)

@@ -160,10 +160,6 @@ def plan_move(
 
     Args:
         goals_rad: Where it may end; the nearest on the way is taken.
-
-    Raises:
-        NoPathError: Start or goals touch something (which), the budget is spent, or the exact
-            check refused every round.
     """
     check_numbers(start_rad, goals_rad)
     asked = _Asked(
@@ -309,10 +305,6 @@ def plan_straight(
 
     For the last centimetres, where contact is wanted: pairs in ``allowed`` are left to the exact
     check, which lets them touch but not lie in each other.
-
-    Raises:
-        NoPathError: A pose is out of reach, the arm would have to change its branch, or something
-            is in the way: a straight line cannot go around it.
     """
     check_numbers(start_rad, T_base_goal)
     asked = _Asked(

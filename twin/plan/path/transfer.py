@@ -76,9 +76,6 @@ def plan_transfer(
     Args:
         lift_m: How far the object is lifted, and let down, straight; less where that is not free.
         straight: Carry it along a straight line of the tool, turned evenly; else around.
-
-    Raises:
-        NoPathError: One of the movements does not exist; its name comes first.
     """
     transfer = _Transfer(
         problem=problem,

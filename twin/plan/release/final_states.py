@@ -103,9 +103,6 @@ def final_states(
         constraints: What must hold there besides (Eq. 7).
         near: Poses ``T_base_object`` to look around instead of what the success predicates ask
             for; ``constraints`` then say what is wanted.
-
-    Raises:
-        NoFinalStateError: With its cause, and what is in the way.
     """
     config = ReleaseConfig() if config is None else config
     search = ReleaseSearch(problem, grasp, constraints, config)

@@ -48,11 +48,7 @@ class Target:
 
 
 def target_of(problem: Problem, object_id: str) -> Target:
-    """Find where the success predicates want an object.
-
-    Raises:
-        NoFinalStateError: Nothing says it, or what it is put into was not localised.
-    """
+    """Find where the success predicates want an object."""
     scene = problem.scene
     goal = scene.task.goal_of(object_id)
     if goal is None and (mark := scene.task.mark_of(object_id)) is not None:
@@ -148,9 +144,6 @@ def resting_poses(
 
     Args:
         most_tilted_rad: Poses in which the tool leans farther from straight down are left out.
-
-    Raises:
-        NoFinalStateError: The object was not localised, or in every pose the tool leans too far.
     """
     T_now = problem.scene.Ts_base_object.get(grasp.object_id)
     if T_now is None:

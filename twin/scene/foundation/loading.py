@@ -65,9 +65,6 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
     Sizes are compared with what the headers of the files promise. Where a file ``SHA256SUMS`` lies
     beside the weights, every file it names is compared with its checksum.
 
-    Args:
-        kind: What they must be.
-
     Raises:
         WeightsError: Naming what is missing, cut short, changed, pickled or of another kind.
     """
@@ -89,11 +86,7 @@ def check_folder(folder: Path, kind: WeightsKind) -> dict[str, Any]:
 
 
 def weight_files(folder: Path, kind: WeightsKind) -> list[Path]:
-    """The safetensors of a folder, all of them present.
-
-    Raises:
-        WeightsError: When there are none, or some of a set of parts are missing.
-    """
+    """The safetensors of a folder, all of them present."""
     if (folder / SINGLE).is_file():
         return [folder / SINGLE]
     if not (folder / INDEX).is_file():
@@ -189,9 +182,6 @@ def read_normalisation(
 
     Args:
         default: Mean and standard deviation per channel where the folder states none.
-
-    Raises:
-        WeightsError: When the file holds something else than three numbers each.
     """
     path = folder / "preprocessor_config.json"
     if not path.is_file():
@@ -217,11 +207,7 @@ HALF: Normalisation = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 
 
 def import_torch() -> Any:
-    """Import torch.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
+    """Import torch."""
     try:
         import torch  # noqa: PLC0415  # only the extra [twin] brings it
     except ImportError as error:
@@ -240,8 +226,6 @@ def network_input(
     """Stretch images to one size and normalise them, as one float32 tensor (n, 3, height, width).
 
     Args:
-        images_u8: sRGB images, of any sizes.
-        normalisation: Mean and standard deviation of each colour.
         mode: ``bilinear`` or ``bicubic``; both low-pass when they shrink.
     """
     torch = import_torch()
@@ -268,11 +252,7 @@ class Placement:
     """auto: the first CUDA device, or the CPU where there is none."""
 
     def resolve(self) -> Any:
-        """Return torch's device.
-
-        Raises:
-            UsageError: For a device that is not there.
-        """
+        """Return torch's device."""
         torch = import_torch()
         wanted = self.device
         if wanted == "auto":
@@ -289,11 +269,7 @@ class Placement:
 
 
 def import_transformers() -> Any:
-    """Import transformers, with its way to the network closed.
-
-    Raises:
-        MissingDependencyError: It, or safetensors, is not installed.
-    """
+    """Import transformers, with its way to the network closed."""
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # read once, when the library is imported
     os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
     import_torch()
@@ -312,13 +288,9 @@ def import_transformers() -> Any:
 def load_model(folder: Path, kind: WeightsKind, class_name: str, placement: Placement) -> Any:
     """Load a network and put it to inference on its device.
 
-    Args:
-        kind: What the folder must hold.
-
     Raises:
         WeightsError: When the folder is not whole, or leaves parameters of the network without
             values.
-        MissingDependencyError: When ``transformers`` is not installed or does not know the class.
     """
     check_folder(folder, kind)
     device = placement.resolve()
@@ -357,11 +329,7 @@ class Tokenizer:
     """Words to numbers, by the tokenizer that lies beside the weights."""
 
     def __init__(self, folder: Path, kind: WeightsKind, max_tokens: int) -> None:
-        """Load it from the folder alone.
-
-        Raises:
-            WeightsError: When it cannot be read.
-        """
+        """Load it from the folder alone."""
         self._max_tokens = max_tokens
         self._kind = kind
         transformers = import_transformers()

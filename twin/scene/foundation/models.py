@@ -69,16 +69,7 @@ class Sam3Segmenter:
     def load(
         folder: Path, placement: Placement | None = None, config: Sam3Config | None = None
     ) -> "Sam3Segmenter":
-        """Load weights from a local folder.
-
-        Args:
-            placement: Device and precision; None: the first GPU, else the CPU, in float32.
-            config: Thresholds; None: the defaults.
-
-        Raises:
-            WeightsError: When the folder is missing, incomplete or of another kind.
-            MissingDependencyError: When the extra ``foundation`` is not installed.
-        """
+        """Load weights from a local folder."""
         model = load_model(folder, SAM3_KIND, "Sam3Model", placement or Placement())
         tokenizer = Tokenizer(folder, SAM3_KIND, model.config.text_config.max_position_embeddings)
         return Sam3Segmenter(model, tokenizer, folder, config or Sam3Config())
@@ -98,9 +89,6 @@ class Sam3Segmenter:
 
         Args:
             prompts: A few words each; they become the labels.
-
-        Raises:
-            UsageError: When there are no prompts, too many, or one that cannot be read.
         """
         if not 0 < len(prompts) <= MAX_PROMPTS:
             message = f"{len(prompts)} prompts; SAM 3 takes 1 to {MAX_PROMPTS} of them."
@@ -169,15 +157,7 @@ class DinoFeatures:
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "DinoFeatures":
-        """Load weights from a local folder.
-
-        Args:
-            placement: Device and precision; None: the first GPU, else the CPU, in float32.
-
-        Raises:
-            WeightsError: When the folder is missing, incomplete or of another kind.
-            MissingDependencyError: When the extra ``foundation`` is not installed.
-        """
+        """Load weights from a local folder."""
         model = load_model(folder, DINOV3_KIND, "DINOv3ViTModel", placement or Placement())
         return DinoFeatures(model, folder)
 
@@ -194,11 +174,7 @@ class DinoFeatures:
         below the network's own enlarges the image first.
 
         Args:
-            images_u8: sRGB images of one size.
             stride: Image pixels per cell; None: the network's own.
-
-        Raises:
-            UsageError: When sizes differ, or the maps would be empty or too large.
         """
         if not images_u8:
             return []
@@ -264,25 +240,13 @@ class ClipEmbedder:
 
     @staticmethod
     def load(folder: Path, placement: Placement | None = None) -> "ClipEmbedder":
-        """Load weights from a local folder.
-
-        Args:
-            placement: Device and precision; None: the first GPU, else the CPU, in float32.
-
-        Raises:
-            WeightsError: When the folder is missing, incomplete or of another kind.
-            MissingDependencyError: When the extra ``foundation`` is not installed.
-        """
+        """Load weights from a local folder."""
         model = load_model(folder, CLIP_KIND, "CLIPModel", placement or Placement())
         tokenizer = Tokenizer(folder, CLIP_KIND, model.config.text_config.max_position_embeddings)
         return ClipEmbedder(model, tokenizer, folder)
 
     def encode(self, texts: Sequence[str]) -> Float32[np.ndarray, "num_texts num_channels"]:
-        """Unit vectors of words.
-
-        Raises:
-            UsageError: For an empty text or one that is too long.
-        """
+        """Unit vectors of words."""
         if not texts:
             return np.zeros((0, self.num_channels), dtype=np.float32)
         ids, attention = self._tokenizer(texts)
@@ -302,9 +266,6 @@ class ClipEmbedder:
 
         Args:
             masks: Of the same sizes, none empty.
-
-        Raises:
-            UsageError: When an image and its mask do not fit, or a mask is empty.
         """
         if len(images_u8) != len(masks):
             message = f"{len(images_u8)} images for {len(masks)} masks; give each mask its image."
@@ -334,9 +295,6 @@ def masked_crop(
 
     Args:
         ground_u8: sRGB of everything around it.
-
-    Raises:
-        UsageError: When the sizes differ or the mask is empty.
     """
     if image_u8.shape[:2] != mask.shape or not mask.any():
         message = (
@@ -372,9 +330,6 @@ def split_spec(spec: str, option: str, known: tuple[str, ...]) -> tuple[str, Pat
 
     Args:
         spec: As the user wrote it; ``~`` is expanded in the folder.
-
-    Raises:
-        UsageError: When the name is none of those known, or the folder is missing.
     """
     name, colon, folder = spec.partition(":")
     if name not in known or not colon or not folder:

@@ -61,15 +61,11 @@ class ModelFindings:
 def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
     """Check all that the models need, before anything slow begins.
 
-    Args:
-        task: Its objects give the words to look for where no prompt does; None: there is no task.
-
     Returns:
         SHA-256 of each model's weights, by its option.
 
     Raises:
         UsageError: When an option or a folder cannot be used, or nothing says what to look for.
-        MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     named: list[tuple[str, Path, WeightsKind]] = []
     if config.segmenter:
@@ -92,14 +88,7 @@ def check_models(config: ModelConfig, task: Task | None) -> dict[str, str]:
 
 
 def prompts_of(config: ModelConfig, task: Task | None) -> list[str]:
-    """What to look for: the prompts given, else the names of the task's objects.
-
-    Args:
-        task: Names objects; None: there is no task.
-
-    Raises:
-        UsageError: When there is neither.
-    """
+    """What to look for: the prompts given, else the names of the task's objects."""
     if config.prompt:
         return list(config.prompt)
     names = [] if task is None else [spoken_name(key) for key in task.objects]
@@ -126,11 +115,6 @@ def ask_models(
 
     Args:
         cloud: The Gaussians that features are lifted to, in the frames' root frame.
-        threads: For lifting; 0: all cores.
-
-    Raises:
-        UsageError: When a folder, prompt or device cannot be used.
-        MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     placement = Placement(device=config.device)
     masks: list[tuple[Viewpoint, MaskSet]] = []
@@ -173,15 +157,8 @@ def embed_things(
 ) -> dict[str, Any]:
     """Give every thing of a scene its CLIP vector and write ``features.npz``.
 
-    Args:
-        features: What ``ask_models`` found, written along; None: vectors only.
-        threads: For drawing; 0: all cores.
-
     Returns:
         What ``scene.json`` says about the vectors.
-
-    Raises:
-        UsageError: When the folder or device cannot be used, or none is named.
     """
     if not config.clip:
         message = "no folder of CLIP is named; give --clip FOLDER."

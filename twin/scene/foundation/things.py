@@ -60,7 +60,6 @@ def add_semantics(
         surfaces_m: Points of the objects' reconstructed surfaces where they stand: their parts are
             told apart on these.
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
-        threads: For drawing; 0: all cores.
 
     Returns:
         What ``scene.json`` says under ``semantics``.
@@ -137,15 +136,8 @@ def ask_models_about(
 ) -> tuple[list[RgbdFrame], ModelFindings]:
     """Ask segmenter and feature model about training frames; nothing when none is named.
 
-    Args:
-        threads: For lifting; 0: all cores.
-
     Returns:
         The frames they looked at, and what they found.
-
-    Raises:
-        UsageError: When a folder, prompt or device cannot be used.
-        MissingDependencyError: When the extra ``foundation`` is not installed.
     """
     num_models = bool(config.segmenter) + bool(config.features)
     if not num_models and not config.clip:
@@ -184,12 +176,8 @@ def write_scene_semantics(
     """Say what is what in a decomposed scene.
 
     Args:
-        threads: For drawing; 0: all cores.
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         models: Large models to ask beside the default segmenter; None: none.
-
-    Raises:
-        UsageError: When a model cannot be used.
     """
     objects = {} if decomposed.parts is None else decomposed.parts.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}

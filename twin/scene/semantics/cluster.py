@@ -73,11 +73,7 @@ def means_of(
     group: Int[np.ndarray, " num_rows"],
     num_groups: int,
 ) -> Float[np.ndarray, "num_groups num_columns"]:
-    """Average the rows of each group; a group without rows gives zero.
-
-    Args:
-        group: Which group each row belongs to, from 0.
-    """
+    """Average the rows of each group; a group without rows gives zero."""
     count = np.maximum(np.bincount(group, minlength=num_groups), 1)
     sums = [np.bincount(group, weights=column, minlength=num_groups) for column in values.T]
     return np.asarray(np.stack(sums, axis=1) / count[:, None])
@@ -86,11 +82,7 @@ def means_of(
 def neighbour_pairs(
     p_m: Float[np.ndarray, "num_voxels 3"], reach_m: float
 ) -> Int[np.ndarray, "num_pairs 2"]:
-    """Pairs of points nearer than a distance, each once.
-
-    Args:
-        p_m: In any frame.
-    """
+    """Pairs of points nearer than a distance, each once."""
     if len(p_m) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     pairs = cKDTree(p_m).query_pairs(reach_m, output_type="ndarray")
@@ -100,11 +92,7 @@ def neighbour_pairs(
 def components(
     num_nodes: int, pairs: Int[np.ndarray, "num_pairs 2"]
 ) -> Int[np.ndarray, " num_nodes"]:
-    """Number the connected groups of a graph from 0, in the order of their first node.
-
-    Args:
-        num_nodes: Of the graph; a node without an edge is a group of its own.
-    """
+    """Number the connected groups of a graph from 0, in the order of their first node."""
     weights = np.ones(len(pairs), dtype=np.int8)
     graph = coo_matrix((weights, (pairs[:, 0], pairs[:, 1])), shape=(num_nodes, num_nodes))
     _, labels = connected_components(graph, directed=False)
@@ -194,9 +182,6 @@ def split_by_valleys(
     Local convexity as in Stein et al. 2014 (LCCP) between small patches. A neck or an armpit is
     a valley too, so a cut counts only between pieces that each stand on the plane and whose
     outlines seen from above hardly overlap: heads, handles and the floor of a box stay.
-
-    Args:
-        config: What counts as a valley and as standing.
     """
     patch, p, normals = make_patches(voxels, config.patch_voxels * voxel_m)
     links = np.sort(patch[pairs], axis=1)
@@ -264,9 +249,6 @@ def joined_by_outline(
 
     What one camera sees of a thing may fall into pieces: the far wall of a box behind the near
     one, a head in front of its body.
-
-    Args:
-        config: Which colours are one, and how far outlines must overlap.
     """
     xyh = np.concatenate([voxels.p_m[:, :2], height_m[:, None]], axis=1)
     left = sorted(pieces, key=len)

@@ -63,11 +63,7 @@ def scene_from_masks(
     config: AssociateConfig | None = None,
     advance: Advance = lambda done, note: None,
 ) -> SemanticScene:
-    """Fuse the masks of a 2D segmenter into the Gaussians of a scene.
-
-    Raises:
-        SemanticsError: When a mask does not fit its camera.
-    """
+    """Fuse the masks of a 2D segmenter into the Gaussians of a scene."""
     observations, sources = [], []
     for viewpoint, masks in _told(frames, 0, SHOWN, advance, "masks lifted"):
         observations.append(observe(rasteriser, cloud, viewpoint, masks))
@@ -126,7 +122,6 @@ def scene_by_default(
     work is done in a frame where it does, and a remark says that, too.
 
     Args:
-        config: What counts as a thing; the defaults when None.
         known: Gaussians of the objects that a task names, by their ids. They come first, under
             their names.
         surfaces_m: Points of the reconstructed surfaces of some of them, where they stand: parts

@@ -31,11 +31,7 @@ class FeatureBasis:
     """Share of the variance they keep."""
 
     def reduce(self, feature_map: FeatureMap) -> FeatureMap:
-        """Express a feature map in the basis.
-
-        Raises:
-            SemanticsError: When the map has another number of channels.
-        """
+        """Express a feature map in the basis."""
         channels, height, width = feature_map.values.shape
         if channels != len(self.mean):
             message = f"a feature map has {channels} channels, the basis {len(self.mean)}."
@@ -62,14 +58,7 @@ class SceneFeatures:
 
 
 def fit_basis(maps: Sequence[FeatureMap], num_kept: int) -> FeatureBasis:
-    """Principal component analysis over cells of all maps, evenly thinned.
-
-    Args:
-        num_kept: Components to keep; fewer when there are fewer channels or cells.
-
-    Raises:
-        SemanticsError: When there is no map, or values are not finite.
-    """
+    """Principal component analysis over cells of all maps, evenly thinned."""
     if not maps or num_kept < 1:
         message = "a basis needs at least one feature map and one component."
         raise SemanticsError(message)
@@ -104,9 +93,6 @@ def lift_reduced(
     """Reduce the maps of all frames and put them on the Gaussians; instances get no embedding yet.
 
     A Gaussian gets the mean of what the maps say about it.
-
-    Args:
-        cloud: The Gaussians, in the frame of the viewpoints.
     """
     reduced = [(viewpoint, basis.reduce(item)) for viewpoint, item in frames]
     mean, weight = lift_features(rasteriser, cloud, reduced)

@@ -38,13 +38,7 @@ def branches(
     max_size_m: float,
     min_voxels: int,
 ) -> Branches:
-    """Part the connected groups of voxels.
-
-    Args:
-        p_m: Voxels above the plane.
-        height_m: Of each over the plane.
-        max_size_m: Groups that reach farther along an axis are parted.
-    """
+    """Part the connected groups of voxels."""
     groups: list[np.ndarray] = []
     too_large = np.zeros(len(p_m), dtype=bool)
     group = components(len(p_m), pairs)

@@ -40,10 +40,6 @@ def numbered(
     A thing of which at least half belongs to one known object is that object: its rest is what
     was left in the background when the object was cut out. Objects with next to no Gaussians get
     no number: nothing can be said of them.
-
-    Args:
-        labels: From the segmenter; 0 is the background.
-        known: The Gaussians of each object; no two share one.
     """
     keys = tuple(key for key, mask in known.items() if int(mask.sum()) >= MIN_SPLATS)
     num_things = int(labels.max(initial=0))
@@ -116,12 +112,6 @@ def query(
     instance's label, else 0. With both, the model answers for objects: the softmax of the text
     against each canonical phrase, the smallest of them. Parts go by name in either case, each
     with its object's activation ("handle of the basket", "the duck's head").
-
-    Args:
-        embeddings: One vector for each instance, in the order of ``scene.instances``.
-
-    Raises:
-        SemanticsError: When the text says nothing, or the embeddings do not fit.
     """
     words = words_of(text)
     if not words:

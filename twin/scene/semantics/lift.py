@@ -45,16 +45,7 @@ class Observation:
 def observe(
     rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint, masks: MaskSet
 ) -> Observation:
-    """Carry the masks of one frame to the Gaussians.
-
-    Args:
-        cloud: The Gaussians, in the frame of the viewpoint.
-        viewpoint: Of the frame that the masks belong to.
-        masks: Of one frame, at the size of its image.
-
-    Raises:
-        SemanticsError: When a mask has another size than the camera's image.
-    """
+    """Carry the masks of one frame to the Gaussians."""
     camera = viewpoint.camera
     for number, mask in enumerate(masks.masks):
         if mask.image.shape != (camera.height, camera.width):
@@ -100,14 +91,8 @@ def lift_features(
 
     The Gaussians are drawn at the maps' own resolution: a feature cell is a pixel.
 
-    Args:
-        cloud: The Gaussians, in the frame of the viewpoints.
-
     Returns:
         Features, and how many cells' worth each Gaussian gave; both zero where never seen.
-
-    Raises:
-        SemanticsError: When there is no frame, or a map does not fit its camera or the others.
     """
     total, weight = None, np.zeros(len(cloud), dtype=np.float32)
     for viewpoint, feature_map in frames:
@@ -162,12 +147,7 @@ def render_labels(
     labels: UInt16[np.ndarray, " num_splats"],
     viewpoint: Viewpoint,
 ) -> UInt16[np.ndarray, "height width"]:
-    """Per pixel the label that gives it most; 0 also where empty space gives more.
-
-    Args:
-        cloud: The Gaussians, in the frame of the viewpoint.
-        labels: Of each Gaussian; 0 is the background.
-    """
+    """Per pixel the label that gives it most; 0 also where empty space gives more."""
     planes = rasteriser.draw_planes(cloud, viewpoint.camera, viewpoint.T_base_camera)
     ids, weight = rasteriser.label_map(labels)
     ids[weight <= 1.0 - planes[4]] = 0
@@ -177,11 +157,7 @@ def render_labels(
 def visible_weight(
     rasteriser: Rasteriser, cloud: GaussianCloud, viewpoint: Viewpoint
 ) -> Float32[np.ndarray, " num_splats"]:
-    """Pixels' worth of one camera's image that each Gaussian gives.
-
-    Args:
-        cloud: The Gaussians, in the frame of the viewpoint.
-    """
+    """Pixels' worth of one camera's image that each Gaussian gives."""
     camera = viewpoint.camera
     ones = np.ones((1, camera.height, camera.width), dtype=np.float32)
     return as_float32(_transposed(rasteriser, cloud, viewpoint, ones)[:, 0])

@@ -16,7 +16,6 @@ from twin.scene.semantics.shape_descriptors import (
 )
 
 MAX_HANDLE = 0.45
-"""Share of the cells around a cavity; more is no handle but the rim itself."""
 MIN_HANDLE = 0.012
 """Share of the points; less is noise at a rim or a foot."""
 MIN_SHARE = 0.005
@@ -57,7 +56,6 @@ def find_parts(
     A part that is not there is not named.
 
     Args:
-        xyh_m: Its points: x, y and height above what it stands on.
         label: What it is called; decides what parts to look for.
     """
     low, high = np.quantile(xyh_m, [0.01, 0.99], axis=0)

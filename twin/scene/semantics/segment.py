@@ -122,11 +122,7 @@ def ground_of(
     points: SurfacePoints,
     config: SegmentConfig,
 ) -> "OverPlane | WithoutPlane":
-    """Find what things stand on, how high everything is over it, and what is free to be a thing.
-
-    Args:
-        points: What was seen, in a frame whose z points up.
-    """
+    """Find what things stand on, how high everything is over it, and what is free to be a thing."""
     try:
         plane = find_support(points.p_m, points.normals, config.support)
     except NoSupportError:
@@ -212,11 +208,7 @@ class WithoutPlane:
         return no_support(self._points.p_m, self._points.normals, self._config.support)
 
     def look(self, scale: float) -> Look:
-        """Cut them, with voxels so many times as large as their spacing asks for.
-
-        Raises:
-            NoSupportError: When nothing stands out.
-        """
+        """Cut them, with voxels so many times as large as their spacing asks for."""
         patches = self._config.patches
         scaled = replace(patches, voxel_m=scale * patches.voxel_m)
         labels = cut_into_patches(self._points, scale * self._spacing_m, scaled)

@@ -120,11 +120,7 @@ def find_height_map_cavity(
 
 
 def measure_shape(xyh_m: Float[np.ndarray, "num_points 3"], cell_m: float) -> ShapeDescriptors:
-    """Measure a thing from the points of its visible surface.
-
-    Args:
-        xyh_m: x, y and height above the plane it stands on.
-    """
+    """Measure a thing from the points of its visible surface."""
     low, high = np.quantile(xyh_m, [0.005, 0.995], axis=0)
     extent = float((high - low).max())
     heights = height_map(xyh_m, max(cell_m, extent / 48))

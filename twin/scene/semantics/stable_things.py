@@ -41,14 +41,7 @@ def segment_stably(
     points: SurfacePoints,
     config: SegmentConfig,
 ) -> Segmentation:
-    """Find the things that most sizes of voxels find, the largest first.
-
-    Args:
-        points: What was seen, in a frame whose z points up; evenly spaced.
-
-    Raises:
-        NoSupportError: When there is no level plane to stand on, and nothing stands out.
-    """
+    """Find the things that most sizes of voxels find, the largest first."""
     ground = ground_of(points, config)
     looks = [ground.look(scale) for scale in VOXEL_SCALES]
     stable = sorted(

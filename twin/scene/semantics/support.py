@@ -114,9 +114,6 @@ def find_support(
     Fischler and Bolles 1981 on the points that face upwards, with the tilt bounded. Of the
     largest few planes the one with most points on it and just above it wins: a floor may be
     larger than the table, but less stands on the part of it that is seen.
-
-    Raises:
-        NoSupportError: When no level plane has enough points.
     """
     upright = _faces_up(normals, config)
     left = p_m[upright]
@@ -156,11 +153,7 @@ def as_measured(
     normals: Float[np.ndarray, "num_points 3"],
     config: SupportConfig,
 ) -> SupportPlane:
-    """The plane with the bend that the cameras gave it; the same where it is flat.
-
-    Args:
-        config: How near counts as the plane.
-    """
+    """The plane with the bend that the cameras gave it; the same where it is flat."""
     near = (np.abs(plane.height_m(p_m)) < BENT_M) & _faces_up(normals, config)
     if int(near.sum()) < config.min_points:
         return plane
@@ -180,11 +173,7 @@ def _fit_bend(
     height_m: Float[np.ndarray, " num_points"],
     tolerance_m: float,
 ) -> Bend:
-    """Fit it to points near the plane, robustly: what stands on the plane is among them.
-
-    Args:
-        height_m: Of each over the plane.
-    """
+    """Fit it to points near the plane, robustly: what stands on the plane is among them."""
     center_m = p_m[:, :2].mean(axis=0)
     reach_m = float(np.abs(p_m[:, :2] - center_m).max())
     A = _terms((p_m[:, :2] - center_m) / reach_m)
@@ -303,7 +292,6 @@ def level_frame(
     Args:
         normals: Unit vectors at the points, towards whoever saw them.
         Ts_base_camera: Where the cameras stood; none: z is up.
-        config: What counts as a support plane.
     """
     if not len(Ts_base_camera) or len(p_m) < config.min_points:
         return np.eye(4)

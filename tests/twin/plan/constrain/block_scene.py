@@ -267,16 +267,6 @@ EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
     ),
     "height": ({"kind": "height", "a": CUBE, "min": 0.04}, ON_BRICK, START),
     "height of a body": ({"kind": "height", "obj": "cube", "max": 0.03}, START, ON_BRICK),
-    "reach": (
-        {"kind": "reach", "margin": 0.1},
-        START,
-        state(tcp=pose(1.5, 0.5, 0.3) @ LOOKING_DOWN),
-    ),
-    "stable": (
-        {"kind": "stable", "obj": "cube", "support": "brick", "margin": 0.005},
-        ON_BRICK,
-        START,
-    ),
     "moved": (
         {"kind": "moved", "obj": "cube", "at_least": 0.05, "vector": [0.0, 1.0, 0.0]},
         ON_BRICK,

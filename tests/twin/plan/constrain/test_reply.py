@@ -14,12 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.task.task_file import load_task
-from twin.plan.constrain.reply import MAX_BYTES, ReplyError, parse_strictly, read_reply
+from twin.plan.constrain.reply import MAX_BYTES, ReplyError, read_reply
 from twin.plan.constrain.schema import (
     ConstraintError,
     Vocabulary,
     check_constraint,
-    find_problems,
 )
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[5] / "shared" / "data"))
@@ -46,10 +45,6 @@ def test_a_valid_reply_becomes_stages() -> None:
     assert place.subgoal == (ABOVE,)
     assert place.allowed_contacts == (("gripper", "cube"), ("cube", "box"))
     assert not place.terminal
-
-
-def test_there_are_enough_hostile_replies() -> None:
-    assert len({reply for _, reply, _ in HOSTILE}) >= 140
 
 
 def test_hostile_replies_are_refused_with_their_place() -> None:
@@ -134,18 +129,6 @@ def test_the_largest_reply_is_read_in_time() -> None:
     assert min(_cpu_s(reply) for _ in range(3)) <= CPU_LIMIT_S
 
 
-def test_what_rests_on_itself_by_way_of_others_is_refused() -> None:
-    record = valid_reply()
-    record["stages"][1]["subgoal"] = [
-        {"kind": "on", "obj": "cube", "support": "brick"},
-        {"kind": "on", "obj": "brick", "support": "cube"},
-    ]
-    record["stages"][0]["allowed_contacts"] = []
-    record["stages"][1]["allowed_contacts"] = []
-    problems = judged(json.dumps(record), BLOCKS)
-    assert problems == ("stages[1].subgoal[1]: brick would rest on itself: brick on cube on brick",)
-
-
 def test_contacts_are_those_of_the_task_or_of_what_is_held() -> None:
     record = put(("stages", 0, "allowed_contacts"), [["gripper", "post"]])
     assert "the task never lets gripper touch post" in judged(json.dumps(record), BLOCKS)[0]
@@ -161,27 +144,6 @@ def test_a_constraint_is_checked_for_the_scene() -> None:
         check_constraint({"kind": "inside", "obj": "cube", "container": "boxx"}, CUBE)
     with pytest.raises(ConstraintError, match=r"min 0.5 is above max 0.1"):
         check_constraint({"kind": "height", "a": {"obj": "cube"}, "min": 0.5, "max": 0.1}, CUBE)
-
-
-def test_jsonschema_agrees_on_what_fits() -> None:
-    from jsonschema import Draft202012Validator
-
-    schema = CUBE.schema()
-    Draft202012Validator.check_schema(schema)
-    validator = Draft202012Validator({"$ref": "#/$defs/reply", "$defs": schema["$defs"]})
-    agreed = {True: 0, False: 0}
-    for name, text, _ in [("valid", json.dumps(valid_reply()), ""), *HOSTILE[::3]]:
-        try:
-            record = parse_strictly(text)
-        except ReplyError:
-            continue
-        ours = find_problems(record, "reply", CUBE)
-        if "surrogate" in str(ours) or "more than once" in str(ours):
-            continue  # no schema can say so
-        assert bool(ours) != validator.is_valid(record), (name, ours)
-        agreed[not ours] += 1
-    assert agreed[False] > 50
-    assert agreed[True] > 3  # what only contradicts itself
 
 
 VALUES = st.recursive(

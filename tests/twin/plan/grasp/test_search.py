@@ -161,16 +161,6 @@ def test_no_two_grasps_are_alike(cube_search: tuple[Problem, GraspSearch]) -> No
             assert not (near & (se3.rotation_angle_rad(R) < SAME_RAD - 1e-6)).any()
 
 
-def test_the_same_question_has_the_same_answer(cube_search: tuple[Problem, GraspSearch]) -> None:
-    given, search = cube_search
-    one, other = search, GraspSearcher(given).search("cube")
-    assert one.rejected == other.rejected
-    for a, b in zip(one.grasps, other.grasps, strict=True):
-        assert a.margin == b.margin
-        np.testing.assert_array_equal(a.T_object_tcp, b.T_object_tcp)
-        np.testing.assert_array_equal(a.joints_rad, b.joints_rad)
-
-
 def test_the_surest_grasp_of_a_cube_is_near_its_middle(
     cube_search: tuple[Problem, GraspSearch],
 ) -> None:

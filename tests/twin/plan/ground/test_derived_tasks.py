@@ -22,7 +22,6 @@ from twin.plan.ground.run_tasks import keep, task_files_of, understand
 from twin.plan.ground.vocabulary import GroundingError, vocabulary_of
 
 CUBE = TaskFile.read(datasets_folder() / "tasks" / "cube_into_box.toml")
-DUCKS = TaskFile.read(datasets_folder() / "tasks" / "five_ducks_into_basket.toml")
 STACK = TaskFile.read(datasets_folder() / "tasks" / "stack_two_cubes.toml")
 
 
@@ -69,22 +68,6 @@ def test_an_instruction_becomes_the_task_that_ships() -> None:
     assert task.derived["by"] == "grammar"
     assert task.derived["tasks"] == ["cube_into_box"]
     assert ships.derived is None
-
-
-def test_the_contacts_of_five_ducks_are_those_of_the_task_that_ships() -> None:
-    task, ships = derived("Put all ducks into the basket", DUCKS), DUCKS.task()
-    assert task.grip_force_N == ships.grip_force_N
-    assert len(task.stages) == len(ships.stages)
-    for number, stage in enumerate(ships.stages):
-        theirs = {frozenset(pair) for pair in stage["allowed_contacts"]}
-        resting = {
-            frozenset((f"duck_{n}", place)) for n in range(1, 6) for place in ("table", "basket")
-        }
-        ducks = {pair for pair in pairs(task, number) if all("duck" in key for key in pair)}
-        assert theirs <= pairs(task, number)
-        assert pairs(task, number) - theirs <= resting | ducks
-    kinds = [spec["kind"] for spec in task.success]
-    assert kinds.count("shape") == kinds.count("inside") == kinds.count("settled") == 5
 
 
 def test_a_stack_may_touch_what_it_stands_on_and_nothing_else() -> None:

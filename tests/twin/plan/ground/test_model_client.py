@@ -262,11 +262,6 @@ def test_a_server_that_knows_no_formats_is_asked_plainly() -> None:
     assert any("asked again in plain words" in remark for remark in answer.remarks)
 
 
-def test_prose_is_repaired() -> None:
-    with serving(says("Sure! First grasp the cube, then release it."), says(GOOD)) as server:
-        assert ask(server).answered_by == BY_REPAIR
-
-
 def images_in(body: dict[str, Any]) -> list[str]:
     content = body["messages"][1]["content"]
     parts = content if isinstance(content, list) else []
@@ -336,11 +331,6 @@ def test_an_address_that_is_none_is_refused(url: str) -> None:
         ModelConfig(url=url, model="stub")
 
 
-def test_limits_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(UsageError, match="total-timeout-s"):
-        ModelConfig(url="http://127.0.0.1/v1", model="stub", total_timeout_s=0.0)
-
-
 def test_the_same_question_is_asked_once(tmp_path: Path) -> None:
     with serving(says(BAD), says(GOOD)) as server:
         first = ask(server, cache=tmp_path)
@@ -387,10 +377,3 @@ def test_instructions_in_labels_are_data_and_do_nothing() -> None:
     told = " ".join(answer.remarks)
     assert '"settings"' in told
     assert '"*" is unknown' in told
-
-
-def test_a_reply_to_another_task_is_refused() -> None:
-    with serving(says(json.dumps(put(("task",), "put the sloth into the basket")))) as server:
-        answer = ask(server)
-    assert answer.answered_by == BY_GRAMMAR
-    assert any("was not asked" in remark for remark in answer.remarks)

@@ -14,7 +14,7 @@ from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.problem import Grasp, Problem, Release, Shape, State
 from twin.plan.release.final_states import ReleaseConfig, final_states, perturbed
-from twin.plan.release.obstacles import Obstacles, hand_points, obstacles_of, spread_points
+from twin.plan.release.obstacles import hand_points, obstacles_of, spread_points
 from twin.plan.release.resting import NoFinalStateError, orientations, target_of
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.scene import ReplayScene
@@ -369,7 +369,3 @@ def test_the_mark_of_a_pushed_object_is_a_target_too() -> None:
     target = target_of(problem, name)
     assert target.relation == "at"
     assert tuple(target.T_base[:2, 3]) == task.mark_of(name)
-
-
-def test_nothing_around_is_no_obstacle() -> None:
-    assert Obstacles([]).margins(np.zeros((2, 3)), np.eye(4)[None], np.zeros(0)).min() == np.inf
