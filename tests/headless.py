@@ -36,11 +36,6 @@ ACCESSIBLE = Path(__file__).with_name("accessible.js")
 SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Instead of --disable-gpu, without which there is no WebGL on a machine without a GPU."""
 
-KEYS: dict[str, dict[str, Any]] = {
-    "Tab": {"windowsVirtualKeyCode": 9},
-    "Enter": {"windowsVirtualKeyCode": 13, "text": "\r"},
-}
-
 
 @dataclass
 class Browser:
@@ -100,7 +95,7 @@ class Browser:
         elif method == "Audits.issueAdded":
             self.complaints.append(str(params["issue"]["code"]))
 
-    def show(self, address: str, *, width: int, dark: bool, media: str = "screen") -> None:
+    def show(self, address: str, *, width: int, dark: bool) -> None:
         """Open an address at this width [px] and wait until it is there."""
         self.asked.clear()
         self.complaints.clear()
@@ -112,7 +107,7 @@ class Browser:
             mobile=False,
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
+        self.call("Emulation.setEmulatedMedia", media="screen", features=[scheme])
         to = self.call("Page.navigate", url=address)
         while "loaderId" in to and to["loaderId"] not in self._loaded:
             self._read()
@@ -131,38 +126,11 @@ class Browser:
         )
         self.call("Runtime.evaluate", expression=expression, awaitPromise=True)
 
-    def press(self, key: str, *, loads: bool = False) -> None:
-        """Press a key as a person would; ``loads``: and wait for the page that it leads to."""
-        before = self.num_loaded
-        told = KEYS.get(key, {"text": key} if len(key) == 1 else {})
+    def press(self, key: str) -> None:
+        """Press a key as a person would."""
+        told = {"text": key} if len(key) == 1 else {}
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **told)
-        if loads:
-            self.await_load(before)
-
-    def click(self, selector: str, *, loads: bool = False) -> None:
-        """Click an element as a person would, scrolled to; ``loads``: as in ``press``."""
-        before = self.num_loaded
-        x, y = self.ask(
-            "((element) => { element.scrollIntoView({ block: 'center', behavior: 'instant' });"
-            " const box = element.getClientRects()[0];"
-            " return [box.x + box.width / 2, box.y + box.height / 2]; })"
-            f"(document.querySelector({json.dumps(selector)}))"
-        )
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-        if loads:
-            self.await_load(before)
-
-    @property
-    def num_loaded(self) -> int:
-        """How many documents were loaded so far."""
-        return len(self._loaded)
-
-    def await_load(self, before: int) -> None:
-        """Wait for the document that an action led to."""
-        while self.num_loaded == before:
-            self._read()
 
     def picture(self) -> bytes:
         """Take a PNG of the whole page."""
