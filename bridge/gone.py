@@ -40,8 +40,6 @@ GONE: dict[str, str] = {
     "record --triggers": (
         "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
     ),
-    "publish standin --real-time": "Play the episode, which keeps its pace.",
-    "publish standin --execute-unverified": "Without a verdict nothing is executed.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
         "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."
@@ -70,6 +68,9 @@ GONE: dict[str, str] = {
         (
             *(f"{command} --replay.{name}" for command in ("replay", "gate") for name in FIXED),
             "gate --max-audit-distances",
+            "plan --candidates",
+            *(f"publish standin --{name}" for name in ("real-time", "execute-unverified")),
+            *(f"publish standin --{name}" for name in ("scan-id", "first-probe", "gate-cell")),
             "gate --frames",
             "gate --max-frame-age-s",
             "gate --max-silence-s",

@@ -327,7 +327,7 @@ class Operator:
     def scan(self) -> None:
         """Record one scan with the objects where the first trial has them."""
         cell, start_seed = self._cell, self.start_seeds(1)[0]
-        scan_id = self._config.scan_id or f"scan_{self._next_number('scan'):04d}"
+        scan_id = f"scan_{self._next_number('scan'):04d}"
         cell.reset(self.start_poses(start_seed, "scan"))
         self._begin(self._info(scan_id, kind="scan", start_seed=start_seed))
         joints = cell.home_rad
@@ -413,11 +413,9 @@ class Operator:
     def probes(self) -> None:
         """Record every probe of every round, each from a start of its own."""
         kinds = [kind for _ in range(self._config.probes) for kind in PROBES]
-        first = self._config.first_probe
-        if kinds and first is None:
-            first = self._next_number("probe")
+        first = self._next_number("probe") if kinds else 1
         with self._output.progress("probes", len(kinds)) as advance:
-            for number, kind in enumerate(kinds, start=first or 1):
+            for number, kind in enumerate(kinds, start=first):
                 self._probe(number, kind)
                 self.num_probes += 1
                 advance(self.num_probes, kind)

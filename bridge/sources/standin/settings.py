@@ -28,8 +28,6 @@ class SessionConfig:
     """Draws the hidden laboratory and the starts; same seed, same session."""
     scan: bool = True
     """Record a scan first."""
-    scan_id: str = ""
-    """Name of the scan's episode; empty: scan_ and the run's next number."""
     trials: int = 3
     """Starts to try, each once per condition; 0 records the scan only."""
     first_start: int = 0
@@ -44,8 +42,6 @@ class SessionConfig:
     probes: int = 0
     """Rounds of probe episodes after the trials, for calibrate RUN --physics: each round pushes,
     slides, squeezes and drops the first object."""
-    first_probe: int | None = None
-    """Number of the first probe's episode; without it the run's numbering goes on."""
     planner: str = BUILT_IN
     """Who plans: built_in (scripted, careless) or wire, whoever answers on the cell's service plan
     (robot-gst plan RUN --live)."""
@@ -67,8 +63,6 @@ class SessionConfig:
     retry: bool = False
     """After an execution that failed, put the objects back, look and plan anew: one new start of
     the same trial, in an episode of its own (retry_...), which counts in no rate of trials."""
-    gate_cell: str = ""
-    """Cell name the gate was started with; empty: the same."""
     gate_timeout_s: float = 600.0
     """The cell's clock stands still while the gate judges, so a slow machine changes nothing. This
     limit on the wall clock is the last resort against a gate that hangs: the trial is then void,
@@ -96,7 +90,6 @@ class SessionConfig:
             "first_start": (0, SEEDS_PER_SESSION - 1),
             "first_trial": (0, 9_999),
             "probes": (0, 1_000),
-            "first_probe": (1, 9_999),
             "rounds": (1, 1_000),
             "planner_timeout_s": (0.1, most),
             "study_seed": (0, 2**31),
