@@ -52,8 +52,6 @@ GONE: dict[str, str] = {
     "recover --in-place": (
         "Free some space, or move the file to another disk: a copy is made beside it."
     ),
-    "publish standin --real-time": "Play the episode, which keeps its pace.",
-    "publish standin --execute-unverified": "Without a verdict nothing is executed.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": (
         "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."
@@ -62,7 +60,7 @@ GONE: dict[str, str] = {
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",
     ),
-    "rebuild --depth-model": "Depth that nobody measured is found by comparing views.",
+    "rebuild --depth-model": "rebuild needs depth images: it finds no depth of its own.",
     **dict.fromkeys(
         ("rebuild --generator", "rebuild --generator-timeout-s"),
         "Shapes are carved from what the cameras saw.",
@@ -93,6 +91,9 @@ GONE: dict[str, str] = {
         (
             *(f"{command} --replay.{name}" for command in ("replay", "gate") for name in FIXED),
             "gate --max-audit-distances",
+            "plan --candidates",
+            *(f"publish standin --{name}" for name in ("real-time", "execute-unverified")),
+            *(f"publish standin --{name}" for name in ("scan-id", "first-probe", "gate-cell")),
             "gate --frames",
             "gate --max-frame-age-s",
             "gate --max-silence-s",

@@ -25,12 +25,6 @@ class LivePlanConfig:
     robot: str = ""
     """Robot file, by name or path, whose description takes the place of the published one; none:
     the robot that the cell describes (docs/robots.md)."""
-    candidates: int = 5
-    """Plans that are made at once; a cell may ask for as many rounds."""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers with which no planner can work."""
-        refuse_outside(self, {"candidates": (1, 1000)})
 
 
 @Parameter(name="*")

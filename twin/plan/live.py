@@ -40,6 +40,8 @@ PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
     name: partial(PlanProposer, policy) for name, policy in POLICIES.items()
 }
 GROUNDING = "gst localisation v1 of the request"
+MOST_CANDIDATES = 5
+"""Plans that are made at once; a cell may ask for as many rounds."""
 ALIVE = "/alive"
 """Behind the service's key: the liveliness token of the planner that answers there."""
 
@@ -130,7 +132,7 @@ class LivePlanner:
             seed=request.seed,
             round_=request.round,
             refused=request.refused,
-            most=self._config.candidates,
+            most=MOST_CANDIDATES,
         )
 
     def _chosen_with_model(

@@ -183,7 +183,6 @@ class Begun:
     understood: UnderstoodTask
     start: Start
     asked: Asked | None = None
-    """None: nobody was asked."""
 
     def lines(self) -> list[str]:
         """Everything for a person."""
@@ -236,7 +235,6 @@ class Planned:
     """With what a model said, as far as plans keep it."""
     attempts: Sequence[Attempt]
     path: Path | None
-    """Where the accepted plan lies; None: none was accepted."""
 
     @property
     def last(self) -> Attempt:

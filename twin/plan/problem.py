@@ -32,7 +32,6 @@ class Shape:
     parts_m: Mapping[str, Float[np.ndarray, "num_points 3"]] = field(default_factory=dict)
     """Points of its parts in its own frame, by their names in the rebuilt scene."""
     keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
-    """Named points of the rebuilt scene, in its own frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +58,7 @@ class Problem:
     """Task, poses with covariances, static distances, containers, where the arm stands."""
     robot: RobotModel
     shapes: Mapping[str, Shape]
-    """By object id; every object of the task has one."""
     keypoints: tuple[Keypoint, ...] = ()
-    """What constraints may name as ``kp``."""
 
     def model(self, object_id: str) -> ObjectModel:
         """The task file's nominal shape of an object."""

@@ -54,7 +54,6 @@ def problem_of(
 
 
 MOST_KEYPOINTS = 256
-"""That constraints can name."""
 
 
 def keypoints_of(shapes: Mapping[str, Shape]) -> tuple[Keypoint, ...]:

@@ -19,7 +19,6 @@ from twin.replay.run_job import START_KNOWN_NS, recorded_start
 
 _AGAIN = "Record the start again: robot-gst record RUN; a live cell asks again."
 _RIGID = 1e-3
-"""By how much a rotation may differ from one."""
 MOST_UNCERTAIN_M = 0.010
 """Standard deviation of a position beyond which nothing is planned."""
 _LIMIT_RAD = 0.01

@@ -133,14 +133,14 @@ class Decider:
         self._planner: Planner = (
             BuiltInPlanner(cell, GROUNDING_GATE if self.sees_by_gate else GROUNDING)
             if built_in
-            else WirePlanner(session, config_cell(config), config.planner_timeout_s)
+            else WirePlanner(session, config.cell, config.planner_timeout_s)
         )
 
     def look(self) -> GateSight:
         """Ask the gate where the objects are; what it says is all that is known of them."""
         return ask_where(
             self._session,
-            config_cell(self._config),
+            self._config.cell,
             self._cell.task,
             self._task_sha256,
             timeout_s=self._config.gate_timeout_s,
@@ -250,7 +250,7 @@ class Decider:
 
     def _ask_gate(self, plan: Plan) -> tuple[Verdict | None, str]:
         """Return the verdict, None when there is none, and why it is not a yes."""
-        key = cell_topic(config_cell(self._config), GATE)[1:]
+        key = cell_topic(self._config.cell, GATE)[1:]
         self._cell.streams.joints_again()  # a planner may have thought for seconds
         limit_s, asked_s = self._config.gate_timeout_s, time.monotonic()
         try:
@@ -263,11 +263,6 @@ class Decider:
         if verdict.plan_id != plan.id:
             return None, f"the gate judged {verdict.plan_id!r} instead of {plan.id!r}"
         return verdict, _reason(verdict)
-
-
-def config_cell(config: SessionConfig) -> str:
-    """Name under which gate and planner of a session answer."""
-    return config.gate_cell or config.cell
 
 
 def _record(object_id: str, T: np.ndarray, stamp_ns: int) -> dict[str, Any]:

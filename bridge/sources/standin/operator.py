@@ -319,7 +319,7 @@ class Operator:
     def scan(self) -> None:
         """Record one scan with the objects where the first trial has them."""
         cell, start_seed = self._cell, self.start_seeds(1)[0]
-        scan_id = self._config.scan_id or f"scan_{self._next_number('scan'):04d}"
+        scan_id = f"scan_{self._next_number('scan'):04d}"
         cell.reset(self.start_poses(start_seed, "scan"))
         self._begin(self._info(scan_id, kind="scan", start_seed=start_seed))
         joints = cell.home_rad

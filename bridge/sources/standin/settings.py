@@ -30,8 +30,6 @@ class SessionConfig:
     """Draws the hidden laboratory and the starts; same seed, same session."""
     scan: bool = True
     """Record a scan first."""
-    scan_id: Annotated[str, RARE] = ""
-    """Name of the scan's episode; empty: scan_ and the run's next number."""
     trials: int = 3
     """Starts to try, each once per condition; 0 records the scan only."""
     first_start: Annotated[int, RARE] = 0
@@ -64,8 +62,6 @@ class SessionConfig:
     retry: Annotated[bool, RARE] = False
     """After an execution that failed, put the objects back, look and plan anew: one new start of
     the same trial, in an episode of its own (retry_...), which counts in no rate of trials."""
-    gate_cell: Annotated[str, RARE] = ""
-    """Cell name the gate was started with; empty: the same."""
     gate_timeout_s: Annotated[float, RARE] = 600.0
     """The cell's clock stands still while the gate judges, so a slow machine changes nothing. This
     limit on the wall clock is the last resort against a gate that hangs: the trial is then void,

@@ -1,8 +1,10 @@
 """A wire in memory, and laboratories from the seeds that are kept for tests."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,8 @@ from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
 from bridge.wire.errors import NoReplyError
 from bridge.wire.qos import Qos
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_plans import planned
 
 from bridge.data_files import dataset_file
 from bridge.geometry import se3
-from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
+from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.destination import destination_of
-from bridge.sources.standin.kinematics import Kinematics, arm_kinematics, tool_down
+from bridge.sources.standin.kinematics import tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
 from bridge.sources.standin.streams import Streams
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, evaluate_success
-from bridge.task.task_file import Task, load_task
+from bridge.task.task_file import load_task
 
 FROZEN = {
     # SHA-256 of the files that were there before: what was recorded with them names their hash.
@@ -48,26 +48,6 @@ def test_older_files_are_what_they_were(folder: str) -> None:
             assert hashlib.sha256(data).hexdigest()[:16] == FROZEN[kind, name], name
 
 
-@pytest.fixture(scope="module")
-def arm() -> Kinematics:
-    return arm_kinematics()
-
-
-def planned(arm: Kinematics, task: Task, starts: dict[str, np.ndarray]) -> Plan:
-    home = tool_down(np.array([0.42, 0.0, 0.42]), 0.0)
-    return plan_pick_and_place(
-        task,
-        starts,
-        NO_ERROR,
-        kinematics=arm,
-        joints_start_rad=arm.joints_for(home, np.array(HOME_SEED_RAD)),
-        max_joint_speed_rad_s=1.6,
-        plan_id="p",
-        condition="without_replanning",
-        start_id="s",
-    )
-
-
 def predicted(plan: Plan, starts: dict[str, np.ndarray]) -> Rollout:
     """The start, then what the plan says where everything comes to lie."""
     ends = dict(starts)
@@ -82,11 +62,11 @@ def predicted(plan: Plan, starts: dict[str, np.ndarray]) -> Rollout:
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_a_plan_predicts_what_its_task_asks_for(arm: Kinematics, name: str) -> None:
+def test_a_plan_predicts_what_its_task_asks_for(name: str) -> None:
     task = load_task(name)
     assert load_cell(task.cell).name == "standin_cubes"
     starts = task.draw_start(np.random.default_rng(SEED))
-    plan = planned(arm, task, starts)
+    plan = planned(task, starts)
     assert [stage.id for stage in plan.stages] == [stage["id"] for stage in task.stages]
     begins = [stage.t_start_ns for stage in plan.stages]
     assert begins == sorted(begins)
@@ -129,12 +109,10 @@ def test_beside_is_the_middle_of_the_gap_with_a_finger_on_either_side_of_it(
         assert abs(place.turned_to(taken) - taken) <= np.pi / 2 + 1e-9
 
 
-def test_what_stands_in_the_way_is_put_to_its_mark_before_the_cube_is_touched(
-    arm: Kinematics,
-) -> None:
+def test_what_stands_in_the_way_is_put_to_its_mark_before_the_cube_is_touched() -> None:
     task = load_task("clear_then_place")
     starts = task.draw_start(np.random.default_rng(SEED))
-    plan = planned(arm, task, starts)
+    plan = planned(task, starts)
     mark = task.mark_of("block")
     assert mark is not None
     stages = {stage.id: stage for stage in plan.stages}
@@ -173,7 +151,7 @@ def test_a_plan_that_leaves_the_block_runs_into_it_and_fails(
     )
     cell.reset(task.draw_start(np.random.default_rng(SEED)))
     cell.wait(0.2)
-    plan = planned(cell.kinematics, task, cell.world.Ts_base_object())
+    plan = planned(task, cell.world.Ts_base_object())
     cell.truth.clear()
     execute_plan(cell, plan)
     moved_m = np.linalg.norm(np.ptp(np.array(cell.truth.poses["block"])[:, :2, 3], axis=0))

@@ -7,19 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_plans import planned
 
 import bridge.task
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
+from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.destination import ON_CLEARANCE_M
-from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
     NO_ERROR,
-    GraspError,
-    plan_pick_and_place,
 )
 from bridge.sources.standin.session import run_session
 from bridge.sources.standin.settings import SessionConfig
@@ -35,24 +33,6 @@ FILE = TaskFile.read(Path(str(bridge.task.__file__)).parent / "template.toml")
 @pytest.fixture(scope="module")
 def onto() -> Task:
     return FILE.task()
-
-
-def planned(
-    task: Task, starts: dict[str, np.ndarray], error: GraspError = NO_ERROR, **more: Any
-) -> Plan:
-    arm = arm_kinematics()
-    home_rad = arm.joints_for(tool_down(np.array([0.42, 0.0, 0.42]), 0.0), np.array(HOME_SEED_RAD))
-    values = {"kinematics": arm, "joints_start_rad": home_rad, **more}
-    return plan_pick_and_place(
-        task,
-        starts,
-        error,
-        max_joint_speed_rad_s=1.6,
-        plan_id="p",
-        condition="without_replanning",
-        start_id="s",
-        **values,
-    )
 
 
 def let_go_m(plan: Plan, stage_id: str) -> np.ndarray:

@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_plans import planned
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
+from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, nominal_hidden
-from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.operator import execute_plan, label_trial
-from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
 from bridge.sources.standin.streams import Streams
-from bridge.task.plan import Plan
 from bridge.task.task_file import Task, load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
 
@@ -25,22 +23,6 @@ SEED = 9_000_000
 @pytest.fixture(scope="module")
 def push() -> Task:
     return load_task("push_cube_to_mark")
-
-
-def planned(task: Task, starts: dict[str, np.ndarray]) -> Plan:
-    arm = arm_kinematics()
-    home_rad = arm.joints_for(tool_down(np.array([0.42, 0.0, 0.42]), 0.0), np.array(HOME_SEED_RAD))
-    return plan_pick_and_place(
-        task,
-        starts,
-        NO_ERROR,
-        kinematics=arm,
-        joints_start_rad=home_rad,
-        max_joint_speed_rad_s=1.6,
-        plan_id="p",
-        condition="without_replanning",
-        start_id="s",
-    )
 
 
 @pytest.mark.parametrize("seed", range(SEED, SEED + 5))

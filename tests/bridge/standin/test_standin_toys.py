@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_plans import planned
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PointCloudSample, PoseSample
@@ -16,20 +17,17 @@ from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell import CellConfig, StandinCell
 from bridge.sources.standin.cell_file import CellFile, draw_hidden, nominal_hidden
 from bridge.sources.standin.destination import release_slots
-from bridge.sources.standin.kinematics import arm_kinematics, yaw_of
+from bridge.sources.standin.kinematics import yaw_of
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
-    NO_ERROR,
     draw_error,
     draw_errors,
-    plan_pick_and_place,
 )
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.soft import SoftBody
 from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import clutter_surfaces, lab_surfaces, object_surfaces
 from bridge.sources.standin.world import World
-from bridge.task.plan import Plan
 from bridge.task.task_file import Task, load_task
 
 SEED = 9_000_000
@@ -54,20 +52,6 @@ def only(task: Task, kept: tuple[str, ...]) -> Task:
     )
 
 
-def plan_of(task: Task, Ts: dict[str, np.ndarray], error: Any = NO_ERROR) -> Plan:
-    return plan_pick_and_place(
-        task,
-        Ts,
-        error,
-        kinematics=arm_kinematics(),
-        joints_start_rad=HOME,
-        max_joint_speed_rad_s=1.6,
-        plan_id="plan_0",
-        condition="without_replanning",
-        start_id=f"{task.name}/{SEED}",
-    )
-
-
 def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCell]:
     cell = StandinCell(
         file,
@@ -81,7 +65,7 @@ def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCel
     Ts = task.draw_start(np.random.default_rng(SEED))
     cell.reset(Ts)
     cell.wait(0.2)
-    execute_plan(cell, plan_of(task, Ts))
+    execute_plan(cell, planned(task, Ts))
     return label_trial(task, cell.truth, executed=True), cell
 
 
@@ -172,7 +156,7 @@ def test_a_turn_the_wrist_cannot_make_is_made_the_other_way_round(sloth: Task) -
     Ts = sloth.draw_start(np.random.default_rng(SEED))
     turned = -1.4  # over the basket the wrist would pass its limit with this turn
     Ts["sloth"][:2, :2] = [[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]]
-    closed = next(waypoint for waypoint in plan_of(sloth, Ts).tau if waypoint.g == 1)
+    closed = next(waypoint for waypoint in planned(sloth, Ts).tau if waypoint.g == 1)
     T = se3.transform_from(np.array(closed.q_wxyz), np.array(closed.p_m))
     assert yaw_of(T @ np.diag([-1.0, 1.0, -1.0, 1.0])) == pytest.approx(turned + np.pi, abs=1e-6)
 

@@ -16,7 +16,6 @@ from twin.plan.problem import State
 Measure = Callable[[State], Array]
 """A number of each state, ``(num_states,)``."""
 SCALES = {"m": 0.01, "rad": np.radians(10.0), "m/s": 0.1}
-"""How much of a unit weighs as much as 1 cm."""
 SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "m/s": (1e3, "mm/s")}
 """By unit: what a number of it is multiplied by for a person, and what it then is."""
 

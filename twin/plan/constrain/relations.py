@@ -321,7 +321,6 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
 }
 
 PLACES = ("inside", "on", "outside", "beside", "between", "moved")
-"""Kinds that say where an object ends."""
 _KEYS = {
     "object": "obj",
     "margin_m": "margin",

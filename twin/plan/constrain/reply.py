@@ -26,11 +26,8 @@ from twin.plan.constrain.schema import (
 )
 
 MAX_BYTES = 64 * 1024
-"""Of a reply."""
 MAX_DEPTH = 12
-"""Of lists and objects within each other."""
 MAX_VALUES = 5000
-"""Lists and objects in a reply."""
 MAX_CONSTRAINTS = 16
 """Of one stage, subgoal and path together."""
 _MOST_DIGITS = 18

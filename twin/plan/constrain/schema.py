@@ -39,9 +39,7 @@ class Vocabulary:
 
     objects: tuple[str, ...]
     movable: tuple[str, ...]
-    """Of the objects, those that the task moves."""
     containers: tuple[str, ...] = ()
-    """Of the objects, those with a cavity."""
     num_keypoints: int = 0
     allowed_contacts: frozenset[frozenset[str]] | None = None
     """Pairs that may touch at some time, from the task file; None: no task file says so yet."""

@@ -61,7 +61,6 @@ class Doubt:
     robot_m: float
     """Of the robot alone: the table does not move with the object."""
     middle_m: float
-    """Of the middle of the object's mass."""
 
 
 def reaches_along(

@@ -17,7 +17,6 @@ from twin.robot.inverse import UrInverse, solutions, solve_ik
 MOST_TURN_RAD = 0.8
 """Of any joint on the straight approach; more is another branch, or a wrist that flips."""
 _MOST_BRANCHES = 4
-"""The nearest to where the arm stands are looked at."""
 _TURN = 2 * np.pi
 
 
@@ -151,4 +150,3 @@ class _Reaches:
 
 
 _PROGRESS = ("reach", "approach", "arm")
-"""What a candidate failed at, by how far it came."""

@@ -66,7 +66,6 @@ class NoGraspError(TwinError):
 FRICTION = 0.5
 """Least friction coefficient between pads and object that a grasp must hold with."""
 CONE_RAD = float(np.arctan(FRICTION))
-"""Half the opening of the friction cone."""
 APPROACHES_RAD = (0.0, -0.35, 0.35, -0.7, 0.7)
 """Turns about the closing line, from the approach nearest to straight down."""
 MOST_TILT_RAD = 0.9
@@ -74,7 +73,6 @@ MOST_TILT_RAD = 0.9
 DEPTHS_M = (0.0, -0.005, 0.012)
 """How far the tool centre point goes beyond the closing line."""
 PREGRASP_M = 0.08
-"""Length of the straight approach."""
 ROBOT_ERROR_M = 0.0015
 """Standard deviation of the tool in any direction."""
 SAME_M, SAME_RAD = 0.01, 0.1745
@@ -103,7 +101,6 @@ class GraspSearch:
     rejected: Mapping[str, int]
     """Candidates by the cause for which they are none; see ``CAUSES``."""
     remarks: tuple[str, ...] = ()
-    """What was not known, and what stood in for it."""
 
 
 @dataclass
@@ -146,7 +143,6 @@ _OPENINGS = (0.75, 0.55)
 """Shares of its width to which the hand opens where the whole of it finds no way past what is
 beside the object."""
 _IN_THE_WAY = ("neighbour", "arm")
-"""Causes that a narrower hand may have not."""
 _COVERED_M = 0.006
 """Something whose underside is no more than this under the top of what it covers lies on it."""
 

@@ -21,12 +21,10 @@ class Grounding:
     goals: tuple[Mapping[str, Any], ...]
     """Success predicates of a task file, in the order they were said."""
     order: tuple[str, ...]
-    """Objects in the order in which they are moved."""
     is_order_given: bool
     """The instruction asks for that order, or its relations do; else another one is as good."""
     choices: tuple[Choice, ...] = ()
     explanation: tuple[str, ...] = ()
-    """What each phrase means, and why."""
 
     def lines(self) -> list[str]:
         """The goals, the order and what they were made of, in words."""

@@ -33,7 +33,6 @@ from twin.plan.ground.words import (
 GAP_TOLERANCE_M = 0.005
 """Of a gap that is given by one number."""
 MOST_M = 1.5
-"""Farther nothing is moved."""
 _SLOTS = {"inside": "container", "outside": "container", "on": "support"}
 
 

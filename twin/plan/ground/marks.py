@@ -22,7 +22,6 @@ _DIGITS = {
 }
 """Drawn here, so that no font is needed."""
 _DOT_PX = 3
-"""Edge of a dot of a digit."""
 _RIM_PX = 4
 _MOST_TRIES = 40
 

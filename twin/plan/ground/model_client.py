@@ -35,10 +35,8 @@ from twin.plan.constrain.schema import Vocabulary, printable
 
 Messages = list[dict[str, Any]]
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
-"""Who answered."""
 READ_INSTEAD = "the grammar read the instruction instead"
 MOST_LABEL = 80
-"""Characters of a label that are sent."""
 _CHUNK = 64 * 1024
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _REFUSES_FORMAT = (400, 404, 415, 422, 501)
@@ -96,7 +94,6 @@ class Question:
     labels: Mapping[str, str] = field(default_factory=dict)
     """What each object looks like, from the scene: data, whoever wrote it."""
     image_u8: UInt8[np.ndarray, "height width 3"] | None = None
-    """With the marks of ``draw_marks``."""
     marks: Mapping[str, int] = field(default_factory=dict)
     keypoints: Sequence[tuple[str | None, str]] = ()
     """Of each keypoint, by its number, the object it moves with and its name in the scene."""
@@ -108,7 +105,6 @@ class Answer:
 
     stages: tuple[Stage, ...]
     answered_by: str
-    """``BY_MODEL``, ``BY_REPAIR`` or ``BY_GRAMMAR``."""
     remarks: tuple[str, ...] = ()
     """Whom was asked, what was sent, and what was wrong with what came back."""
 

@@ -31,7 +31,6 @@ class UnderstoodTask:
 
     file: TaskFile
     grounding: Grounding | None
-    """None: the task was named."""
 
     def lines(self) -> list[str]:
         """Everything for a person: what was understood, then the task."""

@@ -28,7 +28,6 @@ KINDS = (
     "unsupported_relation",
     "unsupported_verb",
 )
-"""Why an instruction is not planned."""
 AT_FAULT = ("contradiction", "cyclic", "fixed_object")
 """Kinds whose candidates are at fault, and named by the message: there is nothing to choose."""
 ANY_THING = ("object", "thing", "item")
@@ -57,7 +56,6 @@ class Thing:
 
     id: str
     label: str
-    """What the segmenter, or the task, calls it."""
     colour: str
     """One of the names of ``twin.naming.colours``, or empty."""
     movable: bool
@@ -67,9 +65,7 @@ class Thing:
     shape: str = ""
     """``cube`` where it is one, whatever it is called."""
     own_names: frozenset[str] = field(init=False)
-    """Words of its id and of its label."""
     names: frozenset[str] = field(init=False)
-    """Whatever else it may be called."""
 
     def __post_init__(self) -> None:
         """Work out its names once."""

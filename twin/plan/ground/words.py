@@ -16,7 +16,6 @@ def word_set(text: str) -> frozenset[str]:
 
 
 MAX_CHARACTERS = 2000
-"""Of an instruction."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,6 @@ VERBS = {
     "pack": "pack",
     "stack": "stack",
 }
-"""What a clause begins with, and what it asks for."""
 CARRIED = ("push", "slide", "throw", "drop")
 """Verbs whose manner is not kept, which is said."""
 ENDS_THERE = ("goes", "go", "belongs", "belong")
@@ -97,7 +95,6 @@ WAYS = {
     **{f"{before}{side}": side for side in ("left", "right") for before in ("", "to the ")},
     **{f"{way}{s}": f"{way}s" for way in ("forward", "backward") for s in ("", "s")},
 }
-"""Which way something moves."""
 THEN = ("then", "after that", "afterwards", "finally")
 POLITE = ("please", "could you", "can you")
 GAP = ("with a gap of", "with gaps of")

@@ -60,7 +60,6 @@ PLANNER = "gst_planner"
 CLOSED_M = 0.0
 """Commanded width of the closed hand: its force, not its place, is what holds."""
 GRASPS = 6
-"""Grasps of one object that are looked at, the surest first."""
 WIDER_M = 0.003
 """Kept beyond what was asked for where a path was refused."""
 NOT_KEPT = "not kept on the way"
@@ -69,9 +68,7 @@ MOST_TRIED = 16
 _PLACED = ("inside", "on")
 """Relations that final states are found for without a place to begin at."""
 _HOPELESS = ("nowhere_said", "not_localised", "container_too_small")
-"""Causes that no other grasp changes."""
 _OF_GRASP = ("approach", "around", "lift")
-"""Movements that do not depend on the final state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +131,6 @@ class Transfer:
     release: Release
     legs: tuple[Leg, ...]
     T_base_lies: Float[np.ndarray, "4 4"]
-    """Where the object is predicted to come to lie."""
     cost: float
     """J of the final state, plus the chance that the grasp misses."""
     remarks: tuple[str, ...] = ()

@@ -23,7 +23,6 @@ class Candidate:
 
     plan: Plan
     rank: int
-    """0 is the one it likes best."""
     cost: float
     remarks: tuple[str, ...] = ()
 

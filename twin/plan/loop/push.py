@@ -43,7 +43,6 @@ class PushChoice:
     """What one candidate does to every object."""
 
     turns: int
-    """Half turns of the hand."""
     aside_m: float
     ahead_m: tuple[float, float]
 
@@ -59,7 +58,6 @@ class _Leg:
     T_base_tcp: Pose
     g: int = 1
     pause_s: float = 0.0
-    """Stands here this long instead of moving."""
     even_m_s: float | None = None
     """Goes at this speed but for short ramps; None: slowly, at rest at both ends."""
 

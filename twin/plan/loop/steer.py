@@ -58,7 +58,6 @@ class Steer:
     toward_m: tuple[float, float, float] | None = None
     """Where the tool was in the object's frame when a finger first touched it in the twin."""
     refused: tuple[Tried, ...] = ()
-    """Of every refused plan, oldest first."""
 
     def steered_by(self) -> SteeredBy:
         """What a plan says of it."""

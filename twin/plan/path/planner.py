@@ -34,7 +34,6 @@ REASONS = {
 }
 """Why a search ends without a path, by the native search's number."""
 _WIDER_M = 0.001
-"""Kept beyond what a refusal lacked."""
 _STRAIGHT_M, _STRAIGHT_RAD = 0.005, 0.05
 """Longest parts of a straight tool movement."""
 _JUMP = 6.0
@@ -45,15 +44,12 @@ _OTHERWISE = ((0.25, True), (1.0, False))
 
 
 RANGE_RAD = 1.0
-"""Longest step of the search's trees, over all joints."""
 SHORTCUTS = 60
-"""Shorter ways that are tried."""
 CONTACT_M_S = 0.1
 """Speed of the tool on straight movements, at whose ends something is touched."""
 ACCELERATION_RAD_S2 = 5.0
 """Limit of joints whose acceleration the robot file does not limit."""
 STEP_S = 0.02
-"""Time between two knots of a path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +57,7 @@ class PathConfig:
     """How far a search goes, and how fast the arm may be told to go."""
 
     max_nodes: int = 5000
-    """Postures in both trees at most."""
     max_postures: int = 150_000
-    """Postures looked at at most, in one search with its shortcuts."""
     rounds: int = 4
     """Searches at most, each with what was refused before kept farther away."""
     speed_share: float = 0.95
@@ -107,7 +101,6 @@ class Movement:
     width_m: float
     carried: Carried | None
     goal: int = 0
-    """Which of the goals was reached."""
 
 
 @dataclass(frozen=True, kw_only=True)

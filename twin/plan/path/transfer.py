@@ -31,7 +31,6 @@ from twin.robot.inverse import UrInverse, solutions
 from twin.robot.model import RobotModel
 
 LIFT_M = 0.06
-"""How far an object is lifted, and let down, straight [m]."""
 _LEAST_LIFT_M = 0.02
 _SAME_RAD = 0.001
 _LEAVE_MORE_M = (0.1, 0.05, 0.0)

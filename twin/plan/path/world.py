@@ -35,7 +35,6 @@ from twin.robot.model import RobotModel
 SPARE_M = 0.0003
 """A path keeps this much more than was asked: what the search may overlook is less."""
 BOX, PLANE, GRID, BODY = range(4)
-"""Kinds of the native pairs."""
 
 Names = tuple[str, str]
 
@@ -130,7 +129,6 @@ class World:
 
     motion: Motion
     names: list[Names]
-    """Of each native pair."""
     robot: RobotModel
     width_m: float
     carried: Carried | None = None

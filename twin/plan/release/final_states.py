@@ -63,9 +63,7 @@ class ReleaseConfig:
     """How final states are looked for."""
 
     num_samples: int = 2048
-    """Poses drawn, over all nominal ones."""
     num_nominal: int = 4
-    """Nominal poses that are perturbed."""
     num_starts: int = 12
     """Starts of the stage optimisation for each way to rest."""
     num_ways: int = 4

@@ -25,7 +25,6 @@ from twin.replay.clearance.static_obstacles import (
 from twin.robot.collision import RobotHulls
 
 TABLE_SIDE_M = 20.0
-"""The table is a box of this size below its top."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +35,6 @@ class Obstacle:
     error_m: float
     """How far its surface may be off: distances are smaller by this."""
     source: str
-    """What its distances are made of, in words."""
     boxes: tuple[PanelBox, ...] = ()
     grid: GridLookup | None = None
 

@@ -36,7 +36,6 @@ class Target:
     relation: str
     """inside, on, or at: a mark on the table."""
     name: str
-    """Of the container or the support; the table."""
     T_base: Float[np.ndarray, "4 4"]
     """Upright frame in the middle of the area, at the height on which the object comes to lie."""
     half_m: tuple[float, float]

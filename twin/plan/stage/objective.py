@@ -23,7 +23,6 @@ from twin.plan.problem import State
 LENGTH_M = 0.01
 """Unit of lengths in the regulariser and in steps of the solver."""
 ANGLE_RAD = float(np.deg2rad(10.0))
-"""Unit of angles."""
 NUM_VARIABLES = 7
 LAMBDA_REG = 1e-3
 """Weight of the regulariser Omega, the squared deviation from the nominal pose and width in units
@@ -41,9 +40,7 @@ class CostTerm:
     """f of states at the end: ``(num_states,)``, or a column for each of its parts
     ``(num_states, num_parts)``, in metres or radians; satisfied where none is above zero."""
     scale: float = LENGTH_M
-    """What counts as one."""
     unit: str = "m"
-    """Of the violation, see ``SCALES``."""
 
     @staticmethod
     def of(constraint: Constraint) -> "CostTerm":
@@ -91,9 +88,7 @@ class StageProblem:
     """One stage as an optimisation problem."""
 
     nominal_T_base_tcp: Float[np.ndarray, "4 4"]
-    """Where the regulariser draws the tool."""
     nominal_width_m: float
-    """And the width."""
     subgoal: tuple[CostTerm, ...]
     """What must hold where the stage ends; at least one."""
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)

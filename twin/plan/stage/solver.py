@@ -29,9 +29,7 @@ FREE_ITERATIONS = 12
 SPREAD_M = 0.06
 """Starts are drawn this far around the nominal position, along each axis."""
 SPREAD_TURN_RAD = float(np.pi)
-"""And turned about the vertical by up to this much."""
 DAMPING = 1e-2
-"""First damping of Levenberg and Marquardt."""
 LONGEST_STEP = 4.0
 """Of a start in one iteration, in units of 1 cm and 10 degrees."""
 SETTLED = 1e-7
@@ -40,7 +38,6 @@ _DIFFERENCE = 1e-4
 """Step of numeric derivatives, in units: 1 um, 0.001 degrees."""
 _NOTHING = 1e-10
 _NEXT_SEED = 7919
-"""Between the seeds of one drawing of starts and the next."""
 _HOPELESS = 1e6
 """A start that needs more damping than this came as far as it can."""
 
@@ -56,7 +53,6 @@ class SolveConfig:
     only_above: bool = False
     """No start is drawn below the nominal position: what is put down comes from above."""
     spread_rad: float = 0.6
-    """Starts are tilted by up to this much."""
     max_candidates: int = 16
 
 
@@ -67,7 +63,6 @@ class StageCandidate:
     T_base_tcp: Float[np.ndarray, "4 4"]
     width_m: float
     cost: float
-    """J."""
     violations: Mapping[str, float]
     """f of each term [m or rad]."""
 

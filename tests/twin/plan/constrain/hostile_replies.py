@@ -103,15 +103,7 @@ def _numbers() -> Iterator[tuple[str, str, str]]:
     for path in places:
         for value in NO_NUMBERS:
             yield f"{path[-1]} is {value!r}", json.dumps(put(path, value)), text_of(path)
-        for number in (
-            "NaN",
-            "Infinity",
-            "-Infinity",
-            "1e400",
-            "-1e999",
-            "9" * 5000,
-            "-" + "1" * 40,
-        ):
+        for number in NO_JSON_NUMBERS:
             text = json.dumps(put(path, "@")).replace('"@"', number)
             yield f"{path[-1]} is {number[:12]}", text, text_of(path)
         for number in (100.0, -7, 1e300):
