@@ -32,6 +32,7 @@ from twin.gate.gate import (
     Gate,
     JudgedTasks,
     PlanTooLargeError,
+    no_verdict,
     of_another_scene,
 )
 
@@ -290,3 +291,22 @@ def test_a_gate_of_one_task_wants_that_very_file() -> None:
     assert "that is asked for has sha256 000000000000" in (other.reason or "")
     same = replace(PLAN, task_sha256=TASK_FILE.sha256)
     assert gate_with().judge(same.to_json()).accepted is True
+
+
+def test_no_verdict_is_never_a_yes() -> None:
+    verdict = no_verdict(PLAN, "because")
+    assert verdict.accepted is None
+    assert verdict.reason == "because"
+
+
+def test_the_same_frames_are_searched_again_for_another_task(any_task: JudgedTasks) -> None:
+    searched: list[str] = []
+
+    def localise(frames: Any, task: Task, ends_s: float) -> dict[str, Any]:
+        searched.append(task.name)
+        return found()
+
+    gate = gate_with(localise=localise, tasks=any_task)
+    for name in ("cube_into_box", "cube_into_box", "my_task"):
+        gate.localise(name, find_task_file(name, tasks_dir=any_task.tasks_dir).sha256)
+    assert searched == ["cube_into_box", "my_task"]

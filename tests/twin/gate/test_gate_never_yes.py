@@ -17,7 +17,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import OptionError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from bridge.task.verdict import Verdict
+from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 from twin.gate import twin_process
 from twin.gate.config import GateConfig
@@ -266,3 +266,17 @@ def test_a_gate_that_is_being_stopped_says_so(twin: TwinProcess) -> None:
     assert len(said) == 1
     with pytest.raises(UndecidedError, match="is being stopped"):
         twin._do("replay", eval, "1", soon(1))
+
+
+def test_a_no_is_a_no_whatever_happens_meanwhile() -> None:
+    no = Factor(value=False, cause="inside", detail="beside the box")
+    verdict = judged(
+        ChangingPerception(running=[None, "plan_0"]),
+        verdict=Verdict(**{**vars(accepted()), "terminal": no}),
+    )
+    assert verdict.accepted is False
+
+
+def test_without_a_newer_picture_nobody_looks_again() -> None:
+    """A cell that stands still while it waits for the verdict costs no second localisation."""
+    assert judged(found=[seen(pose()), seen(pose(9.0))]).accepted is True

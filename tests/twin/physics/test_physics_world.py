@@ -114,3 +114,8 @@ def test_a_link_may_be_called_what_no_file_can_be(urdf: str, tmp_path: Path) -> 
     path = write_description(other, {"left/forearm_link": [box_corners(SIZE)]}, tmp_path)
     assert "left/forearm_link" in path.read_text()
     assert len(list(tmp_path.glob("*.obj"))) == 1
+
+
+def test_a_dropped_cube_comes_to_rest_on_the_table(urdf: str) -> None:
+    T, _ = dropped(urdf)
+    assert T[2, 3] == pytest.approx(0.02, abs=1e-3)

@@ -81,3 +81,17 @@ def test_a_stack_stays_while_the_weight_is_over_the_lower_face(
 
 def test_inertia_is_that_of_the_textbook() -> None:
     assert box_inertia(np.array([0.1, 0.2, 0.3]), 12.0) == pytest.approx((0.13, 0.1, 0.05))
+
+
+@each_engine
+@pytest.mark.parametrize("edge_m", [0.0, 0.004])
+def test_what_rests_rests_on_its_own_face_wherever_its_weight_is(
+    engine: str, edge_m: float
+) -> None:
+    unseen = Unseen(edge_m=edge_m, centre_of_mass_m=(0.003, 0.002, -0.008))
+    with cell(engine) as world:
+        world.add_table(0.0)
+        world.add_free("cube", CUBE, MASS_KG, at(0.8, 0.3, 0.0203), unseen)
+        world.reset_robot(HOME, 0.08)
+        p = poses(world, "cube", RATE_HZ)[-1, :3]
+    np.testing.assert_allclose(p, [0.8, 0.3, 0.02], atol=5e-4)

@@ -12,7 +12,7 @@ from bridge.data_files import datasets_folder
 from bridge.errors import GstError, UsageError
 from bridge.robots.robot import Robot, read_robot
 from twin.robot.check import check_robot
-from twin.robot.collision import link_hulls
+from twin.robot.collision import RobotHulls, link_hulls
 from twin.robot.model import RobotDescriptionError, RobotModel, check_dynamics
 
 ROBOTS = sorted(path.stem for path in (datasets_folder() / "robots").glob("*.toml"))
@@ -174,3 +174,14 @@ def test_the_check_command_ends_with_2_and_the_reason(
         assert robot_gst.run(["robot", "check", str(path)]) == 2
         assert found in capsys.readouterr().err
     assert issubclass(UsageError, GstError)
+
+
+def test_links_said_to_overlap_are_not_watched() -> None:
+    pair = ("panda_link5", "panda_link7")
+
+    def watched(robot: Robot) -> set[frozenset[str]]:
+        hulls = RobotHulls(model(robot))
+        return {frozenset((hulls.hulls[a].link, hulls.hulls[b].link)) for a, b in hulls.pairs}
+
+    assert frozenset(pair) in watched(PANDA)
+    assert frozenset(pair) not in watched(replace(PANDA, name="mine", may_overlap=(pair,)))

@@ -97,3 +97,11 @@ def test_a_collision_mesh_that_is_no_mesh_is_named(tmp_path: Path) -> None:
     broken = urdf.replace(first[1], str(mesh))
     with pytest.raises(RobotDescriptionError, match="cannot be read"):
         RobotHulls(load_robot(broken))
+
+
+def test_every_mesh_vertex_lies_in_its_hull(hulls: RobotHulls) -> None:
+    point = coal.Sphere(1e-6)
+    for hull in hulls.hulls:
+        for vertex in hull.points_m[::7]:
+            T = coal.Transform3s(np.eye(3), vertex)
+            assert signed_distance(hull.shape, coal.Transform3s(), point, T) < 1e-5, hull.link

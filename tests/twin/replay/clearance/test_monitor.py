@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scripted_plans import joints_over
 
-from twin.replay.clearance.monitor import ClearanceMonitor
+from twin.replay.clearance.monitor import ClearanceMonitor, active_stage
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of
@@ -128,3 +128,21 @@ def test_an_object_at_rest_where_it_started_is_nobodys_collision(script: SimpleN
     pushed[0, 3] += 0.05
     monitor.measure(1, joints, WIDTH_M, {"cube": pushed})
     assert [failure.bodies for failure in monitor.failures] == [("cube", "table")]
+
+
+def test_the_stage_that_has_begun_last_is_active(script: SimpleNamespace) -> None:
+    stages = script.plan(script.scene()).stages
+    end = stages[0].t_end_ns
+    assert active_stage(stages, 0) is stages[0]
+    assert active_stage(stages, end - 1) is stages[0]
+    assert active_stage(stages, end) is stages[1]
+    assert active_stage(stages, 10**12) is stages[1]
+    assert active_stage((), 0) is None
+
+
+def test_a_higher_table_is_closer_by_its_height(script: SimpleNamespace) -> None:
+    scene = replace(script.scene(), table_height_m=0.015)
+    joints = joints_over(scene, 0.62, -0.1, 0.03)
+    assert monitor_of(script, scene).measure(0, joints, WIDTH_M, {}) == pytest.approx(
+        0.005, abs=1e-6
+    )

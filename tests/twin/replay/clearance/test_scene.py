@@ -12,6 +12,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
 from twin.replay.clearance.bounding_spheres import bounding_spheres_of
+from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
@@ -367,3 +368,16 @@ def test_nearest_points_of_a_soft_body_are_never_nearer_than_was_measured(
         assert np.linalg.norm(own - other) > measured[pair] - 1e-5
         if pair[0] == name:
             assert np.abs(nodes[name] - own).max(axis=1).min() < 1e-5
+
+
+def test_lookups_are_those_of_the_grid_and_beyond_it_never_too_large() -> None:
+    rng = np.random.default_rng(4)
+    grid = replace(static_of(POST).observed, closed=True)
+    points = rng.uniform([-0.6, -0.8, -0.1], [1.0, 0.8, 0.7], (4000, 3))
+    found, known = GridLookup(grid).distance(points), grid.distance(points)
+    end = grid.origin_m + VOXEL_M * (np.array(grid.values_m.shape) - 1)
+    held = np.clip(points, grid.origin_m, end)
+    alike = (grid.distance(held) > 0) | (held == points).all(axis=1)
+    np.testing.assert_allclose(found[alike], known[alike], atol=1e-5)
+    assert np.all(found <= known + 1e-5)
+    assert np.sum(~alike) > 50, "below the table: solid goes on there"

@@ -13,7 +13,7 @@ from twin.npz import UnreadableArraysError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.replay.config import ReplayConfig
-from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene
+from twin.replay.rebuilt_scene import TASK_SHAPE, calibrated, read_rebuilt_scene, shape_hashes
 from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.shape.static import StaticSdf
@@ -130,3 +130,10 @@ def test_calibrated_physics_is_used_where_the_user_said_nothing() -> None:
     mine = ReplayConfig(physics=PhysicsConfig(object_friction=0.7))
     physics = calibrated(mine, found, TASK).physics
     assert (physics.object_friction, physics.grip_force_N) == (0.7, 9.0)
+
+
+def test_other_shapes_are_other_replays(run: RunFolder) -> None:
+    before = shape_hashes(run)
+    assert list(before) == ["objects/sloth/soft.npz"]
+    lattice_of_task(stretch=1.1).save(run.scene_dir / "objects" / "sloth" / "soft.npz")
+    assert shape_hashes(run) != before

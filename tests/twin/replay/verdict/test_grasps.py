@@ -99,3 +99,10 @@ def test_a_grasp_that_misses_is_neither_touched_nor_held(script: SimpleNamespace
     nothing = {"cube": np.zeros(len(result.stamps_ns), dtype=bool)}
     (grasp,) = grasps_seen(plan, path_of(plan), replace(result, finger_contact=nothing))
     assert (grasp["touched"], grasp["held"], grasp["p_object_m"]) == (False, False, None)
+
+
+def test_a_hand_that_never_leaves_carries_nothing(script: SimpleNamespace) -> None:
+    plan, result = carried(script)
+    still = np.repeat(result.Ts_base_tcp[:1], len(result.stamps_ns), axis=0)
+    touched = {"cube": np.ones(len(result.stamps_ns), dtype=bool)}
+    assert not held(plan, replace(result, Ts_base_tcp=still, finger_contact=touched))

@@ -146,3 +146,12 @@ def test_a_delay_and_a_focal_length_are_corrected_in_the_frames_that_are_read(
     frame, _ = load(longer, frozenset(stamps))
     assert frame.depth_camera.fx == pytest.approx(1.25 * first.depth_camera.fx)
     assert frame.color_camera.fy == pytest.approx(1.25 * first.color_camera.fy)
+
+
+def test_nothing_is_found_in_a_noisy_scan_that_is_right() -> None:
+    images = [image(k) for k in range(NUM_FRAMES)]
+    assert search_geometry(images, pose_at, FRAME_NS) is None
+    rng = np.random.default_rng(1)
+    noise = rng.normal(1, 0.02, (NUM_FRAMES, *images[0].depth_m.shape)).astype(np.float32)
+    coarse = [replace(i, depth_m=i.depth_m * n) for i, n in zip(images, noise, strict=True)]
+    assert search_geometry(coarse, pose_at, FRAME_NS) is None  # agreement is low, and no better

@@ -132,3 +132,17 @@ def test_what_was_elsewhere_in_another_scan_did_not_move() -> None:
     apart = find_moving(points, choose_reference_views(views, [0] * 8 + [1] * 8))
     at_once = find_moving(points, choose_reference_views(views))
     assert len(apart.keys) < 0.2 * len(at_once.keys)
+
+
+def test_the_pixels_of_a_visitor_are_masked(
+    training: tuple[list[PointSet], list[TrainingView]],
+) -> None:
+    points, views = training
+    moving = find_moving(points, choose_reference_views(views))
+    masked = moving.mask_in(views[3])
+    magenta = (views[3].full.planes_u8 == VISITOR_COLOR[:, None, None]).all(axis=0)
+    assert (~masked.full.static_mask)[magenta].mean() > 0.9
+    assert masked.full.static_mask[~magenta].mean() > 0.8
+    assert masked.full.static_mask.shape == views[3].full.static_mask.shape
+    assert not masked.full.depth_m[~masked.full.static_mask].any()
+    assert moving.mask_in(views[0]).half.static_mask.mean() > 0.97

@@ -67,6 +67,9 @@ def nothing(alpha: float = 0.0) -> View:
     )
 
 
+HEADINGS = (-3.1, -1.5, 0.0, 1.0, 3.1)
+
+
 def test_what_is_drawn_keeps_its_bits_and_less_of_it_shows_more_of_the_shell() -> None:
     for alpha in (OPAQUE, 0.99, 1.0):
         view = nothing(alpha)
@@ -166,3 +169,28 @@ def test_a_corner_that_nobody_saw_is_drawn_and_counts_as_unseen(room: RunFolder)
     depth = decode_color(out.with_name("corner_depth.png").read_bytes())
     assert seen.max() == 0
     assert depth.max() == 0
+
+
+@pytest.mark.parametrize("heading", HEADINGS)
+@pytest.mark.parametrize("tilt", [-1.2, 0.0, 0.7])
+def test_each_pixel_shows_the_shell_in_its_own_direction(heading: float, tilt: float) -> None:
+    T = looking(heading, tilt)
+    drawn = shell().behind(replace(nothing(), image=np.zeros((48, 64, 3), np.float32)), CAMERA, T)
+    rays = CAMERA.rays() @ T[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    np.testing.assert_allclose(drawn.image, painted(rays), atol=0.02)
+
+
+def test_pixels_that_moved_say_nothing() -> None:
+    (view,) = seen_views((0.0,))
+    masked = view.half.planes_u8.copy()
+    masked[:, :, :32] = 255
+    static = np.ones(masked.shape[1:], dtype=bool)
+    static[:, :32] = False
+    target = replace(view.half, planes_u8=masked, static_mask=static)
+    made = backdrop_of(
+        empty_cloud(),
+        [replace(view, half=target, full=target)],
+        Rasteriser(RasterConfig(threads=1)),
+    )
+    assert made.colors.max() <= view.half.image()[:, :, 32:].max() + 0.01

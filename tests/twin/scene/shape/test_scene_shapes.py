@@ -14,6 +14,7 @@ from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import ObjectSplats, SceneParts, write_objects
 from twin.scene.shape.from_training import (
+    masked_view,
     shapes_of,
 )
 from twin.scene.shape.known import pose_of
@@ -119,3 +120,10 @@ def test_a_toy_that_could_not_be_reconstructed_keeps_its_known_mesh() -> None:
     assert is_watertight(faces)
     assert volume_m3(vertices, faces) > 0
     np.testing.assert_allclose(np.ptp(vertices, axis=0), sloth.size_m, rtol=0.02)
+
+
+def test_a_pixel_belongs_to_the_nearest_object(views: list[TrainingView]) -> None:
+    masks = {key: masked_view(views[0], key, TASK.objects, POSES).mask for key in POSES}
+    assert masks["cube"].any()
+    assert masks["box"].any()
+    assert not (masks["cube"] & masks["box"]).any()

@@ -111,3 +111,12 @@ def test_an_array_of_objects_and_a_lying_header_are_refused(tmp_path: Path) -> N
         archive.writestr("rows.npy", data.replace(b"(4,)", b"(9,)"))
     with pytest.raises(UnreadableArraysError, match="bytes"):
         read_npz(path, ["rows"], 10**6)
+
+
+def test_smoothing_keeps_the_number_of_solid_voxels_even_in_thin_walls() -> None:
+    solid = np.zeros((20, 20, 20), dtype=bool)
+    solid[9:11, 4:16, 4:16] = True
+    before = distances_of_solid(solid, 1.0)
+    after = smoothed(before, 1.0, 0.8)
+    assert abs(int((after < 0).sum()) - int(solid.sum())) <= 0.08 * solid.sum()
+    assert (after < 0)[9:11, 6:14, 6:14].all()
