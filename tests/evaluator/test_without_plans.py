@@ -19,7 +19,7 @@ STEP_NS = 8_000_000
 def moved(maker: Any, name: str, result: str) -> None:
     """A trial of joints that rest, turn by one radian and rest again."""
     info = EpisodeInfo(id=name, kind="trial", task="cube_into_box", policy="act")
-    outcome = Outcome(result=result, k=result == "success")
+    outcome = Outcome(result=result, k=int(result == "success"))
     turn = np.interp(np.arange(600), [200, 400], [0.0, 1.0])
     with EpisodeWriter(maker.run.episodes_dir / f"{name}.mcap") as writer:
         writer.describe(info, outcome=outcome)
