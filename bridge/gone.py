@@ -30,6 +30,11 @@ GONE: dict[str, str] = {
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."
     ),
+    "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
+    "publish episode --remap": (
+        "Messages keep their names; namespace in a zenoh configuration (--config) comes before "
+        "all of them."
+    ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": (

@@ -1,7 +1,7 @@
 """An RGB-D folder as the messages of a live camera.
 
 Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
-RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files of
+RGB-D benchmark (``rgb.txt`` and ``depth.txt``), and the numbered files of
 7-Scenes (``frame-000000.color.png``). ``docs/rgbd_folder.md`` describes each.
 """
 

@@ -23,7 +23,7 @@ from bridge.episode.mcap.messages import Selection, Stored, merged
 from bridge.episode.reader import Episode
 from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.errors import UsageError
-from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename_topics
+from bridge.sources.playback.config import PlaybackConfig, choose_topics
 from bridge.terminal import Output
 from bridge.wire.errors import BadTopicError
 from bridge.wire.keys import key_from_topic
@@ -144,12 +144,12 @@ class EpisodeSource:
         self.pace = Pace(config.rate)
         counts = {topic: each.count for topic, each in self.episode.topics().items()}
         there = [topic for topic in counts if topic not in OF_RECORDER]
-        self.names = rename_topics(config.remap, choose_topics(config.topics, there))
-        for name in self.names.values():
-            _check_name(path, name)
-        self.num_messages = sum(counts[topic] for topic in self.names)
+        self.topics = tuple(choose_topics(config.topics, there))
+        for topic in self.topics:
+            _check_name(path, topic)
+        self.num_messages = sum(counts[topic] for topic in self.topics)
         if not self.num_messages:
-            listed = ", ".join(self.names) or "it has no topics"
+            listed = ", ".join(self.topics) or "it has no topics"
             raise UsageError(f"{path} holds no messages to play ({listed}).")
         self.start_ns = self.episode.start_ns + ns_from_s(config.start_s)
         if self.start_ns > self.episode.end_ns:
@@ -163,23 +163,18 @@ class EpisodeSource:
         """The episode's id."""
         return self.episode.info.id
 
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The topics it sends, by the names they get."""
-        return tuple(self.names.values())
-
     def messages(self) -> Iterator[Due]:
         """Yield what is sent; the recorder's drop log stays out."""
         for item in self._latched_before():
             yield Due(self.start_ns, item)
-        for item in merged(self.episode.files, Selection(frozenset(self.names), self.start_ns)):
+        for item in merged(self.episode.files, Selection(frozenset(self.topics), self.start_ns)):
             yield Due(item.log_time_ns, item)
 
     def _latched_before(self) -> Iterator[Stored]:
         """What was latched when the playback begins: the last of each topic, and all frames."""
         if self.start_ns <= self.episode.start_ns:
             return
-        latched = frozenset(topic for topic in self.names if is_latched(topic))
+        latched = frozenset(topic for topic in self.topics if is_latched(topic))
         last: dict[tuple[str, int], Stored] = {}
         for item in merged(self.episode.files, Selection(latched, None, self.start_ns)):
             topic = item.channel.topic
@@ -211,7 +206,7 @@ class EpisodeSource:
                     late_s.append(waited_s)
                     publisher = publishers[id(item.file), item.channel.id]
                     publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
-                    sent[self.names[item.channel.topic]] += 1
+                    sent[item.channel.topic] += 1
                     advance(len(late_s), "")
         finally:
             sys.setswitchinterval(switch_s)
@@ -230,7 +225,7 @@ class EpisodeSource:
         found: dict[tuple[int, int], WirePublisher] = {}
         for file in self.episode.files:
             for channel in file.summary.channels.values():
-                if channel.topic not in self.names:
+                if channel.topic not in self.topics:
                     continue
                 record = file.schema_of(channel)
                 key = (channel.topic, record.name if record else "", channel.message_encoding)
@@ -238,7 +233,7 @@ class EpisodeSource:
                     self._define(session, record, channel.message_encoding)
                 if key not in made:
                     made[key] = session.publisher(
-                        self.names[channel.topic],
+                        channel.topic,
                         key[1],
                         qos=Qos.PLAYBACK,
                         message_encoding=key[2],
@@ -265,9 +260,7 @@ def _check_name(path: Path, name: str) -> None:
     try:
         key_from_topic(name)
     except BadTopicError as error:
-        raise UsageError(
-            f"{path}: {error} Rename it with --remap, or choose others with --topics."
-        ) from error
+        raise UsageError(f"{path}: {error} Choose others with --topics.") from error
 
 
 def _lateness_ms(late_s: "array[float]") -> dict[str, float]:
