@@ -18,11 +18,7 @@ KEYFRAME_EVERY = 2
 
 
 def pyav() -> Any:
-    """Return PyAV.
-
-    Raises:
-        MissingDependencyError: Without it.
-    """
+    """Return PyAV."""
     try:
         import av  # noqa: PLC0415
     except ImportError as error:

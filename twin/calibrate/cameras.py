@@ -195,11 +195,6 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
 
     Args:
         config: Which camera (empty: all), which pose pairs and mounting.
-
-    Raises:
-        NothingToCalibrateError: No camera could be found for want of data; says what is missing.
-        UndeterminedCameraError: The one camera that was asked for is not determined.
-        RobotNotAlignedError: The same, from the robot it sees.
     """
     episodes = _readable(run, output)
     where = {} if config.pairs is not None else placement(episodes)

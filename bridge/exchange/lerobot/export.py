@@ -372,9 +372,6 @@ def export_lerobot(
 
     Args:
         advance: Told how many episodes are done; each counts twice, once for looking at it.
-
-    Raises:
-        UsageError: When there is nothing to export, or ``out`` may not be replaced.
     """
     files, left_out = select_episodes(source, config)
     run = RunFolder(source) if source.is_dir() else None

@@ -141,11 +141,7 @@ class DatasetInfo:
 
 
 def read_info(folder: Path) -> DatasetInfo:
-    """Read and check ``meta/info.json``.
-
-    Raises:
-        PathNotFoundError: When it is not there.
-    """
+    """Read and check ``meta/info.json``."""
     path = folder / INFO_PATH
     if not path.is_file():
         raise PathNotFoundError(

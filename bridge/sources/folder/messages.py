@@ -156,9 +156,6 @@ def folder_messages(
 
     Args:
         start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
-
-    Raises:
-        UsageError: When a rate is asked of a folder that has real times.
     """
     times = frame_times_ns(index, config, start_ns)
     shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)

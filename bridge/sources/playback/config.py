@@ -27,11 +27,7 @@ class PlaybackConfig:
 
 
 def choose_topics(patterns: Sequence[str], there: Sequence[str]) -> list[str]:
-    """Return the topics that a pattern names; all without one.
-
-    Raises:
-        UsageError: When a pattern names none of them, with those that are there.
-    """
+    """Return the topics that a pattern names; all without one."""
     if not patterns:
         return list(there)
     chosen: set[str] = set()

@@ -133,11 +133,7 @@ class EpisodeSource:
     """An episode as a ``bridge.sources.source.Source``."""
 
     def __init__(self, path: Path, config: PlaybackConfig) -> None:
-        """Open an episode and choose what is sent.
-
-        Raises:
-            UsageError: When nothing is chosen, or a name cannot travel on zenoh.
-        """
+        """Open an episode and choose what is sent."""
         self.episode = Episode.open(path)
         self.config = config
         self._defined: set[str] = set()
