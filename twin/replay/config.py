@@ -149,7 +149,7 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond which no comparison would fail, rates and engines that do not fit."""
+        """Refuse numbers beyond which no comparison fails; rates and engines that do not fit."""
         second = (0, 60)
         refuse_outside(
             self,

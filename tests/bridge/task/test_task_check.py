@@ -56,7 +56,7 @@ def test_what_is_shipped_is_right_and_named_like_its_file(path: Path) -> None:
         ('grasp = "cube"', 'push = "cube"', "stages[0].push", "where cube is to be moved"),
         ('grasp = "cube"', 'grasp = "cube"\npush = "cube"', "stages[0].push", "neither grasps"),
         ('grasp = "cube"', 'grasp = "cube"\nspeed_m_s = 0.1', "stages[0].speed_m_s", "to push"),
-        ('grasp = "cube"', 'push = "cube"\nspeed_m_s = 0', "stages[0].speed_m_s", "the minimum of 0"),
+        ('grasp = "cube"', 'push = "cube"\nspeed_m_s = 0', "stages[0].speed_m_s", "minimum of 0"),
         ('grasp = "cube"', 'grasp = "cube"\nclearance_m = 0.1', "stages[0].clearance_m", "carry"),
         ('["gripper", "cube"]]\n\n', '["griper", "cube"]]\n\n', "stages[0].allowed_contacts[1]",
          "Did you mean 'gripper'?"),
@@ -68,7 +68,7 @@ def test_what_is_shipped_is_right_and_named_like_its_file(path: Path) -> None:
         ("[objects.cube]", "[objects.gripper]", "objects.gripper", "cannot be called so"),
         ('name = "cube_into_box"', 'name = "../box"', "name", "does not match"),
         ("schema_version = 1", "schema_version = 2", "schema_version", "newer than the 1"),
-        ('instruction = "', 'grip_force_N = 0\ninstruction = "', "grip_force_N", "the minimum of 0"),
+        ('instruction = "', 'grip_force_N = 0\ninstruction = "', "grip_force_N", "minimum of 0"),
     ],
 )  # fmt: skip
 def test_an_error_says_where_it_is_and_what_was_probably_meant(
