@@ -30,6 +30,7 @@ GONE: dict[str, str] = {
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."
     ),
+    "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "publish episode --remap": (
         "Messages keep their names; namespace in a zenoh configuration (--config) comes before "

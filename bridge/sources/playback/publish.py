@@ -5,8 +5,6 @@ numbers are counted anew: a gap in the new recording was lost on this way, not o
 """
 
 import contextlib
-import queue
-import sys
 import threading
 import time
 from array import array
@@ -30,10 +28,6 @@ from bridge.wire.keys import key_from_topic
 from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
-SLICE_S = 0.05
-"""Who reads ahead looks this often whether the playback has ended."""
-SWITCH_S = 0.0005
-"""The thread that reads gives way to the one that sends after this long, not after 5 ms."""
 LATEST_NS = 2**63 - 1
 """The latest publish time that an attachment can hold."""
 
@@ -72,61 +66,6 @@ class Pace:
                 return -left_s
             stop.wait(left_s)
         return None
-
-
-BATCH_MESSAGES = 256
-BATCH_BYTES = 4_000_000
-BATCHES_AHEAD = 8
-
-
-class ReadAhead:
-    """Reads messages on a thread of its own, so that unpacking a chunk delays none of them."""
-
-    def __init__(self, messages: Iterator[Due]) -> None:
-        """Begin to read."""
-        self._messages = messages
-        self._batches: queue.Queue[list[Due]] = queue.Queue(BATCHES_AHEAD)
-        self._closed = threading.Event()
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._read, name="read ahead", daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        batch: list[Due] = []
-        size = 0
-        try:
-            for message in self._messages:
-                batch.append(message)
-                size += len(message.item.data)
-                if len(batch) >= BATCH_MESSAGES or size >= BATCH_BYTES:
-                    if not self._hand_over(batch):
-                        return
-                    batch, size = [], 0
-        except Exception as error:  # noqa: BLE001  # raised again where the messages are used
-            self._error = error
-        if not batch or self._hand_over(batch):
-            self._hand_over([])
-
-    def _hand_over(self, batch: list[Due]) -> bool:
-        while not self._closed.is_set():
-            try:
-                self._batches.put(batch, timeout=SLICE_S)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def __iter__(self) -> Iterator[Due]:
-        """Yield the messages; an error of reading comes after those before it."""
-        while batch := self._batches.get():
-            yield from batch
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        """Stop reading."""
-        self._closed.set()
-        self._thread.join()
 
 
 class EpisodeSource:
@@ -190,23 +129,16 @@ class EpisodeSource:
         publishers = self._publishers(session)
         sent = dict.fromkeys(self.topics, 0)
         late_s = array("d")
-        ahead = ReadAhead(self.messages())
-        switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        try:
-            with output.progress("play", self.num_messages) as advance:
-                for at_ns, item in ahead:
-                    waited_s = self.pace.wait(at_ns, stop)
-                    if waited_s is None:
-                        break
-                    late_s.append(waited_s)
-                    publisher = publishers[id(item.file), item.channel.id]
-                    publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
-                    sent[item.channel.topic] += 1
-                    advance(len(late_s), "")
-        finally:
-            sys.setswitchinterval(switch_s)
-            ahead.close()
+        with output.progress("play", self.num_messages) as advance:
+            for at_ns, item in self.messages():
+                waited_s = self.pace.wait(at_ns, stop)
+                if waited_s is None:
+                    break
+                late_s.append(waited_s)
+                publisher = publishers[id(item.file), item.channel.id]
+                publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
+                sent[item.channel.topic] += 1
+                advance(len(late_s), "")
         return {
             "episode": self.name,
             "messages": len(late_s),
