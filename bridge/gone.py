@@ -91,6 +91,10 @@ GONE: dict[str, str] = {
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
+    "calibrate --pairs": (
+        "Record target poses beside the joints (geometry_msgs/PoseStamped on "
+        "/CELL/cam/ID/target/pose), then robot-gst calibrate RUN --cameras."
+    ),
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(

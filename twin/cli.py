@@ -30,7 +30,6 @@ def replay(
 
     Args:
         run: Run folder.
-        config: Settings.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.calibrate.physics.imported import replay_imported
@@ -58,7 +57,6 @@ def gate(
 
     Args:
         run: Run folder with the rebuilt scene.
-        config: Settings.
     """
     from twin.gate.service import run_gate
 
@@ -78,7 +76,6 @@ def rebuild(
 
     Args:
         run: Run folder.
-        config: Settings.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.scene.rebuild.record import describe_scene
@@ -103,7 +100,6 @@ def render(
 
     Args:
         run: Run folder.
-        config: Settings.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.scene.render import describe_drawn
@@ -158,7 +154,6 @@ def calibrate(
 
     Args:
         run: Run folder.
-        config: Settings.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError

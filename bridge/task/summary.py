@@ -1,6 +1,5 @@
 """Say in words what a task asks for: objects, stages, what counts as success."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -74,17 +73,11 @@ _WAYS = {
 def _object(model: ObjectModel, start: StartRange) -> str:
     size = " x ".join(_mm(length) for length in model.size_m)
     what = model.mesh or model.shape.replace("_", " ")
-    made = "soft" if model.soft is not None else "rigid"
-    weight = "fixed" if model.fixed else f"{made}, {model.mass_kg * 1e3:g} g"
-    low, high = (math.degrees(limit) for limit in start.yaw_rad)
+    made = "fixed" if model.fixed else "rigid" if model.soft is None else "soft"
     return (
-        f"{model.id}: {what}, {size} mm, {weight}; starts at x {_range(start.x_m)}, "
-        f"y {_range(start.y_m)} m, turned by {low:.0f} to {high:.0f} degrees"
+        f"{model.id}: {what}, {size} mm, {made}, {model.mass_kg * 1e3:g} g; starts at "
+        f"x {start.x_m} m, y {start.y_m} m, yaw {start.yaw_rad} rad"
     )
-
-
-def _range(limits: tuple[float, float]) -> str:
-    return f"{limits[0]:g} to {limits[1]:g}"
 
 
 def _mm(length_m: float) -> str:
