@@ -30,6 +30,12 @@ GONE: dict[str, str] = {
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
         "your own, or age whole runs with logrotate."
     ),
+    "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
+    "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
+    "publish episode --remap": (
+        "Messages keep their names; namespace in a zenoh configuration (--config) comes before "
+        "all of them."
+    ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
     "record --failover": (
@@ -85,6 +91,10 @@ GONE: dict[str, str] = {
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
+    "calibrate --pairs": (
+        "Record target poses beside the joints (geometry_msgs/PoseStamped on "
+        "/CELL/cam/ID/target/pose), then robot-gst calibrate RUN --cameras."
+    ),
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
     **dict.fromkeys(

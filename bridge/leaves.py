@@ -185,22 +185,14 @@ def _is_here(module: str) -> bool:
 
 
 def load_leaf(name: str, entry: str) -> Any:
-    """Return what a leaf brings under a name.
-
-    Raises:
-        MissingDependencyError: When the leaf is not here; names the extra that brings it.
-    """
+    """Return what a leaf brings under a name."""
     refuse_missing(name)
     module, _, attribute = LEAVES[name].entries[entry].partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 def refuse_missing(name: str) -> None:
-    """Refuse to go on without a leaf.
-
-    Raises:
-        MissingDependencyError: When it is not here; names the extra that brings it.
-    """
+    """Refuse to go on without a leaf."""
     if has_leaf(name):
         return
     leaf = LEAVES.get(name, Leaf(modules=(), extra="all", purpose=f"what is asked ({name})"))
@@ -215,11 +207,7 @@ def leaf_commands() -> tuple[Command, ...]:
 
 
 def refuse_missing_command(tokens: Sequence[str]) -> None:
-    """Refuse a command whose leaf is not here.
-
-    Raises:
-        MissingDependencyError: Naming the extra that brings it.
-    """
+    """Refuse a command whose leaf is not here."""
     typed = " ".join(tokens[:2]) + " "
     for name, leaf in LEAVES.items():
         if any(typed.startswith(f"{command.name} ") for command in leaf.commands):

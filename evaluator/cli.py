@@ -68,7 +68,6 @@ def evaluate(
         latex: Write the headline tables as LaTeX, too.
         tables: How tables are read.
         images: Renders to compare, and backbones of LPIPS.
-        output: How to talk.
     """
     from evaluator.thresholds import parse_thresholds
 
@@ -207,7 +206,6 @@ def design(
         run: Folder of the study; made where it is not there.
         study: What is tried.
         wanted: What is expected, and what is to be shown.
-        output: How to talk.
     """
     from evaluator.design.plan import design as make
     from evaluator.design.plan import design_record, design_text, lock

@@ -30,8 +30,6 @@ def replay(
 
     Args:
         run: Run folder.
-        config: Settings.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.calibrate.physics.imported import replay_imported
@@ -59,8 +57,6 @@ def gate(
 
     Args:
         run: Run folder with the rebuilt scene.
-        config: Settings.
-        output: How to talk.
     """
     from twin.gate.service import run_gate
 
@@ -80,8 +76,6 @@ def rebuild(
 
     Args:
         run: Run folder.
-        config: Settings.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.scene.rebuild.record import describe_scene
@@ -106,8 +100,6 @@ def render(
 
     Args:
         run: Run folder.
-        config: Settings.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from twin.scene.render import describe_drawn
@@ -138,7 +130,6 @@ def robot_check(
     Args:
         robot: Robot file, or the name of one that ships with the package.
         urdf_out: Write the description that carries the record there, to be published.
-        output: How to talk.
     """
     from twin.robot.check import check_robot, describe_robot
 
@@ -163,8 +154,6 @@ def calibrate(
 
     Args:
         run: Run folder.
-        config: Settings.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError

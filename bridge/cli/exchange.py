@@ -106,7 +106,6 @@ def export_rosbag2(
     out: Path,
     /,
     *,
-    json_topics: Literal["leave-out", "string"] = "leave-out",
     force: bool = False,
     output: Output = OUTPUT,
 ) -> int:
@@ -118,7 +117,6 @@ def export_rosbag2(
     Args:
         episode: An episode file.
         out: The folder to make.
-        json_topics: Topics of JSON records: left out, or as std_msgs/String.
         force: Replace an earlier export.
     """
     from bridge.episode.reader import Episode
@@ -127,9 +125,7 @@ def export_rosbag2(
     opened = Episode.open(episode)
     total = sum(item.count for item in opened.topics().values())
     with output.progress("export", total) as advance:
-        report = export_bag(
-            opened, out, json_as_string=json_topics == "string", force=force, advance=advance
-        )
+        report = export_bag(opened, out, force=force, advance=advance)
     lines = [f"{out}: {report.messages} messages on {len(report.topics)} topics"]
     lines += [f"  left out: {topic} ({why})" for topic, why in report.left_out.items()]
     data = {"out": str(out), "topics": report.topics, "left_out": report.left_out}

@@ -115,7 +115,7 @@ def publish_episode(
     """Play an episode back: the same bytes in the same order, as far apart as they came.
 
     Example: robot-gst publish episode runs/monday/episodes/trial_0001.mcap --rate 2 --episode again
-    Under other names: robot-gst publish episode FILE --topics "lab/**" --remap /lab:=/twin
+    Some of it: robot-gst publish episode FILE --topics "lab/**"
 
     Args:
         file: A finished episode, or any other MCAP file.

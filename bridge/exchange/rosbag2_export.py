@@ -1,7 +1,7 @@
 """An episode as a rosbag2 folder, as ``ros2 bag`` and rosbags read it: MCAP and ``metadata.yaml``.
 
 rosbag2 knows CDR messages with a ROS 2 definition and nothing else. What is anything else is left
-out and listed; JSON records can become std_msgs/String instead.
+out and listed.
 """
 
 import json
@@ -13,7 +13,6 @@ from typing import Any
 from mcap import records
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.mcap.file import McapFile
 from bridge.episode.mcap.messages import Selection, merged
 from bridge.episode.provenance import software
@@ -45,7 +44,6 @@ class _Channel:
 
     topic: str
     record: schema.Schema
-    is_json: bool
     profile: str
     """Quality of service, in the file as in metadata.yaml: rosbags compares them."""
     count: int = 0
@@ -57,7 +55,6 @@ def export_bag(
     episode: Episode,
     out: Path,
     *,
-    json_as_string: bool = False,
     force: bool = False,
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> ExportReport:
@@ -71,7 +68,7 @@ def export_bag(
         (id(file), channel.id): found
         for file in episode.files
         for channel in file.summary.channels.values()
-        if (found := _channel(file, channel, json_as_string, report.left_out)) is not None
+        if (found := _channel(file, channel, report.left_out)) is not None
     }
     if not channels:
         listed = ", ".join(report.left_out) or "it has no topics"
@@ -90,7 +87,7 @@ def export_bag(
             folder,
             made_by="robot-gst export rosbag2",
             sources=list(episode.parts),
-            choices={"json_as_string": json_as_string, "left_out": report.left_out},
+            choices={"left_out": report.left_out},
         )
     return report
 
@@ -111,12 +108,9 @@ def _copy_messages(
         channel = channels.get((id(item.file), item.channel.id))
         if channel is None:  # of a topic that also has messages that can go
             continue
-        data = item.data
-        if channel.is_json:
-            data = string_to_cdr(data.decode(errors="replace"))
         writer.write_foreign(
             channel.topic,
-            data,
+            item.data,
             schema_record=channel.record,
             log_time_ns=item.log_time_ns,
             publish_time_ns=item.publish_time_ns,
@@ -132,22 +126,11 @@ def _copy_messages(
     return bag
 
 
-def _channel(
-    file: McapFile, channel: records.Channel, json_as_string: bool, left_out: dict[str, str]
-) -> _Channel | None:
+def _channel(file: McapFile, channel: records.Channel, left_out: dict[str, str]) -> _Channel | None:
     """What a channel is in the bag; None where it has no place in one, and why is noted."""
     if is_truth(channel.topic):
         return None
     record = file.schema_of(channel)
-    if channel.message_encoding == "json" and json_as_string:
-        known = schema.schema_for(schema.STRING)
-        return (
-            None
-            if known is None
-            else _Channel(
-                topic=channel.topic, record=known, is_json=True, profile=_profile(channel.topic)
-            )
-        )
     if channel.message_encoding != "cdr":
         left_out[channel.topic] = f"{channel.message_encoding or 'bytes'}, not ROS 2"
         return None
@@ -158,9 +141,7 @@ def _channel(
     made = schema.Schema(
         name=record.name, schema_encoding=record.encoding, message_encoding="cdr", data=record.data
     )
-    return _Channel(
-        topic=channel.topic, record=made, is_json=False, profile=_profile(channel.topic)
-    )
+    return _Channel(topic=channel.topic, record=made, profile=_profile(channel.topic))
 
 
 def _copy_attachments(episode: Episode, writer: EpisodeWriter) -> None:

@@ -5,14 +5,12 @@ SSIM has three customs at the border of an image; all three are here. Every numb
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8
-from numpy.lib.stride_tricks import as_strided
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import correlate1d
 
 from bridge.errors import BridgeError, UndefinedStatisticError
 
@@ -116,14 +114,6 @@ def check_same_shape(recorded: np.ndarray, replayed: np.ndarray) -> None:
         )
 
 
-# The sliding window as products with small matrices of weights, in float64: a band of rows times a
-# matrix that holds the window once for each row, one place further on, is the window slid down;
-# blocks of columns times its transpose slide it across. Half of these products are with zeros, and
-# BLAS is still much faster than sums of shifted rows. Bands are so small that they stay in the
-# cache and that BLAS starts no threads of its own. Windowed are u = a + b, v = a - b and their
-# squares, for SSIM needs no more: 2 mu_a mu_b is half of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of
-# mu_u^2 + mu_v^2, and so on for the variances.
-
 WINDOW = 11
 SIGMA = 1.5
 BORDER = WINDOW // 2
@@ -135,153 +125,32 @@ _WEIGHTS = _BELL / _BELL.sum()
 Padding = Literal["valid", "zero", "reflect"]
 """What a window sees beyond the border: it never reaches there, zeros, or the mirrored image."""
 
-_BLOCK = 16
-"""Window centres in a block, across and down. More means more products with zeros, fewer more
-calls."""
-_PART = 96
-"""Columns that slide down in one product."""
-_PLANES = 4
 
+def _map(
+    recorded: Float[np.ndarray, "height width channels"],
+    replayed: Float[np.ndarray, "height width channels"],
+    mode: Literal["constant", "mirror"],
+) -> Float[np.ndarray, "height width channels"]:
+    """SSIM around each pixel.
 
-@dataclass(frozen=True, kw_only=True)
-class Band:
-    """SSIM around some rows of window centres. The next band overwrites it."""
+    Windowed are u = a + b, v = a - b and their squares, for SSIM needs no more: 2 mu_a mu_b is half
+    of mu_u^2 - mu_v^2, mu_a^2 + mu_b^2 half of mu_u^2 + mu_v^2, and so on for the variances.
+    """
 
-    channel: int
-    rows: slice
-    similar: Float64[np.ndarray, "num_rows num_columns"]
+    def windowed(plane: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+        down = correlate1d(plane, _WEIGHTS, axis=0, mode=mode)
+        return np.asarray(correlate1d(down, _WEIGHTS, axis=1, mode=mode))
 
-
-class SlidWindow:
-    """Windows over two images of one size, at least as large as the window."""
-
-    def __init__(
-        self,
-        first: Float[np.ndarray, "height width channels"],
-        second: Float[np.ndarray, "height width channels"],
-        padding: Padding,
-    ) -> None:
-        """Look at both images, which stay as they are."""
-        self._images = first, second
-        self._mirrored = padding == "reflect"
-        self._room = 0 if padding == "valid" else BORDER
-        height, width, channels = first.shape
-        self.channels: int = channels
-        self.rows: int = height + 2 * self._room - 2 * BORDER
-        self.columns: int = width + 2 * self._room - 2 * BORDER
-        self._block = min(_BLOCK, self.columns)
-        self._num_blocks = -(-self.columns // self._block)
-        # Columns beyond the image fill up the last block and the last part.
-        needed = self._num_blocks * self._block + 2 * BORDER
-        self._width = -(-needed // _PART) * _PART
-        self._scratch: dict[int, _Scratch] = {}
-
-    @property
-    def size(self) -> int:
-        """Window centres in all channels."""
-        return self.rows * self.columns * self.channels
-
-    def bands(self) -> Iterator[Band]:
-        """Yield SSIM channel by channel, from top to bottom, in buffers that are used again."""
-        for channel in range(self.channels):
-            before: _Scratch | None = None
-            for start in range(0, self.rows, _BLOCK):
-                count = min(_BLOCK, self.rows - start)
-                here, known = self._scratch_of(count), 0
-                if before is not None:  # the rows that both bands see
-                    known = 2 * BORDER
-                    here.seen[:, :known] = before.seen[:, -known:]
-                self._look(here.seen[:, known:], channel, start + known - self._room)
-                self._slide(here)
-                yield self._compared(here.across, channel, slice(start, start + count))
-                before = here
-
-    def _scratch_of(self, count: int) -> "_Scratch":
-        if count not in self._scratch:
-            self._scratch[count] = _Scratch(
-                seen=np.zeros((_PLANES, count + 2 * BORDER, self._width)),
-                down=np.empty((_PLANES, count, self._width)),
-                across=np.empty((_PLANES, count, self._num_blocks * self._block)),
-            )
-        return self._scratch[count]
-
-    def _look(self, seen: np.ndarray, channel: int, first: int) -> None:
-        """Fill in rows of the images from ``first`` on, with what lies beyond the border."""
-        a, b = (image[..., channel] for image in self._images)
-        height, width = a.shape
-        last = first + seen.shape[1]
-        start = min(max(first, 0), height)
-        inside = slice(start, max(start, min(last, height)))  # empty: a band below the image
-        columns = slice(self._room, None)
-        for plane, combine in ((0, np.add), (1, np.subtract)):
-            into = seen[plane, :, columns][:, :width]
-            if inside.stop > inside.start:
-                combine(a[inside], b[inside], out=into[inside.start - first : inside.stop - first])
-            for row in (*range(first, 0), *range(max(height, first), last)):
-                beyond = -row if row < 0 else 2 * height - 2 - row
-                into[row - first] = combine(a[beyond], b[beyond]) if self._mirrored else 0.0
-        if self._mirrored:
-            end = BORDER + width
-            seen[:2, :, :BORDER] = seen[:2, :, 2 * BORDER : BORDER : -1]
-            seen[:2, :, end : end + BORDER] = seen[:2, :, end - 2 : end - 2 - BORDER : -1]
-        np.multiply(seen[:2], seen[:2], out=seen[2:])
-
-    def _slide(self, here: "_Scratch") -> None:
-        _, count, width = here.down.shape
-        parts = width // _PART
-        np.matmul(
-            _weights(count),
-            here.seen.reshape(_PLANES, -1, parts, _PART).swapaxes(1, 2),
-            out=here.down.reshape(_PLANES, count, parts, _PART).swapaxes(1, 2),
-        )
-        item = here.down.itemsize
-        pieces = as_strided(
-            here.down,
-            shape=(self._num_blocks, _PLANES * count, self._block + 2 * BORDER),
-            strides=(self._block * item, width * item, item),
-            writeable=False,
-        )
-        slid = here.across.reshape(_PLANES * count, self._num_blocks, self._block)
-        np.matmul(pieces, _weights_across(self._block), out=slid.swapaxes(0, 1))
-
-    def _compared(self, windowed: np.ndarray, channel: int, rows: slice) -> Band:
-        mean_u, mean_v, power_u, power_v = windowed
-        np.square(windowed[:2], out=windowed[:2])
-        power_u -= mean_u
-        power_v -= mean_v
-        power_u += 2 * C2
-        structure = np.subtract(power_u, power_v)
-        power_u += power_v
-        structure /= power_u
-        mean_u += 2 * C1
-        similar = np.subtract(mean_u, mean_v, out=power_v)
-        mean_u += mean_v
-        similar /= mean_u
-        similar *= structure
-        return Band(channel=channel, rows=rows, similar=similar[:, : self.columns])
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Scratch:
-    """Where one band is worked on: u, v and their squares."""
-
-    seen: Float64[np.ndarray, "4 num_seen width"]
-    down: Float64[np.ndarray, "4 num_rows width"]
-    across: Float64[np.ndarray, "4 num_rows columns"]
-
-
-@cache
-def _weights(count: int) -> Float64[np.ndarray, "count seen"]:
-    """Hold the window once in each row, one column further on."""
-    weights = np.zeros((count, count + 2 * BORDER))
-    for row in range(count):
-        weights[row, row : row + WINDOW] = _WEIGHTS
-    return weights
-
-
-@cache
-def _weights_across(count: int) -> Float64[np.ndarray, "seen count"]:
-    return np.ascontiguousarray(_weights(count).T)  # BLAS is twice as fast than on a transpose
+    channels = []
+    for a, b in zip(np.moveaxis(recorded, -1, 0), np.moveaxis(replayed, -1, 0), strict=True):
+        u, v = a + b, a - b
+        with np.errstate(invalid="ignore"):  # images need not be finite
+            bright_u, bright_v = windowed(u) ** 2, windowed(v) ** 2
+            spread_u, spread_v = windowed(u * u) - bright_u, windowed(v * v) - bright_v
+            structure = (spread_u - spread_v + 2 * C2) / (spread_u + spread_v + 2 * C2)
+            bright = (bright_u - bright_v + 2 * C1) / (bright_u + bright_v + 2 * C1)
+        channels.append(bright * structure)
+    return np.stack(channels, axis=-1)
 
 
 PADDINGS: dict[Padding, str] = {
@@ -329,41 +198,16 @@ def ssim_maps(
     """Compute SSIM (Wang et al. 2004) around every pixel, for all paddings at once.
 
     Gaussian window of 11 x 11 pixels with sigma 1.5, C1 1e-4, C2 9e-4 for images in 0..1,
-    population covariance, each channel alone. Mirrored borders differ from zeros only within half
-    a window of the border, so only these strips are computed twice.
+    population covariance, each channel alone.
 
     Args:
         recorded: In 0..1.
         replayed: In 0..1.
     """
     _refuse_small(recorded, replayed)
-    zero = _maps(recorded, replayed, "zero")
-    return SsimMaps(zero=zero, reflect=_with_mirrored_border(zero, recorded, replayed))
-
-
-def ssim(
-    recorded: Float[np.ndarray, "height width channels"],
-    replayed: Float[np.ndarray, "replayed_height replayed_width channels"],
-    *,
-    mask: Bool[np.ndarray, "height width"] | None = None,
-    padding: Padding = "valid",
-) -> float:
-    """Return the mean structural similarity of two images in 0..1 (see ``ssim_maps``).
-
-    With a mask, the mean runs over window centres inside it; windows may reach over its edge.
-
-    Range: -1 to 1, 1 is identical. Undefined when: the image is smaller than the window.
-
-    Args:
-        recorded: In 0..1.
-        replayed: In 0..1.
-        mask: Pixels whose windows count; None: all.
-    """
-    _refuse_small(recorded, replayed)
-    if mask is not None:
-        return ssim_maps(recorded, replayed).mean(padding, mask=mask)
-    window = SlidWindow(recorded, replayed, padding)
-    return math.fsum(float(band.similar.sum()) for band in window.bands()) / window.size
+    return SsimMaps(
+        zero=_map(recorded, replayed, "constant"), reflect=_map(recorded, replayed, "mirror")
+    )
 
 
 def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
@@ -373,30 +217,3 @@ def _refuse_small(recorded: np.ndarray, replayed: np.ndarray) -> None:
             statistic="SSIM",
             reason=f"the image is smaller than the {WINDOW} x {WINDOW} window",
         )
-
-
-def _maps(recorded: np.ndarray, replayed: np.ndarray, padding: Padding) -> np.ndarray:
-    """Return SSIM around every window centre."""
-    window = SlidWindow(recorded, replayed, padding)
-    similar = np.empty((window.channels, window.rows, window.columns))
-    for band in window.bands():
-        similar[band.channel, band.rows] = band.similar
-    return np.asarray(np.moveaxis(similar, 0, -1))
-
-
-def _with_mirrored_border(
-    zero: np.ndarray, recorded: np.ndarray, replayed: np.ndarray
-) -> np.ndarray:
-    """Compute the windows that reach over the border again; the others see the same."""
-    reflect = zero.copy(order="K")
-    both, before, after = (BORDER, BORDER), (BORDER, 0), (0, BORDER)
-    near, far, whole = slice(None, 2 * BORDER), slice(-2 * BORDER, None), slice(None)
-    for seen, beyond, rows, columns in (
-        ((near, whole), (before, both), slice(None, BORDER), whole),
-        ((far, whole), (after, both), slice(-BORDER, None), whole),
-        ((whole, near), (both, before), whole, slice(None, BORDER)),
-        ((whole, far), (both, after), whole, slice(-BORDER, None)),
-    ):
-        a, b = (np.pad(i[seen], (*beyond, (0, 0)), mode="reflect") for i in (recorded, replayed))
-        reflect[rows, columns] = _maps(a, b, "valid")
-    return reflect

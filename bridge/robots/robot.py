@@ -267,11 +267,7 @@ _ODD = (msgspec.ValidationError, AttributeError, TypeError, ValueError)
 
 
 def read_robot(name: str) -> Robot:
-    """Read a robot file by its name in ``datasets/robots``, or by its path.
-
-    Raises:
-        UsageError: No such robot, or a file that does not describe one.
-    """
+    """Read a robot file by its name in ``datasets/robots``, or by its path."""
     path = dataset_file("robots", name)
     try:
         table = tomllib.loads(path.read_text())

@@ -94,48 +94,18 @@ def _numbers(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any
 
 
 def _sentence(error: "ValidationError") -> str:
-    """One finding of jsonschema, in the words of a task file."""
-    place, value, wanted = _place(error.absolute_path), error.instance, error.validator_value
+    """One finding of jsonschema, with the names that are known where one is not."""
+    place, value = _place(error.absolute_path), error.instance
     match error.validator:
         case "additionalProperties":
             known = error.schema["properties"]
             wrong = [key for key in value if key not in known]
             said = "; ".join(f"unknown key {key!r}.{nearest(key, known)}" for key in wrong)
             return f"{place}: {said} Allowed: {_names(known)}."
-        case "required":
-            missing = error.message.partition(" is a required")[0].strip("'")
-            return f"{place}: {missing} is missing"
         case "enum":
-            return f"{place}: {value!r} is unknown. Known: {_names(wanted)}.{_near(value, wanted)}"
-        case "minItems" | "maxItems":
-            least, most = error.schema.get("minItems", 0), error.schema.get("maxItems")
-            many = f"{least}" if least == most else f"at least {least}"
-            return f"{place}: has {len(value)} values; it must have {many}"
-        case "minimum" | "maximum" | "exclusiveMinimum" | "exclusiveMaximum":
-            word = {
-                "minimum": "at least",
-                "maximum": "at most",
-                "exclusiveMinimum": "above",
-                "exclusiveMaximum": "below",
-            }[error.validator]
-            return f"{place}: {value} makes no sense; it must be {word} {wanted:g}"
-        case "type":
-            return f"{place}: {value!r:.60} should be a TOML {_TOML[wanted]}"
-        case "pattern":
-            return f"{place}: {value!r:.60} may hold letters, digits, '_' and '-' only, at most 80"
-        case "minLength":
-            return f"{place}: is empty"
+            known = error.validator_value
+            return f"{place}: {value!r} is unknown. Known: {_names(known)}.{_near(value, known)}"
     return f"{place}: {error.message:.200}"
-
-
-_TOML = {
-    "object": "table",
-    "array": "list",
-    "string": "text in quotes",
-    "number": "number",
-    "integer": "whole number",
-    "boolean": "true or false",
-}
 
 
 def _near(value: Any, known: Iterable[str]) -> str:

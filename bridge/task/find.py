@@ -77,11 +77,7 @@ def find_task_file(
 
 
 def chosen_task_file(name: str, *, tasks_dir: Path | None = None) -> TaskFile:
-    """Return the task file a person names: by its path, else by its name.
-
-    Raises:
-        UsageError: When the file cannot be read, or there is none of that name.
-    """
+    """Return the task file a person names: by its path, else by its name."""
     if name.endswith(".toml"):
         return TaskFile.read(Path(name))
     return find_task_file(name, tasks_dir=tasks_dir)

@@ -5,7 +5,7 @@ Errata resolution 9 and 10: the predicate reads the settled final state x_{T+1};
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -114,21 +114,20 @@ def already_true_at_start(task: Task, rollout: Rollout) -> bool:
 
 
 def _evaluate(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
-    rule = _RULES.get(spec["kind"])
+    kind = spec["kind"]
+    rule = _RULES.get(kind)
     if rule is None:
-        message = f"success predicate {spec['kind']!r} is unknown. Known: {', '.join(_RULES)}."
-        raise UsageError(message)
-    object_id = str(spec.get("object", ""))
-    asked = [] if spec["kind"] == ALLOWED_CONTACTS else bodies_of(spec)
+        raise UsageError(f"success predicate {kind!r} is unknown. Known: {', '.join(_RULES)}.")
+    asked = [] if kind == ALLOWED_CONTACTS else bodies_of(spec)
     lost = [key for key in asked if key not in rollout.Ts_base_object]
-    if lost:
-        return PredicateResult(
-            kind=spec["kind"],
-            value=None,
-            detail=f"{lost[0]} was not localised",
-            object_id=object_id,
-        )
-    return replace(rule(spec, task, rollout), object_id=object_id)
+    value, detail = (None, f"{lost[0]} was not localised") if lost else rule(spec, task, rollout)
+    return PredicateResult(
+        kind=kind, value=value, detail=detail, object_id=str(spec.get("object", ""))
+    )
+
+
+Found = tuple[bool | None, str]
+"""Whether a predicate holds, None where nobody can tell, and what was found."""
 
 
 def bodies_of(spec: Mapping[str, Any]) -> list[str]:
@@ -136,16 +135,15 @@ def bodies_of(spec: Mapping[str, Any]) -> list[str]:
     return [spec[key] for key in REFERENCES if key in spec and spec[key] != TABLE]
 
 
-def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _inside(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     container_id = spec["container"]
     container = task.objects[container_id]
     T_container_base = se3.invert(rollout.Ts_base_object[container_id][-1])
     p = se3.apply(T_container_base, rollout.Ts_base_object[spec["object"]][-1][:3, 3])
     excess = _cavity_excess_m(container, p, float(spec.get("margin_m", 0.0)))
-    detail = f"{spec['object']} centre is {abs(excess) * 1e3:.0f} mm " + (
-        f"outside {container_id}" if excess > 0 else f"within {container_id}"
-    )
-    return PredicateResult(kind="inside", value=bool(excess <= 0), detail=detail)
+    side = "outside" if excess > 0 else "within"
+    detail = f"{spec['object']} centre is {abs(excess) * 1e3:.0f} mm {side} {container_id}"
+    return bool(excess <= 0), detail
 
 
 def _cavity_excess_m(
@@ -157,15 +155,14 @@ def _cavity_excess_m(
     return float(np.max(np.abs(p_container - centre) - inner / 2 + margin_m))
 
 
-def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _relation(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     """Whether objects stand to each other as asked, between the boxes around them at the end."""
     boxes = {key: _box_of(key, task, rollout) for key in bodies_of(spec)}
     for key, box in boxes.items():
         if not (np.isfinite(box.T_base_box).all() and np.isfinite(box.half_m).all()):
-            detail = f"the pose of {key} is not a number"
-            return PredicateResult(kind=spec["kind"], value=None, detail=detail)
+            return None, f"the pose of {key} is not a number"
     value, detail = RELATIONS[spec["kind"]](spec, boxes)
-    return PredicateResult(kind=spec["kind"], value=bool(value), detail=detail)
+    return bool(value), detail
 
 
 def _box_of(object_id: str, task: Task, rollout: Rollout) -> Box:
@@ -183,7 +180,7 @@ MOVED_TOLERANCE_M = 0.02
 """Of where an object ends that is to move ``by_m``, where a task says nothing else [m]."""
 
 
-def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     """Whether an object is where it should be compared with its own start.
 
     The way from the first state to the last one is measured straight, or, with ``direction`` (in
@@ -196,12 +193,10 @@ def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateRe
     object_id = spec["object"]
     first, last = rollout.Ts_base_object[object_id][[0, -1], :3, 3]
     if not np.isfinite(first).all():
-        detail = f"{object_id} was not localised before"
-        return PredicateResult(kind="moved", value=None, detail=detail)
+        return None, f"{object_id} was not localised before"
     way = last - first
     if not np.isfinite(last).all():
-        detail = f"{object_id} was not localised at the end"
-        return PredicateResult(kind="moved", value=None, detail=detail)
+        return None, f"{object_id} was not localised at the end"
     direction = direction_of(spec["direction"]) if "direction" in spec else None
     length_m = float(np.linalg.norm(way) if direction is None else way @ direction)
     value = spec.get("at_least_m", -np.inf) <= length_m <= spec.get("at_most_m", np.inf)
@@ -215,66 +210,51 @@ def _moved(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateRe
         off_m = float(np.linalg.norm(last[: len(target)] - target))
         value = value and off_m <= spec["tolerance_m"]
         detail += f" and is {off_m * 1e3:.0f} mm from its target"
-    return PredicateResult(kind="moved", value=bool(value), detail=detail)
+    return bool(value), detail
 
 
-def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _settled(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     held_ns = round(spec["for_s"] * 1e9)
     stamps = rollout.stamps_ns
     tail = stamps >= stamps[-1] - held_ns
     if tail.sum() < 2 or stamps[-1] - stamps[0] < held_ns:
-        return PredicateResult(kind="settled", value=None, detail="too short to tell")
+        return None, "too short to tell"
     p = rollout.Ts_base_object[spec["object"]][tail][:, :3, 3]
     seconds = np.diff(stamps[tail]) * 1e-9
     speed = float(np.max(np.linalg.norm(np.diff(p, axis=0), axis=1) / seconds))
-    return PredicateResult(
-        kind="settled",
-        value=bool(speed <= spec["max_speed_m_s"]),
-        detail=f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s "
-        f"in the last {spec['for_s']} s",
-    )
+    detail = f"{spec['object']} moves at up to {speed * 1e3:.0f} mm/s in the last {spec['for_s']} s"
+    return bool(speed <= spec["max_speed_m_s"]), detail
 
 
-def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _no_finger_contact(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     contact = rollout.finger_contact.get(spec["object"])
     if contact is None:
-        return PredicateResult(
-            kind="no_finger_contact", value=None, detail="finger contact is not known"
-        )
+        return None, "finger contact is not known"
     touching = bool(contact[-1])
-    detail = f"a finger {'touches' if touching else 'does not touch'} {spec['object']} at the end"
-    return PredicateResult(kind="no_finger_contact", value=not touching, detail=detail)
+    verb = "touches" if touching else "does not touch"
+    return not touching, f"a finger {verb} {spec['object']} at the end"
 
 
-def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
+def _shape(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     object_id = spec["object"]
     model = task.objects[object_id]
     if model.soft is None:
-        return PredicateResult(kind="shape", value=True, detail=f"{object_id} is rigid")
+        return True, f"{object_id} is rigid"
     if object_id in rollout.broken:
-        return PredicateResult(
-            kind="shape", value=False, detail=f"{object_id} {rollout.broken[object_id]}"
-        )
+        return False, f"{object_id} {rollout.broken[object_id]}"
     extents = rollout.extents_m.get(object_id)
     if extents is None:
-        return PredicateResult(
-            kind="shape", value=None, detail=f"the shape of {object_id} is not known"
-        )
+        return None, f"the shape of {object_id} is not known"
     change = float(np.max(np.abs(extents[-1] / np.array(model.size_m) - 1.0)))
     if not np.isfinite(change):
-        detail = f"the extents of {object_id} are no numbers"
-        return PredicateResult(kind="shape", value=False, detail=detail)
-    return PredicateResult(
-        kind="shape",
-        value=bool(change <= spec["tolerance_fraction"]),
-        detail=f"an extent of {object_id} differs by {change:.0%} from rest",
-    )
+        return False, f"the extents of {object_id} are no numbers"
+    detail = f"an extent of {object_id} differs by {change:.0%} from rest"
+    return bool(change <= spec["tolerance_fraction"]), detail
 
 
-def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> PredicateResult:
-    kind = ALLOWED_CONTACTS
+def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> Found:
     if rollout.contacts is None:
-        return PredicateResult(kind=kind, value=None, detail="contacts are not known")
+        return None, "contacts are not known"
     said = "inferred: " if rollout.contacts_inferred else ""
     only, deepest = spec.get("object"), -float(spec.get("tolerance_m", 0.0))
     wrong = [
@@ -285,14 +265,13 @@ def _allowed_contacts(spec: Mapping[str, Any], task: Task, rollout: Rollout) -> 
         and (only is None or only in contact.bodies)
     ]
     if not wrong:
-        detail = f"{said}nothing touched what it may not touch"
-        return PredicateResult(kind=kind, value=True, detail=detail)
+        return True, f"{said}nothing touched what it may not touch"
     first = min(wrong, key=lambda contact: contact.start_ns)
     detail = (
         f"{said}{first.bodies[0]} touched {first.bodies[1]} at {first.start_ns * 1e-9:.2f} s, "
         f"{-first.min_distance_m * 1e3:.1f} mm deep"
     )
-    return PredicateResult(kind=kind, value=False, detail=detail)
+    return False, detail
 
 
 def objects_done(
@@ -305,7 +284,7 @@ def objects_done(
     }
 
 
-_RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], PredicateResult]] = {
+_RULES: dict[str, Callable[[Mapping[str, Any], Task, Rollout], Found]] = {
     "inside": _inside,
     "moved": _moved,
     **dict.fromkeys(RELATIONS, _relation),

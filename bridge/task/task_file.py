@@ -207,11 +207,7 @@ class TaskFile:
 
 
 def load_task(name: str) -> Task:
-    """Load ``datasets/tasks/<name>.toml`` or a TOML file by path.
-
-    Raises:
-        UsageError: Unknown name (lists those that exist), or a file that is no task.
-    """
+    """Load ``datasets/tasks/<name>.toml`` or a TOML file by path."""
     return TaskFile.read(dataset_file("tasks", name)).task()
 
 

@@ -28,9 +28,6 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
 
     Args:
         type_hash: The definition must have this RIHS01 hash; "" takes the newest.
-
-    Raises:
-        UsageError: When a file in the folder is not a message definition.
     """
     text = _definition(type_name, type_hash, folder)
     if text is None:
@@ -46,9 +43,6 @@ def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
 
     Args:
         folder: Message definitions of the user's own, looked at as well; None for none.
-
-    Raises:
-        UsageError: When a file in the folder is not a message definition.
     """
     return next(_hashes(type_name, folder), (None, None))[0]
 

@@ -22,7 +22,7 @@ from bridge.robots.robot import robot_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.hand_eye import TargetCamera, find_camera
-from twin.calibrate.pairs import PosePairs, read_pairs, recorded_pairs, target_cameras
+from twin.calibrate.pairs import PosePairs, recorded_pairs, target_cameras
 from twin.robot.model import load_robot
 from twin.robot.posture import Posture, PostureTrack, distinct_postures, posture_track
 from twin.scene.align.align import AlignConfig, Alignment, RobotNotAlignedError, align_robot
@@ -194,15 +194,10 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
     still, from the robot in its depth images.
 
     Args:
-        config: Which camera (empty: all), which pose pairs and mounting.
-
-    Raises:
-        NothingToCalibrateError: No camera could be found for want of data; says what is missing.
-        UndeterminedCameraError: The one camera that was asked for is not determined.
-        RobotNotAlignedError: The same, from the robot it sees.
+        config: Which camera (empty: all), and mounting.
     """
     episodes = _readable(run, output)
-    where = {} if config.pairs is not None else placement(episodes)
+    where = placement(episodes)
     base = _base_frame(episodes)
     found: dict[str, Any] = {}
     reasons: dict[str, str] = {}
@@ -240,9 +235,6 @@ def _base_frame(episodes: Sequence[Episode]) -> str:
 def _wanted(
     episodes: Sequence[Episode], where: Mapping[str, str], config: CalibrateConfig
 ) -> list[str]:
-    if config.pairs is not None and not config.camera:
-        message = "--pairs needs --camera: which camera do the pose pairs belong to?"
-        raise UsageError(message)
     if config.camera:
         return [config.camera]
     return sorted({*where, *target_cameras(episodes)})
@@ -251,22 +243,19 @@ def _wanted(
 def _camera(
     episodes: Sequence[Episode], camera_id: str, where: str, config: CalibrateConfig, base: str
 ) -> dict[str, Any]:
-    if config.pairs is not None:
-        return _from_target(read_pairs(config.pairs), config, base)
     if camera_id in target_cameras(episodes):
         return _from_target(recorded_pairs(episodes, camera_id, config.link), config, base)
     topic = f"...{CAMERAS}{camera_id}{TARGET_POSE}"
     if where == NO_DEPTH:
         message = (
             f"camera {camera_id} has neither target poses (topic {topic}) "
-            "nor depth images with intrinsics. Record one of them, or give --pairs FILE."
+            "nor depth images with intrinsics. Record one of them."
         )
         raise NothingToCalibrateError(message)
     if where == MOVING:
         message = (
             f"camera {camera_id} moves with the robot and there are no target poses of it. Record "
-            f"a target from 10 to 20 places on {topic}, or give --pairs "
-            "FILE."
+            f"a target from 10 to 20 places on {topic}."
         )
         raise NothingToCalibrateError(message)
     with_depth = [episode for episode in episodes if camera_id in depth_cameras(episode)]
@@ -330,7 +319,7 @@ def _nothing(run: RunFolder, reasons: Mapping[str, str]) -> str:
     if not reasons:
         return (
             f"no episode in {run.episodes_dir} has target poses or depth images of a camera. "
-            "Record one of them, or give --pairs FILE --camera ID."
+            "Record one of them."
         )
     listed = " ".join(f"{key}: {reason}" for key, reason in sorted(reasons.items()))
     return f"no camera could be calibrated. {listed}"

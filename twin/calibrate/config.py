@@ -1,7 +1,6 @@
 """Settings of ``calibrate``; imports nothing heavy, so that --help is quick."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from cyclopts import Parameter
@@ -26,10 +25,8 @@ class CalibrateConfig:
     written to RUN/scene/calibration.json; samples of replays and of the gate then draw from it."""
     draws: int = 64
     """With --posterior: draws from the priors, each replayed through every trial."""
-    pairs: Path | None = None
-    """JSON file of pose pairs (T_base_effector, T_camera_target), for --camera."""
     camera: str = ""
-    """Only this camera; with --pairs, the one the pairs belong to."""
+    """Only this camera."""
     mount: Mount = "auto"
     """Where the camera of a target sits: in the hand, or fixed with the target in the hand; auto:
     whichever explains the pairs."""
@@ -43,11 +40,4 @@ class CalibrateConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers with which nothing can be found."""
-        refuse_outside(
-            self,
-            {
-                "seed": (0, 2**31),
-                "workers": (1, 1024),
-                "draws": (2, 100_000),
-            },
-        )
+        refuse_outside(self, {"seed": (0, 2**31), "workers": (1, 1024), "draws": (2, 100_000)})

@@ -162,11 +162,7 @@ def solve(
 
 
 def check_motions(Ts_a: Float[np.ndarray, "num_pairs 4 4"]) -> float:
-    """Return the root mean square turn about the second axis of all motions [rad].
-
-    Raises:
-        UndeterminedCameraError: Too few poses, or rotations about one axis only.
-    """
+    """Return the root mean square turn about the second axis of all motions [rad]."""
     if len(Ts_a) < MIN_PAIRS:
         message = (
             f"{len(Ts_a)} pair(s) of poses do not determine a camera; at least {MIN_PAIRS} are "

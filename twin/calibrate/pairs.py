@@ -1,14 +1,11 @@
-"""Pose pairs of a hand-eye calibration: from a JSON file, or from recorded episodes.
+"""Pose pairs of a hand-eye calibration, from recorded episodes.
 
 An episode holds the target's pose in the camera on ``/<cell>/cam/<id>/target/pose``
 (geometry_msgs/PoseStamped); the robot's side comes from its joints at the same instant.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +14,6 @@ from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
 from bridge.episode.reader import Episode
 from bridge.episode.topics import CAMERAS, TARGET_POSE
-from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry import se3
 from twin.robot.model import load_robot
 from twin.robot.posture import PostureTrack, posture_track
@@ -33,48 +29,11 @@ class PosePairs:
     Ts_base_effector: Float[np.ndarray, "num_pairs 4 4"]
     Ts_camera_target: Float[np.ndarray, "num_pairs 4 4"]
     source: str
-    """File name or episode ids."""
+    """Episode ids."""
 
     def __len__(self) -> int:
         """Return the number of pairs."""
         return len(self.Ts_base_effector)
-
-
-def read_pairs(path: Path) -> PosePairs:
-    """Read pairs from JSON, ``[[T_base_effector, T_camera_target], ...]`` as 4x4 rows [m]."""
-    if not path.is_file():
-        raise PathNotFoundError(path=path, what="file of pose pairs", hint="Check the path.")
-    try:
-        poses = np.array(_json_rows(path), dtype=np.float64).reshape(-1, 2, 4, 4)
-    except (ValueError, KeyError, TypeError) as error:
-        message = (
-            f"{path} holds no pose pairs ({error!r}). Write JSON [[T_base_effector, "
-            f"T_camera_target], ...] with 4x4 matrices."
-        )
-        raise UsageError(message) from error
-    _refuse_no_poses(path, poses)
-    return PosePairs(Ts_base_effector=poses[:, 0], Ts_camera_target=poses[:, 1], source=path.name)
-
-
-def _json_rows(path: Path) -> list[Any]:
-    rows = json.loads(path.read_text())
-    if not isinstance(rows, list):
-        message = f"a {type(rows).__name__}, not a list"
-        raise TypeError(message)
-    return rows
-
-
-def _refuse_no_poses(path: Path, poses: np.ndarray) -> None:
-    finite = np.isfinite(poses).all(axis=(-1, -2))
-    R = np.where(finite[..., None, None], poses, 0.0)[..., :3, :3]
-    square = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    whole = finite & (square < 1e-3) & (np.linalg.det(R) > 0)
-    whole &= (poses[..., 3, :] == [0, 0, 0, 1]).all(axis=-1)
-    if not whole.all():
-        pair, which = np.argwhere(~whole)[0]
-        name = ("T_base_effector", "T_camera_target")[which]
-        message = f"{path}: {name} of pair {pair + 1} is no rigid transform. Correct or remove it."
-        raise UsageError(message)
 
 
 def target_cameras(episodes: Sequence[Episode]) -> list[str]:

@@ -182,10 +182,6 @@ class JudgedTasks:
         Args:
             name: Of the task; "" for the gate's only one.
             sha256: Of its file; "" where the asker does not know, which the only one forgives.
-
-        Raises:
-            UndecidedError: When it is not one that this gate judges.
-            MissingTaskError: When there is no such file.
         """
         if self.only is None:
             if not name or not sha256:
@@ -267,12 +263,7 @@ class Gate:
         """The frames that were looked at last, for which task, and what was found in them."""
 
     def judge(self, payload: bytes) -> Verdict:
-        """Judge one plan; the wall-clock limit counts from here, reading it included.
-
-        Raises:
-            InvalidRecordError: When the payload is no gst plan.
-            PlanTooLargeError: When it is too large to be looked at; nothing else is an error.
-        """
+        """Judge one plan; the wall-clock limit counts from here, reading it included."""
         ends_s = time.monotonic() + self._config.deadline_s
         arrived_ns = self._now_ns()
         if len(payload) > MAX_PLAN_BYTES:
@@ -376,9 +367,6 @@ class Gate:
         Args:
             arrived_ns: When the plan came, on the receiver's clock.
             robot: Whose joints they must be.
-
-        Raises:
-            UndecidedError: When they are not known, or not of now.
         """
         heard = self._perception.joints()
         topic = cell_topic(self._config.cell, JOINT_STATES)
@@ -518,11 +506,7 @@ class Gate:
             raise UndecidedError(f"moved while the plan was being judged: {'; '.join(moved)}")
 
     def _feel_again(self, start_rad: Joints, robot: Robot) -> None:
-        """Before a yes: the arm must still be where the plan was judged from.
-
-        Raises:
-            UndecidedError: When it is not, or nobody says so.
-        """
+        """Before a yes: the arm must still be where the plan was judged from."""
         arrived_ns = self._contact_ns  # a cell that waits may be silent meanwhile
         off_rad = np.abs(self._where_the_arm_is(arrived_ns, robot) - start_rad)
         joint = int(np.argmax(off_rad))

@@ -157,9 +157,6 @@ def claim_gate(session: Any, cell: str) -> None:
 
     Args:
         session: An open ``bridge.wire.session``; the claim lasts as long as it.
-
-    Raises:
-        GateError: When there is one already.
     """
     key = f"{cell}/gate/alive"
     if session.query_alive(key):

@@ -241,9 +241,6 @@ class TwinProcess:
         Args:
             frames: What the cameras saw at rest, as ``LiveView.frames`` gives them.
             ends_s: When to be done, on the monotonic clock.
-
-        Raises:
-            UndecidedError: When there is no answer in time, or none at all.
         """
         item = Look(run_path=self._run_path, frames=frames, task=task)
         found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
@@ -263,10 +260,6 @@ class TwinProcess:
         Args:
             found: The task's objects as localised, by name.
             ends_s: When to be done, on the monotonic clock.
-
-        Raises:
-            UndecidedError: When there is no answer in time, or none at all.
-            UsageError: When this replay cannot move the task's soft objects.
         """
         self._config.refuse_soft(task.soft_objects)
         question = Question(

@@ -18,11 +18,7 @@ RIGID_ONLY = (
 
 
 def require_engine(engine: Engine) -> None:
-    """Refuse an engine that is not installed.
-
-    Raises:
-        MissingDependencyError: Naming the extra that installs it.
-    """
+    """Refuse an engine that is not installed."""
     if engine == "mujoco" and util.find_spec(engine) is None:
         raise MissingDependencyError(package=engine, extra=engine, purpose=f"--engine {engine}")
 

@@ -56,11 +56,7 @@ _HULLS_AND_FIXED_LINKS = {
 
 @lru_cache(maxsize=4)
 def _robot_spec(urdf: str, hulls: tuple[tuple[str, tuple[bytes, ...]], ...]) -> Any:
-    """The robot as MuJoCo reads the description that PyBullet gets too; copy it before use.
-
-    Raises:
-        PhysicsError: When MuJoCo does not load it.
-    """
+    """The robot as MuJoCo reads the description that PyBullet gets too; copy it before use."""
     points = {link: [np.frombuffer(raw).reshape(-1, 3) for raw in raws] for link, raws in hulls}
     with tempfile.TemporaryDirectory(prefix="robot-gst-physics-") as folder:
         root = ET.fromstring(write_description(urdf, points, Path(folder)).read_text())
@@ -82,11 +78,7 @@ class MujocoArm:
     """The robot of one world."""
 
     def __init__(self, spec: Any, record: Robot, config: PhysicsConfig) -> None:
-        """Give the joints motors.
-
-        Raises:
-            PhysicsError: When joints or links are missing.
-        """
+        """Give the joints motors."""
         _check_names(spec, record)
         self._record, self._config = record, config
         self._drives = record.gripper.fingers
@@ -246,11 +238,7 @@ class MujocoWorld:
     """One simulated cell. A context manager, as every world; there is nothing to free."""
 
     def __init__(self, urdf: str, mesh_hulls_m: Hulls, config: PhysicsConfig) -> None:
-        """Load the robot with its base at the origin.
-
-        Raises:
-            PhysicsError: When MuJoCo does not load the description or joints are missing.
-        """
+        """Load the robot with its base at the origin."""
         self.config = config
         hulls = tuple(
             (link, tuple(np.asarray(points, dtype=np.float64).tobytes() for points in several))
@@ -276,11 +264,7 @@ class MujocoWorld:
         self._compile()
 
     def soft_bodies(self) -> SoftBodies:
-        """Soft bodies, which this engine does not replay.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Soft bodies, which this engine does not replay."""
         raise UsageError(RIGID_ONLY)
 
     def _add_robot_shapes(self) -> None:

@@ -299,11 +299,7 @@ class World:
         return float(np.linalg.norm(total))
 
     def soft_bodies(self) -> SoftBodies:
-        """What is soft in this world; asking the first time begins it.
-
-        Raises:
-            MissingDependencyError: Without the leaf ``soft``.
-        """
+        """What is soft in this world; asking the first time begins it."""
         if self._soft is None:
             begin = load_leaf("soft", "world")
             soft: SoftBodies = begin(self._client, self.robot, *self._description, self.config)

@@ -36,7 +36,6 @@ def plan(
         live: Answer a cell's requests.
         words: How an instruction is planned.
         config: Settings of --live; its robot counts without it too.
-        output: How to talk.
     """
     from bridge.episode.run_folder import RunFolder
     from bridge.errors import UsageError

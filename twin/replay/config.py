@@ -149,12 +149,7 @@ class ReplayConfig:
     """Nominal physics."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers beyond which no comparison would fail, rates and engines that do not fit.
-
-        Raises:
-            UsageError: Saying what does not fit.
-            MissingDependencyError: When an engine is not installed.
-        """
+        """Refuse numbers beyond which no comparison fails; rates and engines that do not fit."""
         second = (0, 60)
         refuse_outside(
             self,
@@ -179,11 +174,7 @@ class ReplayConfig:
         return ENGINES if self.engine == "both" else (self.engine,)
 
     def refuse_soft(self, soft_objects: Sequence[str]) -> None:
-        """Refuse soft objects in an engine that has none.
-
-        Raises:
-            UsageError: Naming them, and the engine that has them.
-        """
+        """Refuse soft objects in an engine that has none."""
         if soft_objects and self.mode == "dynamic" and "mujoco" in self.engines():
             raise UsageError(f"{', '.join(soft_objects)} cannot be replayed: {RIGID_ONLY}")
 

@@ -294,9 +294,6 @@ def free_start(scene: ReplayScene, soft: Mapping[str, SoftShape]) -> ReplayScene
 
     The object that can move is moved, along the direction of least depth; of two, each by half.
     Objects are their convex hulls. The table is left to ``spawn``, which lifts what reaches in.
-
-    Raises:
-        NotEvaluatedError: Naming both objects and the depth.
     """
     movable = scene.movable()
     shapes = {

@@ -22,11 +22,7 @@ LARGEST_GAP_NS = 500_000_000
 
 
 def check_length(length_ns: int, plan_id: str) -> None:
-    """Refuse an execution that took longer than any trajectory that is replayed.
-
-    Raises:
-        UnusablePlanError: Saying how long.
-    """
+    """Refuse an execution that took longer than any trajectory that is replayed."""
     if length_ns > MAX_DURATION_S * 1e9:
         raise UnusablePlanError(
             plan_id=plan_id,
@@ -36,22 +32,14 @@ def check_length(length_ns: int, plan_id: str) -> None:
 
 
 def check_covers(track: JointTrack, what: str, end_ns: int, plan_id: str) -> None:
-    """Refuse a track that stops well before the execution ended.
-
-    Raises:
-        UnusablePlanError: Saying how much is missing.
-    """
+    """Refuse a track that stops well before the execution ended."""
     missing_ns = end_ns - int(track.stamps_ns[-1])
     if missing_ns > LARGEST_GAP_NS:
         raise _not_recorded(plan_id, what, missing_ns, "at its end")
 
 
 def check_track(track: JointTrack, what: str, plan_id: str) -> None:
-    """Refuse numbers that are none, and gaps.
-
-    Raises:
-        UnusablePlanError: Saying where.
-    """
+    """Refuse numbers that are none, and gaps."""
     wrong = ~np.isfinite(track.position).all(axis=1)
     if wrong.any():
         at_s = int(track.stamps_ns[int(np.argmax(wrong))] - track.stamps_ns[0]) * 1e-9

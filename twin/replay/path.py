@@ -109,11 +109,7 @@ class UnusablePlanError(TwinError):
 
 
 def check_usable(plan: Plan, robot: RobotModel) -> None:
-    """Refuse what no robot, or not this one, could follow.
-
-    Raises:
-        UnusablePlanError: Naming the first thing that is wrong.
-    """
+    """Refuse what no robot, or not this one, could follow."""
     wrong = (
         _about_times(plan)
         or _about_whose(plan, robot)

@@ -276,10 +276,6 @@ def replay_run(
         ``rows`` (one per trajectory), ``counts`` per trajectory and mode, ``skipped_episodes`` that
         could not be read and ``nothing_to_replay`` in others, with reasons, replays of ``imported``
         recordings, what was said ``against_recorded`` labels, and the scene hash.
-
-    Raises:
-        UsageError: When an episode named in the configuration is not in the run.
-        PathNotFoundError: When pictures are asked for and no scene was rebuilt.
     """
     run.refuse_empty()
     workers = config.workers or default_size()

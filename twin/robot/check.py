@@ -21,9 +21,6 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
     Args:
         name: Name in ``datasets/robots``, or path of a robot file.
         urdf_out: Where the description goes that carries the record; None: nowhere.
-
-    Raises:
-        UsageError: The file or its URDF cannot be used; names the joint, frame or mesh.
     """
     record = read_robot(name)
     try:

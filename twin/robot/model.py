@@ -61,10 +61,6 @@ def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
 
     Args:
         keep_visuals: Leave what is drawn in; collision elements always stay.
-
-    Raises:
-        RobotDescriptionError: When the text is not a URDF.
-        UsageError: When a mesh is not there, or is in an unknown package.
     """
     root = parse_description(urdf)
     for link in root.findall("link"):
@@ -120,11 +116,7 @@ _KINDS = ("fixed", "revolute", "prismatic", "continuous", *_REFUSED)
 
 
 def _with_limits(urdf: str, record: Robot) -> str:
-    """Write the record's limits into a description; the arm's endless joints get two turns.
-
-    Raises:
-        RobotDescriptionError: A joint of a kind that no serial arm has.
-    """
+    """Write the record's limits into a description; the arm's endless joints get two turns."""
     root = parse_description(urdf)
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     for name, joint in joints.items():
@@ -439,11 +431,7 @@ class RobotModel:
 
 
 def check_dynamics(robot: RobotModel) -> None:
-    """Refuse an arm whose motors or masses nobody knows: it cannot be simulated.
-
-    Raises:
-        RobotDescriptionError: Naming the joint, and what it moves.
-    """
+    """Refuse an arm whose motors or masses nobody knows: it cannot be simulated."""
     model = robot.model
     for name in (*robot.joints, *robot.record.finger_joints, *(m.joint for m in robot.followers)):
         joint = model.getJointId(name)

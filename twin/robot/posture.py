@@ -130,12 +130,7 @@ def distinct_postures(
 
 
 def posture_track(episode: Episode) -> PostureTrack:
-    """Read robot description, joint states and gripper width of an episode.
-
-    Raises:
-        EpisodeError: No joint states.
-        RobotDescriptionError: No robot description, or joint states of another robot.
-    """
+    """Read robot description, joint states and gripper width of an episode."""
     urdf = robot_description(episode)
     if urdf is None:
         raise RobotDescriptionError(
@@ -157,9 +152,6 @@ def width_track(episode: Episode, robot: Robot) -> JointTrack:
 
     Where no gripper state was recorded, it follows from a finger among the joint states. A fixed
     tool has no width: 0 whenever the joints were recorded.
-
-    Raises:
-        EpisodeError: Neither was recorded.
     """
     fingers = robot.gripper.fingers
     try:
@@ -179,11 +171,7 @@ def width_track(episode: Episode, robot: Robot) -> JointTrack:
 
 
 def check_joints(arm: JointTrack, source: str, robot: Robot) -> None:
-    """See that joint states are of the robot that is meant.
-
-    Raises:
-        RobotDescriptionError: A joint of the arm is missing in what a source sent.
-    """
+    """See that joint states are of the robot that is meant."""
     missing = [name for name in robot.joints if name not in arm.names]
     if missing:
         raise RobotDescriptionError(

@@ -63,12 +63,7 @@ def fixed_links(robot: RobotModel) -> frozenset[str]:
 
 @lru_cache(maxsize=4)
 def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
-    """Read the surface of every link once.
-
-    Raises:
-        RobotDescriptionError: When a shape cannot be read or is of an unknown kind, or none is
-            there.
-    """
+    """Read the surface of every link once."""
     geometry = collision_geometry(robot)
     surfaces = []
     for item in geometry.geometryObjects:

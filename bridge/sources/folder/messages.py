@@ -1,7 +1,7 @@
 """An RGB-D folder as the messages of a live camera.
 
 Three layouts are told apart by their files: our own index ``scene.json``, the lists of the TUM
-RGB-D benchmark (``rgb.txt`` and ``depth.txt``, or ``associations.txt``), and the numbered files of
+RGB-D benchmark (``rgb.txt`` and ``depth.txt``), and the numbered files of
 7-Scenes (``frame-000000.color.png``). ``docs/rgbd_folder.md`` describes each.
 """
 
@@ -156,9 +156,6 @@ def folder_messages(
 
     Args:
         start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
-
-    Raises:
-        UsageError: When a rate is asked of a folder that has real times.
     """
     times = frame_times_ns(index, config, start_ns)
     shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)

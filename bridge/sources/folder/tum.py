@@ -52,28 +52,11 @@ def read_files(path: Path) -> list[StampedFile]:
     """Read "stamp file" lines in time order."""
     files = [
         StampedFile(stamp_ns=_stamp_ns(path, line, cells[0]), name=cells[1], line=line)
-        for line, cells in _rows(path, (2,))
+        for line, cells in _rows(path, 2)
     ]
     if not files:
         raise FolderError(path=path, found="no images listed", hint="Write: stamp file.")
     return sorted(files, key=lambda item: item.stamp_ns)
-
-
-def read_associations(path: Path) -> list[tuple[StampedFile, StampedFile]]:
-    """Read "stamp file stamp file" lines; the column whose folder is called depth is depth."""
-    pairs = []
-    for line, cells in _rows(path, (4,)):
-        first, second = (
-            StampedFile(stamp_ns=_stamp_ns(path, line, cells[at]), name=cells[at + 1], line=line)
-            for at in (0, 2)
-        )
-        depth_first = "depth" in first.name and "depth" not in second.name
-        pairs.append((second, first) if depth_first else (first, second))
-    if not pairs:
-        raise FolderError(
-            path=path, found="no pairs listed", hint="Write: stamp colour stamp depth."
-        )
-    return sorted(pairs, key=lambda pair: pair[0].stamp_ns)
 
 
 def associate(
@@ -106,7 +89,7 @@ def associate(
 def read_poses(path: Path) -> PoseTrajectory:
     """Read "stamp tx ty tz qx qy qz qw" lines, without rows of nan and repeated stamps."""
     poses: dict[int, tuple[list[float], list[float]]] = {}
-    for line, cells in _rows(path, (8,)):
+    for line, cells in _rows(path, 8):
         stamp_ns = _stamp_ns(path, line, cells[0])
         try:
             numbers = [float(cell) for cell in cells[1:]]
@@ -135,7 +118,7 @@ def read_poses(path: Path) -> PoseTrajectory:
     )
 
 
-def _rows(path: Path, counts: tuple[int, ...]) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, count: int) -> Iterator[tuple[int, list[str]]]:
     """Yield numbered lines of cells, blank lines and comments left out."""
     try:
         text = path.read_text()
@@ -145,11 +128,10 @@ def _rows(path: Path, counts: tuple[int, ...]) -> Iterator[tuple[int, list[str]]
         cells = row.replace(",", " ").split()
         if not cells or cells[0].startswith("#"):
             continue
-        if len(cells) not in counts:
-            wanted = " or ".join(str(count) for count in counts)
+        if len(cells) != count:
             raise FolderError(
                 path=path,
-                found=f"line {line} has {len(cells)} fields, expected {wanted}",
+                found=f"line {line} has {len(cells)} fields, expected {count}",
                 hint="Correct the line or remove it.",
             )
         yield line, cells
@@ -171,7 +153,6 @@ def _stamp_ns(path: Path, line: int, text: str) -> int:
 
 
 COLOR_LIST, DEPTH_LIST, POSE_LIST = "rgb.txt", "depth.txt", "groundtruth.txt"
-ASSOCIATION_LISTS = ("associations.txt", "associate.txt", "association.txt")
 CAMERA_FILE = "camera.json"
 DEPTH_UNIT_M = 1 / 5000
 INTRINSICS = (525.0, 525.0, 319.5, 239.5)
@@ -193,15 +174,11 @@ class TumCameras:
 def find_lists(folder: Path) -> list[Path]:
     """Return the lists that name the images; empty when the folder has another layout."""
     both = [folder / COLOR_LIST, folder / DEPTH_LIST]
-    if all(path.is_file() for path in both):
-        return both
-    return [folder / name for name in ASSOCIATION_LISTS if (folder / name).is_file()][:1]
+    return both if all(path.is_file() for path in both) else []
 
 
 def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a folder of the benchmark.
-
-    An association list is followed where there is one, else colour and depth are paired by time.
 
     Args:
         config: Its intrinsics and unit of depth go before those of the folder and the benchmark.
@@ -247,9 +224,6 @@ def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
 
 def _pairs(folder: Path) -> tuple[list[tuple[StampedFile, StampedFile]], int, Path]:
     """Return colour and depth of each frame, how many colours found no depth, and the list."""
-    for name in ASSOCIATION_LISTS:
-        if (folder / name).is_file():
-            return read_associations(folder / name), 0, folder / name
     colors, depths = read_files(folder / COLOR_LIST), read_files(folder / DEPTH_LIST)
     pairs = associate(colors, depths)
     if not pairs:

@@ -5,8 +5,6 @@ numbers are counted anew: a gap in the new recording was lost on this way, not o
 """
 
 import contextlib
-import queue
-import sys
 import threading
 import time
 from array import array
@@ -23,17 +21,13 @@ from bridge.episode.mcap.messages import Selection, Stored, merged
 from bridge.episode.reader import Episode
 from bridge.episode.topics import OF_RECORDER, TF_STATIC, is_latched
 from bridge.errors import UsageError
-from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename_topics
+from bridge.sources.playback.config import PlaybackConfig, choose_topics
 from bridge.terminal import Output
 from bridge.wire.errors import BadTopicError
 from bridge.wire.keys import key_from_topic
 from bridge.wire.qos import Qos
 from bridge.wire.session import WirePublisher, WireSession
 
-SLICE_S = 0.05
-"""Who reads ahead looks this often whether the playback has ended."""
-SWITCH_S = 0.0005
-"""The thread that reads gives way to the one that sends after this long, not after 5 ms."""
 LATEST_NS = 2**63 - 1
 """The latest publish time that an attachment can hold."""
 
@@ -74,82 +68,23 @@ class Pace:
         return None
 
 
-BATCH_MESSAGES = 256
-BATCH_BYTES = 4_000_000
-BATCHES_AHEAD = 8
-
-
-class ReadAhead:
-    """Reads messages on a thread of its own, so that unpacking a chunk delays none of them."""
-
-    def __init__(self, messages: Iterator[Due]) -> None:
-        """Begin to read."""
-        self._messages = messages
-        self._batches: queue.Queue[list[Due]] = queue.Queue(BATCHES_AHEAD)
-        self._closed = threading.Event()
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._read, name="read ahead", daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        batch: list[Due] = []
-        size = 0
-        try:
-            for message in self._messages:
-                batch.append(message)
-                size += len(message.item.data)
-                if len(batch) >= BATCH_MESSAGES or size >= BATCH_BYTES:
-                    if not self._hand_over(batch):
-                        return
-                    batch, size = [], 0
-        except Exception as error:  # noqa: BLE001  # raised again where the messages are used
-            self._error = error
-        if not batch or self._hand_over(batch):
-            self._hand_over([])
-
-    def _hand_over(self, batch: list[Due]) -> bool:
-        while not self._closed.is_set():
-            try:
-                self._batches.put(batch, timeout=SLICE_S)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def __iter__(self) -> Iterator[Due]:
-        """Yield the messages; an error of reading comes after those before it."""
-        while batch := self._batches.get():
-            yield from batch
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        """Stop reading."""
-        self._closed.set()
-        self._thread.join()
-
-
 class EpisodeSource:
     """An episode as a ``bridge.sources.source.Source``."""
 
     def __init__(self, path: Path, config: PlaybackConfig) -> None:
-        """Open an episode and choose what is sent.
-
-        Raises:
-            UsageError: When nothing is chosen, or a name cannot travel on zenoh.
-        """
+        """Open an episode and choose what is sent."""
         self.episode = Episode.open(path)
         self.config = config
         self._defined: set[str] = set()
         self.pace = Pace(config.rate)
         counts = {topic: each.count for topic, each in self.episode.topics().items()}
         there = [topic for topic in counts if topic not in OF_RECORDER]
-        self.names = rename_topics(config.remap, choose_topics(config.topics, there))
-        for name in self.names.values():
-            _check_name(path, name)
-        self.num_messages = sum(counts[topic] for topic in self.names)
+        self.topics = tuple(choose_topics(config.topics, there))
+        for topic in self.topics:
+            _check_name(path, topic)
+        self.num_messages = sum(counts[topic] for topic in self.topics)
         if not self.num_messages:
-            listed = ", ".join(self.names) or "it has no topics"
+            listed = ", ".join(self.topics) or "it has no topics"
             raise UsageError(f"{path} holds no messages to play ({listed}).")
         self.start_ns = self.episode.start_ns + ns_from_s(config.start_s)
         if self.start_ns > self.episode.end_ns:
@@ -163,23 +98,18 @@ class EpisodeSource:
         """The episode's id."""
         return self.episode.info.id
 
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """The topics it sends, by the names they get."""
-        return tuple(self.names.values())
-
     def messages(self) -> Iterator[Due]:
         """Yield what is sent; the recorder's drop log stays out."""
         for item in self._latched_before():
             yield Due(self.start_ns, item)
-        for item in merged(self.episode.files, Selection(frozenset(self.names), self.start_ns)):
+        for item in merged(self.episode.files, Selection(frozenset(self.topics), self.start_ns)):
             yield Due(item.log_time_ns, item)
 
     def _latched_before(self) -> Iterator[Stored]:
         """What was latched when the playback begins: the last of each topic, and all frames."""
         if self.start_ns <= self.episode.start_ns:
             return
-        latched = frozenset(topic for topic in self.names if is_latched(topic))
+        latched = frozenset(topic for topic in self.topics if is_latched(topic))
         last: dict[tuple[str, int], Stored] = {}
         for item in merged(self.episode.files, Selection(latched, None, self.start_ns)):
             topic = item.channel.topic
@@ -199,23 +129,16 @@ class EpisodeSource:
         publishers = self._publishers(session)
         sent = dict.fromkeys(self.topics, 0)
         late_s = array("d")
-        ahead = ReadAhead(self.messages())
-        switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        try:
-            with output.progress("play", self.num_messages) as advance:
-                for at_ns, item in ahead:
-                    waited_s = self.pace.wait(at_ns, stop)
-                    if waited_s is None:
-                        break
-                    late_s.append(waited_s)
-                    publisher = publishers[id(item.file), item.channel.id]
-                    publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
-                    sent[self.names[item.channel.topic]] += 1
-                    advance(len(late_s), "")
-        finally:
-            sys.setswitchinterval(switch_s)
-            ahead.close()
+        with output.progress("play", self.num_messages) as advance:
+            for at_ns, item in self.messages():
+                waited_s = self.pace.wait(at_ns, stop)
+                if waited_s is None:
+                    break
+                late_s.append(waited_s)
+                publisher = publishers[id(item.file), item.channel.id]
+                publisher.put(item.data, source_ns=min(item.publish_time_ns, LATEST_NS))
+                sent[item.channel.topic] += 1
+                advance(len(late_s), "")
         return {
             "episode": self.name,
             "messages": len(late_s),
@@ -230,7 +153,7 @@ class EpisodeSource:
         found: dict[tuple[int, int], WirePublisher] = {}
         for file in self.episode.files:
             for channel in file.summary.channels.values():
-                if channel.topic not in self.names:
+                if channel.topic not in self.topics:
                     continue
                 record = file.schema_of(channel)
                 key = (channel.topic, record.name if record else "", channel.message_encoding)
@@ -238,7 +161,7 @@ class EpisodeSource:
                     self._define(session, record, channel.message_encoding)
                 if key not in made:
                     made[key] = session.publisher(
-                        self.names[channel.topic],
+                        channel.topic,
                         key[1],
                         qos=Qos.PLAYBACK,
                         message_encoding=key[2],
@@ -265,9 +188,7 @@ def _check_name(path: Path, name: str) -> None:
     try:
         key_from_topic(name)
     except BadTopicError as error:
-        raise UsageError(
-            f"{path}: {error} Rename it with --remap, or choose others with --topics."
-        ) from error
+        raise UsageError(f"{path}: {error} Choose others with --topics.") from error
 
 
 def _lateness_ms(late_s: "array[float]") -> dict[str, float]:

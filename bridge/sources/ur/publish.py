@@ -219,9 +219,6 @@ class UrSource:
 
         Returns:
             Samples sent, samples that did not reach us, and connections made.
-
-        Raises:
-            ControllerError: When the first connection fails; later ones are tried again.
         """
         host, config = self.host, self.config
         urdf = read_urdf(config)

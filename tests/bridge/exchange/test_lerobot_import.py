@@ -75,6 +75,14 @@ def test_the_episode_says_what_it_is_made_of(dataset: Dataset, tmp_path: Path) -
     assert source["left_out"] == ["observation.env (float32 [2, 2])"]
 
 
+def test_a_video_of_depth_is_left_out(dataset: Dataset, tmp_path: Path) -> None:
+    key = next(key for key, each in dataset.info["features"].items() if each["dtype"] == "video")
+    dataset.info["features"][key]["info"] = {"is_depth_map": True}
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run") == 0
+    episode = Episode.open(next((tmp_path / "run" / "episodes").iterdir()))
+    assert f"{key} (depth)" in episode.metadata_records["source"]["left_out"]
+
+
 def test_a_selection_imports_only_those_and_a_second_run_only_the_rest(
     dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

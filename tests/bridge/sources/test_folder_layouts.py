@@ -135,18 +135,6 @@ def test_frames_without_a_pose_or_a_partner_are_left_out_and_counted(tum: Path) 
     assert "1 without a pose left out, 1 colour images without depth" in index.summary
 
 
-def test_an_association_list_is_followed_in_either_order(tum: Path) -> None:
-    files = sorted((tum / "depth").iterdir())
-    colors = [f"{stamp} rgb/{stamp}.png" for stamp in STAMPS]
-    depths = [f"{file.stem} depth/{file.name}" for file in files]
-    for first, second in ((colors, depths), (depths, colors)):
-        rows = [f"{a} {b}" for a, b in zip(first[:2], second[:2], strict=True)]
-        (tum / "associations.txt").write_text("\n".join(rows))
-        index = read_index(tum, TUM)
-        assert [frame.color_path.name for frame in index.frames] == [f"{s}.png" for s in STAMPS[:2]]
-        assert [frame.depth_path for frame in index.frames] == files[:2]
-
-
 def test_each_depth_image_is_used_once_and_the_closest_pair_wins() -> None:
     def files(stamps: list[int]) -> list[StampedFile]:
         return [StampedFile(stamp_ns=s * 1_000_000, name=str(s), line=1) for s in stamps]
@@ -175,7 +163,6 @@ def test_each_depth_image_is_used_once_and_the_closest_pair_wins() -> None:
         ("groundtruth.txt", "1 0 0 0 0 0 0 7\n", r"line 1: quaternion of length 7"),
         ("groundtruth.txt", "1 0 0 0 nan 0 0 1\n", "no poses"),
         ("groundtruth.txt", "1 0 0 0 0 0 0 1\n", "no pose within 50 ms of any frame"),
-        ("associations.txt", "1 rgb/a.png 1\n", "line 1 has 3 fields, expected 4"),
         ("camera.json", "{", "camera.json: cannot be read"),
         ("camera.json", '{"depth": {}}', "camera.json: cannot be read"),
     ],

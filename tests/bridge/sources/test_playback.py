@@ -23,7 +23,7 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.schema import Schema
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, UsageError
-from bridge.sources.playback.config import PlaybackConfig, choose_topics, rename_topics
+from bridge.sources.playback.config import PlaybackConfig, choose_topics
 from bridge.sources.playback.publish import EpisodeSource, Pace
 from bridge.sources.source import Source, run_source
 from bridge.terminal import Output
@@ -208,13 +208,11 @@ def play(
         return source.run(session, stop or threading.Event(), QUIET)
 
 
-def test_chosen_topics_go_out_under_their_new_names(path: Path, heard: Heard) -> None:
-    config = PlaybackConfig(
-        rate=100.0, topics=("lab/*", "/robot_description"), remap=("/lab:=/twin", "/lab/grip:=/g")
-    )
+def test_chosen_topics_go_out(path: Path, heard: Heard) -> None:
+    config = PlaybackConfig(rate=100.0, topics=("lab/*", "/robot_description"))
     source = EpisodeSource(path, config)
     assert isinstance(source, Source)
-    names = {"/twin/joint_states", "/twin/event", "/g", "/twin/blob", "/twin/raw"}
+    names = {"/lab/joint_states", "/lab/event", "/lab/grip", "/lab/blob", "/lab/raw"}
     assert set(source.topics) == names | {"/robot_description"}
     counts = play(source, heard)
     samples = heard.wait_for(source.num_messages)
@@ -268,13 +266,8 @@ def test_messages_are_as_far_apart_as_they_came_by_the_rate(
 def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--rate 0 makes no sense; it must be at least 0.001"):
         PlaybackConfig(rate=0.0)
-    with pytest.raises(UsageError, match="not of the form OLD:=/NEW"):
-        PlaybackConfig(remap=("/lab=/x",))
     for config, message in (
         (PlaybackConfig(topics=("/lab/nothing",)), "no topic of the episode. There are: /lab/blob"),
-        (PlaybackConfig(remap=("/lab/joint_stat:=/x",)), "the nearest is /lab/joint_states"),
-        (PlaybackConfig(remap=("/lab/raw:=/lab/blob",)), "would both be sent as /lab/blob"),
-        (PlaybackConfig(remap=("/lab/raw:=/a*b",)), r"Rename it with --remap"),
         (PlaybackConfig(start_s=1.0), "behind the end"),
     ):
         with pytest.raises(UsageError, match=message):
@@ -321,8 +314,3 @@ TOPICS = ["/lab/a", "/lab/b/c", "/other", "/lab2/a"]
 )
 def test_a_pattern_is_a_key_expression(pattern: str, expected: list[str]) -> None:
     assert choose_topics([pattern], TOPICS) == expected
-
-
-def test_the_longest_old_name_counts() -> None:
-    names = rename_topics(["/lab:=/x", "/lab/b:=/y/z", "/lab/b/c:=/w"], TOPICS)
-    assert names == {"/lab/a": "/x/a", "/lab/b/c": "/w", "/other": "/other", "/lab2/a": "/lab2/a"}

@@ -262,8 +262,11 @@ MOVED = {"kind": "moved", "object": "cube"}
         ({**MOVED, "direction": "left"}, "says no limit"),
         ({**MOVED, "by_m": 0.1, "target_m": [0, 0], "direction": "left"}, "give one"),
         ({"kind": "outside", "object": "cube", "container": "block"}, "is no container"),
-        ({"kind": "between", "object": "cube", "first": "block"}, "second is missing"),
-        ({"kind": "upright", "object": "cube", "tolerance_rad": 3}, "at most"),
+        (
+            {"kind": "between", "object": "cube", "first": "block"},
+            "'second' is a required property",
+        ),
+        ({"kind": "upright", "object": "cube", "tolerance_rad": 3}, "greater than the maximum"),
         ({"kind": "aligned", "object": "cube", "reference": "block", "axis": "w"}, "unknown"),
     ],
 )

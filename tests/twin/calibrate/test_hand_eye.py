@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.errors import PathNotFoundError, UsageError
 from bridge.geometry import se3
 from twin.calibrate.hand_eye import (
     UndeterminedCameraError,
@@ -15,7 +14,7 @@ from twin.calibrate.hand_eye import (
     solve,
     solve_hand_eye,
 )
-from twin.calibrate.pairs import PosePairs, read_pairs
+from twin.calibrate.pairs import PosePairs
 
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[4] / "shared" / "data"))
 MOVEIT = SHARED / "handeye_moveit_samples" / "pose_samples.json"
@@ -152,39 +151,6 @@ def test_the_mounting_is_found_and_the_wrong_one_is_refused(mount: str) -> None:
         find_camera(pairs, other)  # type: ignore[arg-type]
 
 
-def test_a_file_holds_the_pairs_that_were_written(tmp_path: Path) -> None:
-    Ts_a, Ts_b, _, _ = made_pairs(0, 5)
-    (tmp_path / "pairs.json").write_text(json.dumps(np.stack([Ts_a, Ts_b], axis=1).tolist()))
-    found = read_pairs(tmp_path / "pairs.json")
-    np.testing.assert_allclose(found.Ts_base_effector, Ts_a, atol=1e-12)
-    np.testing.assert_allclose(found.Ts_camera_target, Ts_b, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "found"),
-    [
-        ("p.json", "{", "no pose pairs"),
-        ("p.json", "{}", "no pose pairs"),
-        ("p.json", "[[1, 2]]", "no pose pairs"),
-        ("p.csv", "a,b\n1,2\n", "no pose pairs"),
-        ("p.json", json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "pair 1"),
-        ("p.json", json.dumps([[np.eye(4).tolist(), np.full((4, 4), np.nan).tolist()]]), "pair 1"),
-        ("p.json", json.dumps([[np.diag([1, 1, -1, 1]).tolist(), np.eye(4).tolist()]]), "T_base"),
-    ],
-)
-def test_a_file_without_pose_pairs_is_refused(
-    tmp_path: Path, name: str, text: str, found: str
-) -> None:
-    (tmp_path / name).write_text(text)
-    with pytest.raises(UsageError, match=found):
-        read_pairs(tmp_path / name)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(PathNotFoundError, match="nowhere"):
-        read_pairs(tmp_path / "nowhere.json")
-
-
 def least_squares(Ts_a: np.ndarray, Ts_b: np.ndarray) -> np.ndarray:
     """X of AX = ZB by SciPy, from unknowns and residuals of another kind than ours."""
     from scipy.optimize import least_squares as minimise
@@ -219,9 +185,8 @@ def test_opencv_finds_the_same_camera_in_recorded_pairs() -> None:
     cv2 = pytest.importorskip("cv2")
     if not hasattr(cv2, "calibrateHandEye"):
         pytest.skip("this OpenCV has no calibrateHandEye (the main module of version 5 lacks it)")
-    pairs = read_pairs(MOVEIT)
-    A, B = pairs.Ts_base_effector, pairs.Ts_camera_target
-    found = find_camera(pairs, "auto")
+    A, B = np.moveaxis(np.array(json.loads(MOVEIT.read_text())), 1, 0)
+    found = find_camera(pairs_of(A, B), "auto")
     Ts_seen = B if found.mount == "hand" else se3.invert(B)
     R, t = cv2.calibrateHandEye(
         A[:, :3, :3], A[:, :3, 3], Ts_seen[:, :3, :3], Ts_seen[:, :3, 3],

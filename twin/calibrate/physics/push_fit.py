@@ -153,9 +153,6 @@ def calibrate_pushes(
 
     Returns:
         The physics record, and the id of the calibration that holds now.
-
-    Raises:
-        UnusablePushError: When there are too few pushes, or one cannot be simulated.
     """
     pushes, skipped = _pushes(run)
     fitted, held_out = split(list(pushes))

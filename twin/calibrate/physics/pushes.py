@@ -88,11 +88,7 @@ def motion_of(episode: Episode) -> ScriptedMotion | None:
 
 
 def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Hand) -> Push:
-    """Read one recording.
-
-    Raises:
-        UnusablePushError: When the tool is missing or lost for long, or a box was not recorded.
-    """
+    """Read one recording."""
     name = episode.info.id
     topics = [
         topic for topic in episode.topics_of_type(schema.POSE_STAMPED) if topic.endswith(TCP_POSE)
