@@ -84,6 +84,7 @@ GONE: dict[str, str] = {
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
+    "plan --send-images": "A model is told the objects in words; leave the flag out.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
     "calibrate --samples": "robot-gst calibrate RUN --posterior --draws N learns how trials end.",
     "calibrate --max-postures": "Postures are chosen far from each other; their number is fixed.",
