@@ -90,6 +90,7 @@ GONE: dict[str, str] = {
     "replay --relocalise": "Remove derived/*.localised.*.mcap; the next replay makes them anew.",
     "calibrate --evaluations": "--physics reads imported pushes; trials teach through --posterior.",
     "calibrate --budget": "--physics tries a grid, which takes as long as it takes.",
+    "plan --send-images": "A model is told the objects in words; leave the flag out.",
     "publish standin --probes": "Trials teach as much: robot-gst calibrate RUN --posterior.",
     "calibrate --pairs": (
         "Record target poses beside the joints (geometry_msgs/PoseStamped on "

@@ -33,8 +33,8 @@ class PlanConfig:
     """How an instruction is planned."""
 
     policy: str = "nominal"
-    """nominal, single (the first candidate alone), loose (no distances), model (nominal with what
-    a model adds: --model). With --live each request names its own."""
+    """nominal, or model (nominal with what a model adds: --model). With --live each request names
+    its own."""
     rounds: int = 5
     """Candidates that the twin may judge; each is steered by what it said of the one before."""
     seed: int = 0
@@ -47,17 +47,12 @@ class PlanConfig:
     it is asked for requests of policy model alone."""
     model_name: str = ""
     """The server's name for that model."""
-    send_images: bool = False
-    """Let a recorded image with numbered marks leave for that address."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that plan nothing, and half of what a model needs."""
         refuse_outside(self, {"rounds": (1, 1000), "seed": (0, 2**63 - 1)})
-        if bool(self.model) != bool(self.model_name) or (self.send_images and not self.model):
-            message = (
-                "a model is asked by its address and its name: --model URL --model-name NAME; "
-                "--send-images needs both."
-            )
+        if bool(self.model) != bool(self.model_name):
+            message = "a model is asked by its address and its name: --model URL --model-name NAME."
             raise UsageError(message)
         if self.policy == MODEL_POLICY and not self.model:
             message = "policy model keeps what a model adds: --model URL --model-name NAME."

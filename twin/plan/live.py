@@ -139,7 +139,7 @@ class LivePlanner:
         self, request: PlanRequest, problem: Problem, words: PlanConfig
     ) -> tuple[Candidate, Asked]:
         """The same, and what the model said; without it where not even one plan keeps it."""
-        asked = ask_about(self._run, None, problem, words)
+        asked = ask_about(self._run, problem, words, keep_refused=True)
         try:
             return self._chosen(request, asked.problem), asked
         except NoPlanError as error:
@@ -248,8 +248,6 @@ def run_planner(
             f"planner ready: cell {config.cell}, service {config.cell}{PLAN}, policies "
             f"{', '.join(planner.policies)}. Stop with Ctrl-C."
         )
-        if words is not None and words.send_images:
-            output.say("--send-images: a cell's requests hold no image, so the model gets none")
         while not stopped.wait(0.2):
             pass
     output.say("planner stopped")

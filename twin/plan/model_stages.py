@@ -11,13 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-from jaxtyping import UInt8
-
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.geometry import se3
 from bridge.task.plan import Stage
 from bridge.task.task_file import Task, TaskFile
 from twin.plan.config import PlanConfig
@@ -26,7 +21,6 @@ from twin.plan.constrain.relations import PLACES, predicate_of
 from twin.plan.constrain.schema import Vocabulary
 from twin.plan.ground.derive import derive_task
 from twin.plan.ground.goals import Goals, Grounding, ordered
-from twin.plan.ground.marks import draw_marks
 from twin.plan.ground.model_client import (
     BY_GRAMMAR,
     READ_INSTEAD,
@@ -41,9 +35,6 @@ from twin.plan.ground.vocabulary import Vocabulary as Things
 from twin.plan.loop.tau import stages_of
 from twin.plan.problem import Problem
 from twin.plan.usable_start import refuse_unusable
-from twin.scene.localise.episode import first_execution_ns
-from twin.scene.localise.stationary_frames import calibrated_cameras, stationary_frames
-from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import read_record
 
 REPLIES = "model_replies"
@@ -61,13 +52,11 @@ class Asked:
     """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
     model: str
     address: str
-    images_sent: bool
     remarks: tuple[str, ...]
 
     def lines(self) -> list[str]:
         """For a person: who answered, whom was asked, what was sent."""
-        sent = "one image was sent" if self.images_sent else "no image was sent"
-        head = f"stages: answered by {self.answered_by}; asked {self.address}; {sent}"
+        head = f"stages: answered by {self.answered_by}; asked {self.address}"
         return [head, *(f"  {remark}" for remark in self.remarks)]
 
     @property
@@ -86,46 +75,42 @@ class Asked:
         return {
             "answered_by": self.answered_by,
             "address": self.address,
-            "images_sent": self.images_sent,
             "remarks": list(self.remarks),
         }
 
 
-def ask_about(run: RunFolder, episode: str | None, problem: Problem, config: PlanConfig) -> Asked:
+def ask_about(
+    run: RunFolder, problem: Problem, config: PlanConfig, *, keep_refused: bool = False
+) -> Asked:
     """Ask the model of the settings for constraints; the grammar's stages are the fallback.
 
     Args:
-        episode: Shows the start; None: no image of it is there, and what came of asking is kept
-            even where every reply was refused.
+        keep_refused: What came of asking is kept even where every reply was refused.
     """
     task = problem.scene.task
-    vocabulary = Vocabulary.of_task(task, num_keypoints=len(problem.keypoints))
-    question = _question(run, episode, problem, vocabulary, task.instruction)
-    client = replace(client_of(run, config), keep_refused=episode is None)
+    vocabulary = Vocabulary.of_task(task)
+    question = _question(run, problem, vocabulary, task.instruction)
+    client = replace(client_of(run, config), keep_refused=keep_refused)
     answer = ask_model(question, client, lambda: stages_in(task))
     if answer.answered_by == BY_GRAMMAR:
-        return _asked(question, answer, config, problem)
+        return _asked(answer, config, problem)
     added, left_out = with_added(problem, answer.stages)
-    return _asked(question, answer, config, added, left_out=left_out)
+    return _asked(answer, config, added, left_out=left_out)
 
 
 def ask_for_goals(
-    run: RunFolder, episode: str, words: str, base: TaskFile, problem: Problem, config: PlanConfig
+    run: RunFolder, words: str, base: TaskFile, problem: Problem, config: PlanConfig
 ) -> Asked:
     """Ask the model of the settings what an instruction wants; ``understood`` is the task of it.
 
     Args:
         problem: The start; of its task only the objects count.
     """
-    vocabulary = Vocabulary.of_task(
-        problem.scene.task,
-        num_keypoints=len(problem.keypoints),
-        objects_alone=True,
-    )
-    question = _question(run, episode, problem, vocabulary, words)
+    vocabulary = Vocabulary.of_task(problem.scene.task, objects_alone=True)
+    question = _question(run, problem, vocabulary, words)
     answer = ask_model(question, client_of(run, config), tuple)
     if answer.answered_by == BY_GRAMMAR:
-        return _asked(question, answer, config, problem)
+        return _asked(answer, config, problem)
     try:
         things = vocabulary_of(base.task(), _instances(run))
         grounding = goals_in(answer.stages, words, things, f"{config.model_name} said so")
@@ -135,10 +120,10 @@ def ask_for_goals(
     except GstError as error:
         remarks = (f"its goals cannot be used: {error}", READ_INSTEAD)
         answer = replace(answer, answered_by=BY_GRAMMAR)
-        return _asked(question, answer, config, problem, left_out=remarks)
+        return _asked(answer, config, problem, left_out=remarks)
     understood = UnderstoodTask(file=file, grounding=grounding)
     added, left_out = with_added(derived, answer.stages)
-    return _asked(question, answer, config, added, left_out=left_out, understood=understood)
+    return _asked(answer, config, added, left_out=left_out, understood=understood)
 
 
 def retasked(problem: Problem, task: Task) -> Problem:
@@ -181,23 +166,16 @@ def _instances(run: RunFolder) -> Sequence[Mapping[str, Any]]:
     return list(semantics.get("instances", ()))
 
 
-def _question(
-    run: RunFolder, episode: str | None, problem: Problem, vocabulary: Vocabulary, words: str
-) -> Question:
+def _question(run: RunFolder, problem: Problem, vocabulary: Vocabulary, words: str) -> Question:
     things = vocabulary_of(problem.scene.task, _instances(run)).things
-    image, marks = (None, {}) if episode is None else marked_view(run, episode, problem)
     return Question(
         task=words,
         vocabulary=vocabulary,
         labels={key: thing.describe() for key, thing in things.items()},
-        image_u8=image,
-        marks=marks,
-        keypoints=[(each.object_id, each.name) for each in problem.keypoints],
     )
 
 
 def _asked(
-    question: Question,
     answer: Answer,
     config: PlanConfig,
     problem: Problem,
@@ -211,7 +189,6 @@ def _asked(
         understood=understood,
         model=config.model_name,
         address=config.model,
-        images_sent=config.send_images and question.image_u8 is not None,
         remarks=(*answer.remarks, *left_out),
     )
 
@@ -221,33 +198,8 @@ def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
     return ModelConfig(
         url=config.model,
         model=config.model_name,
-        send_images=config.send_images,
         cache=run.derived_dir / REPLIES,
     )
-
-
-def marked_view(
-    run: RunFolder, episode: str, problem: Problem
-) -> tuple[UInt8[np.ndarray, "height width 3"] | None, dict[str, int]]:
-    """The recorded image that shows most objects, a number on each; None where there is none."""
-    path = next((path for path in run.episodes() if path.stem == episode), None)
-    if path is None:
-        return None, {}
-    recorded = Episode.open(path)
-    poses = calibrated_cameras(recorded, read_calibration(run))
-    try:
-        frames = stationary_frames(recorded, 1, before_ns=first_execution_ns(recorded), poses=poses)
-    except GstError:
-        return None, {}
-    middles = {
-        key: se3.apply(T, problem.shapes[key].vertices_m.mean(axis=0))
-        for key, T in problem.scene.Ts_base_object.items()
-    }
-    views = [
-        draw_marks(frame.image_u8, frame.color_camera, frame.T_base_color, middles)
-        for frame in frames
-    ]
-    return max(views, key=lambda view: len(view[1]), default=(None, {}))
 
 
 def stages_in(task: Task) -> tuple[Stage, ...]:

@@ -83,18 +83,11 @@ class Start:
         found.append(f"  arm: {self.arm}")
         scene = self.problem.scene.scene_hash
         found.append(f"  scene: {'none was rebuilt' if scene is None else scene[:12]}")
-        if self.problem.keypoints:
-            listed = (f"{k} {each.words}" for k, each in enumerate(self.problem.keypoints))
-            found.append(f"  keypoints: {', '.join(listed)}")
         return found
 
     def to_json(self) -> dict[str, Any]:
         """The same as data, without the objects."""
-        return {
-            "episode": self.episode.path.stem,
-            "arm": self.arm,
-            "keypoints": [each.words for each in self.problem.keypoints],
-        }
+        return {"episode": self.episode.path.stem, "arm": self.arm}
 
 
 def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") -> Start:
@@ -208,12 +201,11 @@ def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Be
         start = start_of(run, understood.file.task(), config, robot)
         asked = None
         if config.model:
-            asked = ask_about(run, start.episode.path.stem, start.problem, config)
+            asked = ask_about(run, start.problem, config)
         return Begun(understood=understood, start=start, asked=asked)
     base = shown_task_file(run, config.episode)
     start = start_of(run, base.task(), config, robot)
-    episode = start.episode.path.stem
-    asked = ask_for_goals(run, episode, words, base, start.problem, config)
+    asked = ask_for_goals(run, words, base, start.problem, config)
     if asked.understood is not None:
         problem = retasked(start.problem, asked.understood.file.task())
         start = replace(start, problem=problem)

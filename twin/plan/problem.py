@@ -29,25 +29,6 @@ class Shape:
     """Below this height in the object frame nobody saw the surface."""
     error_m: float = 0.0
     """How far the surface may be off."""
-    parts_m: Mapping[str, Float[np.ndarray, "num_points 3"]] = field(default_factory=dict)
-    """Points of its parts in its own frame, by their names in the rebuilt scene."""
-    keypoints_m: Mapping[str, Float[np.ndarray, "3"]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Keypoint:
-    """A point that constraints name by its number."""
-
-    p_m: Float[np.ndarray, "3"]
-    object_id: str | None = None
-    """In whose frame it is and with what it moves; None: the base frame, and it stands still."""
-    name: str = ""
-    """In the rebuilt scene, such as top; empty: it has none."""
-
-    @property
-    def words(self) -> str:
-        """What it is, for a person."""
-        return f"{self.object_id}'s {self.name}" if self.object_id and self.name else self.name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +39,6 @@ class Problem:
     """Task, poses with covariances, static distances, containers, where the arm stands."""
     robot: RobotModel
     shapes: Mapping[str, Shape]
-    keypoints: tuple[Keypoint, ...] = ()
 
     def model(self, object_id: str) -> ObjectModel:
         """The task file's nominal shape of an object."""

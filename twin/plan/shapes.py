@@ -11,24 +11,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from bridge.episode.run_folder import RunFolder
-from bridge.errors import InvalidRecordError
-from bridge.geometry import se3
 from bridge.task.task_file import SCANNED, ObjectModel, Task
-from twin.naming.scene_file import BACKGROUND_KEY, SEMANTICS_FILE, read_semantics
-from twin.plan.problem import Keypoint, Problem, Shape
+from twin.plan.problem import Problem, Shape
 from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
-from twin.scene.gaussians import read_ply
 from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
-from twin.scene.store.folder import SCENE_FILE, SPLATS, UnreadableSceneError, read_record
 
 GUESSED_SHARE = 0.1
 """Of its largest extent, a scanned object may be off that no scan has shown yet."""
@@ -44,26 +38,11 @@ def problem_of(
 ) -> Problem:
     """Put together what the planner knows when it plans; no joints where nobody knows them."""
     scene = read_rebuilt_scene(run, task).scene(task, urdf, Ts_base_object, covariances=covariances)
-    shapes = shapes_of(run.scene_dir, task)
     return Problem(
         scene=replace(scene, start_rad=start_rad),
         robot=load_robot(urdf),
-        shapes=shapes,
-        keypoints=keypoints_of(shapes),
+        shapes=shapes_of(run.scene_dir, task),
     )
-
-
-MOST_KEYPOINTS = 256
-
-
-def keypoints_of(shapes: Mapping[str, Shape]) -> tuple[Keypoint, ...]:
-    """Number the keypoints of all objects, in the order of the objects and of their names."""
-    found = [
-        Keypoint(p_m=shape.keypoints_m[name], object_id=key, name=name)
-        for key, shape in shapes.items()
-        for name in sorted(shape.keypoints_m)
-    ]
-    return tuple(found[:MOST_KEYPOINTS])
 
 
 def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
@@ -77,72 +56,10 @@ def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
             key: _task_shape(model, "task file: there is no scene")
             for key, model in task.objects.items()
         }
-    taken = {str(table["grasp"]) for table in task.stages if "part" in table}
-    record = read_record(RunFolder(path=scene_dir.parent)) or {}
-    return {
-        key: _shape_of(
-            scene_dir,
-            key,
-            model,
-            with_parts=key in taken,
-            keypoints_m=_keypoints_of(scene_dir, record, key),
-        )
-        for key, model in task.objects.items()
-    }
+    return {key: _shape_of(scene_dir, key, model) for key, model in task.objects.items()}
 
 
-def _keypoints_of(
-    scene_dir: Path, record: Mapping[str, Any], key: str
-) -> dict[str, Float[np.ndarray, "3"]]:
-    """Named points that the scene has of an object, in the frame it was scanned in."""
-    try:
-        instances = (record.get("semantics") or {}).get("instances", ())
-        mine = [item for item in instances if item.get("object") == key]
-        pose = record.get("objects", {}).get(key, {}).get("T_base_object")
-        if not mine or pose is None:
-            return {}
-        about = max(mine, key=lambda item: int(item["num_splats"]))
-        T = se3.invert(se3.pose_from_record(pose))
-        found = about.get("keypoints_m", {}).items()
-        places = {str(name): np.array(p, dtype=np.float64) for name, p in found}
-        if not all(p.shape == (3,) and np.isfinite(p).all() for p in places.values()):
-            raise ValueError("a point that is none")
-        return {name: se3.apply(T, p) for name, p in places.items()}
-    except (ValueError, KeyError, TypeError, AttributeError, InvalidRecordError) as error:
-        found = f"no keypoints of {key} ({error!r})"
-        raise UnreadableSceneError(path=scene_dir / SCENE_FILE, found=found) from error
-
-
-def _parts_of(scene_dir: Path, key: str) -> dict[str, Float[np.ndarray, "num_points 3"]]:
-    """Middles of the Gaussians of each part, in the object's frame; none where there are none."""
-    if not (scene_dir / SEMANTICS_FILE).is_file():
-        return {}
-    record = read_record(RunFolder(path=scene_dir.parent))
-    if record is None:
-        return {}
-    rows = {BACKGROUND_KEY: int(record["background"]["num_splats"])}
-    rows |= {name: int(about["num_splats"]) for name, about in record["objects"].items()}
-    if key not in rows:
-        return {}
-    scene = read_semantics(scene_dir, rows)
-    first = sum(count for name, count in list(rows.items())[: list(rows).index(key)])
-    own = slice(first, first + rows[key])
-    middles_m = read_ply(scene_dir / "objects" / key / SPLATS).means_m
-    about = max(scene.instances, key=lambda item: int(item.mask[own].sum()), default=None)
-    if about is None:
-        return {}
-    found = {name: middles_m[mask[own]].astype(np.float64) for name, mask in about.parts.items()}
-    return {name: points for name, points in found.items() if len(points)}
-
-
-def _shape_of(
-    scene_dir: Path,
-    key: str,
-    model: ObjectModel,
-    *,
-    with_parts: bool,
-    keypoints_m: Mapping[str, Float[np.ndarray, "3"]],
-) -> Shape:
+def _shape_of(scene_dir: Path, key: str, model: ObjectModel) -> Shape:
     folder = scene_dir / "objects" / key
     if not (folder / MESH).is_file():
         return _task_shape(model, "task file: the scene has no mesh of it")
@@ -166,15 +83,12 @@ def _shape_of(
     known_low, known_high = _extents(model)
     off = float(np.max(np.abs((high - low) / (known_high - known_low) - 1.0)))
     source_text = f"scan ({source})"
-    parts_m = _parts_of(scene_dir, key) if with_parts else {}
     if model.shape != SCANNED:
         if off > MOST_OFF:
             return _task_shape(model, f"task file: an extent of the scene's mesh is {off:.0%} off")
         shift = (known_low + known_high - low - high) / 2
         shift[2] = known_low[2] - low[2]  # it stands on the table
         vertices = vertices + shift
-        parts_m = {name: points + shift for name, points in parts_m.items()}
-        keypoints_m = {name: point + shift for name, point in keypoints_m.items()}
         source_text += f", moved by {np.linalg.norm(shift) * 1e3:.1f} mm onto the task's shape"
     return Shape(
         vertices_m=vertices,
@@ -182,8 +96,6 @@ def _shape_of(
         source=source_text,
         trusted_from_m=float(vertices[:, 2].min()) + truncation_m,
         error_m=voxel_m,
-        parts_m=parts_m,
-        keypoints_m=keypoints_m,
     )
 
 

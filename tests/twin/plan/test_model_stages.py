@@ -14,7 +14,7 @@ sys.path += [str(Path(__file__).parent / "ground"), str(Path(__file__).parent / 
 
 from hostile_replies import TASK, valid_reply
 from scripted_plans import scene_of_test
-from test_model_client import SECRET, Server, images_in, says, serving
+from test_model_client import SECRET, Server, says, serving
 
 import robot_gst
 from bridge.data_files import datasets_folder
@@ -22,18 +22,16 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
-from bridge.geometry import se3
 from bridge.task.find import ATTACHMENT, MEDIA_TYPE
 from bridge.task.plan import Plan
 from bridge.task.task_file import TaskFile
 from bridge.task.verdict import Factor, Verdict
 from twin.gate import twin_process
 from twin.plan import model_stages, once
-from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.relations import constraint_of, predicate_of
 from twin.plan.constrain.reply import read_reply
 from twin.plan.constrain.schema import Vocabulary
-from twin.plan.problem import Keypoint, Problem
+from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.robot.model import load_robot
 
@@ -86,10 +84,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
             ik=yes, clearance=yes, terminal=yes,
         )  # fmt: skip
 
-    image = np.full((24, 32, 3), 200, dtype=np.uint8)
     monkeypatch.setattr(once, "start_of", start_of)
     monkeypatch.setattr(twin_process, "judge_of", judge_of)
-    monkeypatch.setattr(model_stages, "marked_view", lambda *_: (image, {"cube": 1}))
     return folder
 
 
@@ -100,7 +96,7 @@ def planned(
     *more: str,
     task: str = TASK,
 ) -> tuple[dict[str, Any], Plan]:
-    command = ["plan", str(run.path), "--task", task, "--policy", "single", "--json"]
+    command = ["plan", str(run.path), "--task", task, "--json"]
     asked = ["--model", server.url, "--model-name", "stub", *more]
     assert robot_gst.run([*command, *asked]) == 0, capsys.readouterr().err
     data = json.loads(capsys.readouterr().out)
@@ -115,7 +111,6 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
         data, plan = planned(run, server, capsys)
     assert SECRET in server.headers[0]["Authorization"]
     assert (data["model"]["answered_by"], data["model"]["address"]) == ("model", server.url)
-    assert data["model"]["images_sent"] is False
     assert plan.grounding_source == "model"
     assert [LOW in stage.path for stage in plan.stages] == [False, True, True]
     task = TaskFile.read(Path(data["file"])).task()
@@ -130,18 +125,6 @@ def test_what_the_model_adds_joins_the_stages_and_nothing_else(
     kept = [path.read_text() for path in run.derived_dir.rglob("*") if path.is_file()]
     assert kept
     assert not any(SECRET in text for text in kept)
-    assert images_in(server.asked[0]) == []
-    assert "image" not in json.dumps(server.asked[0]["messages"][1])
-
-
-@pytest.mark.slow
-def test_an_image_leaves_where_that_is_asked_for(
-    run: RunFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with serving(says(json.dumps(reply()))) as server:
-        data, _ = planned(run, server, capsys, "--send-images")
-    assert data["model"]["images_sent"] is True
-    assert len(images_in(server.asked[0])) == 1
 
 
 def understood(
@@ -228,8 +211,6 @@ def test_a_goal_and_its_constraint_say_the_same_both_ways(record: dict[str, Any]
 @pytest.mark.parametrize(
     "record",
     [
-        {"kind": "inside", "obj": "cube", "container": "box", "frac": 0.9},
-        {"kind": "inside", "a": TOP, "container": "box"},
         {"kind": "upright", "obj": "cube", "max_deg": 5.0},
     ],
 )
@@ -286,44 +267,10 @@ def test_a_models_stages_find_those_of_the_task() -> None:
     assert found == [([LOW], None), ([NEVER], [LOW]), (None, [NEVER])]
 
 
-TOP_CORNER = Keypoint(p_m=np.array([0.015, 0.0, 0.02]), object_id="cube", name="top")
-NEAR = {
-    "kind": "distance",
-    "a": {"kp": 0},
-    "b": {"obj": "box", "anchor": "opening"},
-    "max": 0.07,
-}
-
-
-def test_a_plan_keeps_what_is_asked_of_a_keypoint_where_it_lets_go(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem = replace(problem_of_test(), keypoints=(TOP_CORNER,))
-    monkeypatch.setattr(sys.modules[__name__], "problem_of_test", lambda: problem)
-    wanted = reply()
-    wanted["stages"][1]["subgoal"] = [INSIDE, NEAR]
-    with serving(says(json.dumps(wanted))) as server:
-        data, plan = planned(run, server, capsys)
-    assert data["model"]["answered_by"] == "model"
-    scene = json.loads(server.asked[0]["messages"][1]["content"])["scene"]
-    assert scene["keypoints"] == [{"kp": 0, "object": "cube", "name": "top"}]
-    release = plan.stages[-1]
-    assert NEAR in release.subgoal
-    (at_start,) = plan.keypoints_m
-    np.testing.assert_allclose(
-        at_start, se3.apply(problem.scene.Ts_base_object["cube"], TOP_CORNER.p_m)
-    )
-    constraint = compile_constraint(NEAR, problem)
-    assert constraint.violation(once._state(problem, plan, None))[0] > 0
-    assert constraint.violation(once._state(problem, plan, release))[0] <= 0
-    assert any("keypoint 0 (cube's top)" in line for line in data["constraints"])
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--model", "http://127.0.0.1:9/v1"], "--model-name"),
-        (["--send-images"], "--model URL"),
         (["--policy", "model"], "--model URL"),
         (["--model", "nowhere", "--model-name", "m"], "must begin with http"),
     ],

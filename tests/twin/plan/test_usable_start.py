@@ -20,7 +20,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
 from bridge.robots.robot import read_robot
-from twin.plan.loop.nominal import SINGLE, PlanProposer
+from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
@@ -106,7 +106,7 @@ def test_a_start_that_cannot_be_used_is_refused_in_one_sentence(
 
     def plan() -> None:
         refuse_unusable(bad)
-        PlanProposer(SINGLE).propose(bad, plan_id="p", seed=0, count=1, steer=None)
+        PlanProposer().propose(bad, plan_id="p", seed=0, count=1, steer=None)
 
     with pytest.raises(NoPlanError, match=said) as caught:
         plan()

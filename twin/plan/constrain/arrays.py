@@ -40,13 +40,6 @@ def angle(a: Array, b: Array, *, undirected: bool = False) -> Array:
     return np.arctan2(norm(cross(a, b)), abs(along) if undirected else along)
 
 
-def turn(R: Array) -> Array:
-    """Angles of rotations ``(num_states, 3, 3)``, 0 to pi [rad]."""
-    skew = [R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
-    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
-    return np.arctan2(norm(np.stack(skew, axis=-1)), trace - 1.0)
-
-
 def carried(T: Array, points_m: Array) -> Array:
     """Points of a body in the frame of its pose, ``(num_states, num_points, 3)``.
 

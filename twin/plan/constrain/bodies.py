@@ -79,28 +79,10 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
         name, anchor = spec["obj"], spec.get("anchor", "centroid")
         p_object = _anchor_m(problem.model(name), anchor) + offset
         return lambda state: _at(pose_of(state, name), p_object), f"{name}'s {anchor}{aside}"
-    if "xyz" in spec:
-        p, frame = np.array(spec["xyz"], dtype=np.float64) + offset, spec.get("frame", BASE)
-        if frame == BASE:
-            return lambda state: p[None], f"the point {millimetres(p)}"
-        return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
-    ids = [int(k) for k in ([spec["kp"]] if "kp" in spec else spec["mean"])]
-    points = [problem.keypoints[index] for index in ids]
-
-    def mean(state: State) -> Array:
-        places = [
-            point.p_m[None]
-            if point.object_id is None
-            else _at(pose_of(state, point.object_id), point.p_m)
-            for point in points
-        ]
-        return sum(places) / len(places) + offset
-
-    called = [f"{k} ({words})" if (words := problem.keypoints[k].words) else f"{k}" for k in ids]
-    words = f"keypoint {called[0]}"
-    if "mean" in spec:
-        words = f"the middle of keypoints {', '.join(called)}"
-    return mean, words + aside
+    p, frame = np.array(spec["xyz"], dtype=np.float64) + offset, spec.get("frame", BASE)
+    if frame == BASE:
+        return lambda state: p[None], f"the point {millimetres(p)}"
+    return lambda state: _at(pose_of(state, frame), p), f"the point {millimetres(p)} of {frame}"
 
 
 def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
@@ -158,11 +140,3 @@ def surface_points(
     chosen, u, v = sample_triangles(areas, count - len(corners), rng, in_order=True)
     spread = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
     return np.concatenate([corners, spread])
-
-
-def quantile(values: Array, share: float) -> Array:
-    """The value that this share of each row does not exceed."""
-    count = values.shape[-1]
-    index = min(max(int(np.ceil(share * count)) - 1, 0), count - 1)
-    ordered = np.sort(values, axis=-1)
-    return ordered[..., index]

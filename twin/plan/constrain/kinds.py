@@ -6,37 +6,27 @@ between bodies, which predicates decide too, are beside this in ``relations``.
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from bridge.errors import UsageError
-from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
 from twin.plan.constrain import arrays
 from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
-    Point,
     Record,
     box_pose,
     directions_of,
     half_extents_m,
     heights,
-    millimetres,
     point_of,
     pose_of,
     surface_points,
 )
 from twin.plan.constrain.constraint import Constraint, Term, flattened
 from twin.plan.constrain.relations import RELATIONS
-from twin.plan.constrain.schema import (
-    BASE,
-    SCENE,
-    ConstraintError,
-    Vocabulary,
-    check_constraint,
-)
+from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint
 from twin.plan.problem import Problem, State
 
 
@@ -46,40 +36,13 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
     Args:
         record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
     """
-    vocabulary = Vocabulary.of_task(problem.scene.task, num_keypoints=len(problem.keypoints))
-    _refuse_unknown_keypoints(record, problem)
-    check_constraint(record, vocabulary)
+    check_constraint(record, Vocabulary.of_task(problem.scene.task))
     for name in _named(record):
         if name in problem.scene.missing():
             reason = problem.scene.reasons.get(name, "not found")
             message = f"{record['kind']}: {name} was not localised ({reason}). Look again."
             raise UsageError(message)
     return _KINDS[record["kind"]](record, problem)
-
-
-def names_keypoint(record: Record) -> bool:
-    """Whether a constraint names a keypoint anywhere."""
-    return any(True for _ in _numbers(record))
-
-
-def _refuse_unknown_keypoints(record: Record, problem: Problem) -> None:
-    known = range(len(problem.keypoints))
-    for number in _numbers(record):
-        if isinstance(number, int) and number not in known:
-            listed = ", ".join(f"{k} ({problem.keypoints[k].words})" for k in known)
-            there = f"There are: {listed}." if listed else "There are none without a rebuilt scene."
-            raise ConstraintError(problems=(f"keypoint {number} is unknown. {there}",))
-
-
-def _numbers(record: Record) -> Iterator[Any]:
-    """Of the keypoints that a record names anywhere."""
-    for key, value in record.items():
-        if isinstance(value, dict):
-            yield from _numbers(value)
-        elif key == "kp":
-            yield value
-        elif key == "mean" and isinstance(value, list | tuple):
-            yield from value
 
 
 _ID_KEYS = ("obj", "container", "support", "reference", "against", "first", "second", "over")
@@ -148,33 +111,6 @@ def _align(record: Record, problem: Problem) -> Constraint:
     return Constraint.of(record, term)
 
 
-def _relpose(record: Record, problem: Problem) -> Constraint:
-    obj, reference = record["obj"], record["reference"]
-    q = np.array(record["q_wxyz"], dtype=np.float64)
-    T_wanted = se3.transform_from(q, np.array(record["p"], dtype=np.float64))
-
-    def reached(state: State) -> Array:
-        T = T_wanted[None]
-        return T if reference == BASE else pose_of(state, reference) @ T
-
-    return Constraint.of(record, *_near_pose(f"{obj} from its place", obj, reached, record))
-
-
-def _near_pose(what: str, obj: str, wanted: Point, record: Record) -> tuple[Term, Term]:
-    def off(state: State) -> Array:
-        return norm((pose_of(state, obj) - wanted(state))[:, :3, 3])
-
-    def turned(state: State) -> Array:
-        R = wanted(state)[:, :3, :3].swapaxes(1, 2) @ pose_of(state, obj)[:, :3, :3]
-        return arrays.turn(R)
-
-    most_rad = float(np.radians(record["tol_deg"]))
-    return (
-        Term(what=f"the distance of {what}", measure=off, high=record["tol"]),
-        Term(what=f"the turn of {what}", measure=turned, high=most_rad, unit="rad"),
-    )
-
-
 def _clearance(record: Record, problem: Problem) -> Constraint:
     obj, against = record["obj"], record["against"]
     return Constraint.of(
@@ -238,61 +174,24 @@ def _panel_distance(model: ObjectModel, points: Array) -> Array:
 
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
-    distance, region = _region(record["region"], problem)
-    if "obj" in record:
-        obj = record["obj"]
-        surface = surface_points(problem, obj)
-        name = obj
-
-        def points(state: State) -> Array:
-            T = pose_of(state, obj)
-            return arrays.carried(T, surface)
-    else:
-        point, name = point_of(record["a"], problem)
-
-        def points(state: State) -> Array:
-            return point(state)[:, None]
+    """Out of the upright column over the box around an object that stands upright."""
+    obj, over = record["obj"], record["region"]["over"]
+    points = surface_points(problem, obj)
+    half = half_extents_m(problem.model(over))
 
     def least(state: State) -> Array:
-        found = distance(state, points(state))
-        return np.amin(found, axis=-1)
+        surface = arrays.carried(pose_of(state, obj), points)
+        q = arrays.seen_from(box_pose(state, over, problem), surface)[..., :2]
+        return np.amin(arrays.box_distance(q, half[:2]), axis=-1)
 
     return Constraint.of(
         record,
         Term(
-            what=f"the distance of {name} from {region}",
+            what=f"the distance of {obj} from what is over {over}",
             measure=least,
             low=record.get("margin", 0.0),
         ),
     )
-
-
-def _region(spec: Record, problem: Problem) -> tuple[Callable[[State, Array], Array], str]:
-    """Signed distances of points to a region, negative inside, and its name in words."""
-    if "box" in spec:
-        low, high = (np.array(spec["box"][key], dtype=np.float64) for key in ("min", "max"))
-
-        def of_box(state: State, points: Array) -> Array:
-            centre, half = (low + high) / 2, (high - low) / 2
-            return arrays.box_distance(points, half, centre)
-
-        return of_box, f"the box from {millimetres(low)} to {millimetres(high)}"
-    if "sphere" in spec:
-        centre = np.array(spec["sphere"]["centre"], dtype=np.float64)
-        radius = spec["sphere"]["radius"]
-        return (
-            lambda state, points: norm(points - centre) - radius,
-            f"the sphere of {radius * 1e3:.0f} mm around {millimetres(centre)}",
-        )
-    over = spec["over"]
-    half = half_extents_m(problem.model(over))
-
-    def of_column(state: State, points: Array) -> Array:
-        """Of an upright column over the box around an object that stands upright."""
-        q = arrays.seen_from(box_pose(state, over, problem), points)[..., :2]
-        return arrays.box_distance(q, half[:2])
-
-    return of_column, f"what is over {over}"
 
 
 def _height(record: Record, problem: Problem) -> Constraint:
@@ -346,7 +245,6 @@ _KINDS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "distance": _distance,
     "above": _above,
     "align": _align,
-    "relpose": _relpose,
     "clearance": _clearance,
     "keepout": _keepout,
     "height": _height,

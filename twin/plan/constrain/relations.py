@@ -26,16 +26,12 @@ from bridge.task.task_file import Task
 from twin.plan.constrain import arrays
 from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
-    Point,
     Record,
     box_pose,
     half_extents_m,
     heights,
     millimetres,
-    point_of,
     pose_of,
-    quantile,
-    surface_points,
 )
 from twin.plan.constrain.constraint import Constraint, Term
 from twin.plan.problem import Problem, State
@@ -81,51 +77,24 @@ def _over_support(record: Record, problem: Problem, support: str, margin: float)
 
 
 def _inside(record: Record, problem: Problem) -> Constraint:
-    container, margin = record["container"], record.get("margin", 0.0)
-    if "frac" in record:
-        return Constraint.of(record, _share_inside(record, problem, margin))
-    if "obj" in record:
-        point, name = point_of({"obj": record["obj"], "anchor": "origin"}, problem)
-        name = f"the middle of {record['obj']}"
-    else:
-        point, name = point_of(record["a"], problem)
-    excess = _cavity_excess(container, lambda state: point(state)[:, None], problem)
-    term = Term(
-        what=f"{name} beyond the cavity of {container}",
-        measure=lambda state: excess(state)[:, 0],
-        high=-margin,
-    )
-    return Constraint.of(record, term)
-
-
-def _share_inside(record: Record, problem: Problem, margin: float) -> Term:
-    """The share of a surface that is inside, as the excess of the point that decides it [m]."""
-    obj, share = record["obj"], record["frac"]
-    points = surface_points(problem, obj)
-    excess = _cavity_excess(
-        record["container"],
-        lambda state: arrays.carried(pose_of(state, obj), points),
-        problem,
-    )
-    return Term(
-        what=f"{share:.0%} of the surface of {obj} beyond the cavity of {record['container']}",
-        measure=lambda state: quantile(excess(state), share),
-        high=-margin,
-    )
-
-
-def _cavity_excess(container: str, points: Point, problem: Problem) -> Callable[[State], Array]:
-    """How far each of ``(num_states, num_points, 3)`` leaves a cavity; negative inside [m]."""
+    obj, container = record["obj"], record["container"]
     model = problem.model(container)
     inner = np.array(model.inner_m)
     centre = np.array([0.0, 0.0, model.wall_m + inner[2] / 2])
 
     def excess(state: State) -> Array:
-        T = pose_of(state, container)
-        q = arrays.seen_from(T, points(state)) - centre
+        middle = pose_of(state, obj)[:, None, :3, 3]
+        q = arrays.seen_from(pose_of(state, container), middle)[:, 0] - centre
         return np.amax(abs(q) - inner / 2, axis=-1)
 
-    return excess
+    return Constraint.of(
+        record,
+        Term(
+            what=f"the middle of {obj} beyond the cavity of {container}",
+            measure=excess,
+            high=-record.get("margin", 0.0),
+        ),
+    )
 
 
 def _outside(record: Record, problem: Problem) -> Constraint:
@@ -359,7 +328,7 @@ def predicate_of(record: Record) -> dict[str, Any] | None:
 
     The other way round of ``constraint_of``; None: no predicate says it.
     """
-    if record["kind"] not in PLACES or "obj" not in record or "frac" in record:
+    if record["kind"] not in PLACES:
         return None
     names = {value: key for key, value in _KEYS.items()} | {"way": "direction"}
     names["vector"] = "direction"

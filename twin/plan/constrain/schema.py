@@ -40,17 +40,11 @@ class Vocabulary:
     objects: tuple[str, ...]
     movable: tuple[str, ...]
     containers: tuple[str, ...] = ()
-    num_keypoints: int = 0
     allowed_contacts: frozenset[frozenset[str]] | None = None
     """Pairs that may touch at some time, from the task file; None: no task file says so yet."""
 
     @staticmethod
-    def of_task(
-        task: Task,
-        *,
-        num_keypoints: int = 0,
-        objects_alone: bool = False,
-    ) -> "Vocabulary":
+    def of_task(task: Task, *, objects_alone: bool = False) -> "Vocabulary":
         """Read off a task file what may be named.
 
         Args:
@@ -63,7 +57,6 @@ class Vocabulary:
             objects=tuple(task.objects),
             movable=free if objects_alone else task.manipulated,
             containers=tuple(key for key, model in task.objects.items() if _has_cavity(model)),
-            num_keypoints=num_keypoints,
             allowed_contacts=None if objects_alone else frozenset(map(frozenset, pairs)),
         )
 
@@ -83,7 +76,6 @@ class Vocabulary:
         }
         for name, known in ids.items():
             schema["$defs"][name] = {"enum": list(known)}
-        schema["$defs"]["keypoint_id"]["maximum"] = self.num_keypoints - 1
         return schema
 
     @cache  # noqa: B019
@@ -250,14 +242,8 @@ def meaning_problems(record: Mapping[str, Any], where: Where) -> Problems:
         if low in record and high in record and record[low] > record[high]:
             yield where, f"{low} {record[low]:g} is above {high} {record[high]:g}"
     yield from _alike(record, where)
-    if "q_wxyz" in record and abs(math.hypot(*record["q_wxyz"]) - 1.0) > 0.01:
-        yield (*where, "q_wxyz"), "is not of unit length"
     if record["kind"] == "moved":
         yield from _course(record, where)
-    if "box" in record.get("region", {}):
-        box = record["region"]["box"]
-        if any(low >= high for low, high in zip(box["min"], box["max"], strict=True)):
-            yield (*where, "region", "box"), "has no volume: min must be below max"
 
 
 def _alike(record: Mapping[str, Any], where: Where) -> Problems:

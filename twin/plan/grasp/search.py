@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
 from twin.errors import TwinError
@@ -26,7 +26,6 @@ CAUSES: Mapping[str, str] = {
     "cone": "no two surfaces face each other within the friction cone",
     "width": "what faces each other is wider than the hand opens",
     "unseen": "what could be taken was seen by no camera",
-    "part": "what could be taken is not on the named part",
     "tilt": "the hand would have to come too far from the side",
     "table": "the hand would meet the table",
     "palm": "it is taller there than the hand is deep",
@@ -128,8 +127,6 @@ _TARGET_POINTS = 500
 _NEIGHBOUR_POINTS = 900
 _UNDERSIDE = 0.5
 """Sine under the horizontal of a scanned surface that no camera above the table sees."""
-_PART_M = 0.008
-"""A contact this near to a point of a part is on the part."""
 _CELLS_M, _CELL_RAD = (0.003, 0.004, 0.005, 0.006, 0.008, 0.010, 0.013), 0.2
 """Closing lines that share such a cell are one; the first that leaves few enough of them."""
 _MOST_LINES = 180
@@ -167,23 +164,16 @@ class GraspSearcher:
         self._reach = ArmReach(problem)
         self._surfaces: dict[str, SampledSurface] = {}
 
-    def search(
-        self, object_id: str, part_points_m: Float[np.ndarray, "num_points 3"] | None = None
-    ) -> GraspSearch:
-        """Find grasps of an object.
-
-        Args:
-            part_points_m: Points of a part, in the object's frame: both contacts are to be on it;
-                None: it may be taken anywhere.
-        """
+    def search(self, object_id: str) -> GraspSearch:
+        """Find grasps of an object."""
         self._refuse(object_id)
-        hand, found, grasps = self._opened(object_id, part_points_m, self.max_width_m)
+        hand, found, grasps = self._opened(object_id, self.max_width_m)
         first = found, hand
         for share in _OPENINGS:
             if grasps or not any(found.rejected.get(cause) for cause in _IN_THE_WAY):
                 break
             open_m = share * self.max_width_m
-            hand, found, grasps = self._opened(object_id, part_points_m, open_m)
+            hand, found, grasps = self._opened(object_id, open_m)
         if not grasps:
             raise self._none(object_id, first[0].rejected, first[1])
         return GraspSearch(
@@ -191,14 +181,11 @@ class GraspSearcher:
         )
 
     def _opened(
-        self,
-        object_id: str,
-        part_points_m: Float[np.ndarray, "num_points 3"] | None,
-        open_m: float,
+        self, object_id: str, open_m: float
     ) -> tuple[OpenHand, _Candidates, tuple[Grasp, ...]]:
         """Search with the hand opened so far."""
         T = self.problem.scene.Ts_base_object[object_id]
-        pairs, rejected = self._pairs(object_id, part_points_m, open_m)
+        pairs, rejected = self._pairs(object_id, open_m)
         hand = open_hand(self.problem.robot, open_m, PREGRASP_M)
         found = self._hands_on(pairs, T, hand, rejected)
         points = self._surface(object_id).points(_TARGET_POINTS, SEED)
@@ -270,12 +257,7 @@ class GraspSearcher:
             self._surfaces[object_id] = SampledSurface(self.problem.shapes[object_id])
         return self._surfaces[object_id]
 
-    def _pairs(
-        self,
-        object_id: str,
-        part_points_m: Float[np.ndarray, "num_points 3"] | None,
-        open_m: float,
-    ) -> tuple[Pairs, dict[str, int]]:
+    def _pairs(self, object_id: str, open_m: float) -> tuple[Pairs, dict[str, int]]:
         """Closing lines that hold, fit between the pads, and are on what was seen."""
         config, shape = self.config, self.problem.shapes[object_id]
         rejected: dict[str, int] = {}
@@ -298,11 +280,6 @@ class GraspSearcher:
         if np.isfinite(shape.trusted_from_m):
             seen &= pairs.downward <= _UNDERSIDE
         pairs = keep(pairs, seen, "unseen")
-        if part_points_m is not None:
-            part = cKDTree(part_points_m)
-            ends = (pairs.first_m, pairs.first_m + pairs.axes * pairs.widths_m[:, None])
-            near = [part.query(end)[0] <= _PART_M for end in ends]
-            pairs = keep(pairs, near[0] & near[1], "part")
         for cell_m in _CELLS_M:
             kept = thinned(pairs, cell_m=cell_m, cell_rad=_CELL_RAD)
             if len(kept) <= _MOST_LINES:

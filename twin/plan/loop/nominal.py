@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.check import TABLE, nearest
+from bridge.task.check import TABLE
 from bridge.task.model_policy import MODEL_POLICY
 from bridge.task.plan import Plan, Waypoint
 from twin.plan.constrain.constraint import (
@@ -36,7 +36,6 @@ from twin.plan.loop.tau import (
     Bounds,
     Trajectory,
     goals_of,
-    named_keypoints,
     plan_stage,
     refuse_without_stages,
     stages_of,
@@ -53,7 +52,6 @@ from twin.plan.problem import Grasp, Problem, Release, State
 from twin.plan.release.final_states import ReleaseConfig, final_states
 from twin.plan.release.resting import NoFinalStateError
 from twin.replay.clearance.bodies import SCENE
-from twin.replay.config import ReplayConfig
 from twin.robot.config import IkConfig
 
 PLANNER = "gst_planner"
@@ -103,23 +101,9 @@ class Policy:
 
 
 NOMINAL = Policy(name="nominal")
-SINGLE = Policy(
-    name="single",
-    release=ReleaseConfig(num_samples=0, num_nominal=1, max_releases=1),
-    grasps=1,
-)
-"""The first grasp and its cheapest solved final state; nothing is drawn, nothing comes after it."""
-LOOSE = Policy(
-    name="loose",
-    grasp=GraspConfig(clearance_m=0.0, least_margin=-5.0),
-    release=ReleaseConfig(eps_col_m=0.0, sigmas=0.0),
-    path=PathConfig(replay=ReplayConfig(eps_col_m=0.0)),
-    ways=(Way(straight=True), Way()),
-)
-"""Nothing has to keep a distance, and objects are carried along straight lines."""
 MODEL = replace(NOMINAL, name=MODEL_POLICY)
 """As nominal, of a problem to whose stages a model added constraints."""
-POLICIES = {policy.name: policy for policy in (NOMINAL, SINGLE, LOOSE, MODEL)}
+POLICIES = {policy.name: policy for policy in (NOMINAL, MODEL)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +140,7 @@ class PlanProposer:
         refuse_lost(problem.scene)
         refuse_without_stages(task)
         if any(table.get("push") for table in task.stages):
-            return self._pushed(problem, plan_id, 1 if self._policy.grasps == 1 else count)
+            return self._pushed(problem, plan_id, count)
         search = _Search(problem, self._policy, seed, steer)
         found: list[Candidate] = []
         for transfers in search.sequences():
@@ -343,7 +327,7 @@ class _Options:
         self._problem, self._key, self._policy = problem, key, policy
         self._seed, self._steer = seed, steer
         searcher = GraspSearcher(problem, policy.grasp)
-        found = searcher.search(key, _part_points(problem, key))
+        found = searcher.search(key)
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
         self.grasps = self._ordered(kept)[: policy.grasps]
@@ -449,24 +433,6 @@ class _Options:
             + "; ".join(release.checked_against),
             f"{self._key}: {postures:.0f} postures looked at on the way",
         )
-
-
-def _part_points(problem: Problem, key: str) -> Float[np.ndarray, "num_points 3"] | None:
-    """Points of the part that the task grasps an object by; None: it names none."""
-    tables = (table for table in problem.scene.task.stages if table.get("grasp") == key)
-    part = next((str(table["part"]) for table in tables if "part" in table), None)
-    if part is None:
-        return None
-    shape = problem.shapes[key]
-    if part in shape.parts_m:
-        return shape.parts_m[part]
-    known = f"It has: {', '.join(shape.parts_m)}." if shape.parts_m else "It has none of it."
-    message = (
-        f"task {problem.scene.task.name} takes {key} by its {part}, and the scene has no such part "
-        f"of it (its surface: {shape.source}). {known}{nearest(part, shape.parts_m)} Leave the "
-        "part out, or scan and rebuild the scene: robot-gst rebuild RUN."
-    )
-    raise NoPlanError(message)
 
 
 def _subgoals(problem: Problem, key: str, verb: str) -> list[Constraint]:
@@ -600,7 +566,6 @@ def _written(
         task=task.name,
         instruction=task.instruction,
         entities={key: se3.pose_record(T) for key, T in problem.scene.Ts_base_object.items()},
-        keypoints_m=named_keypoints(problem),
         joint_names=record.joints,
         stages=tuple(plan_stage(task, table, bounds, there) for table in task.stages),
         tau=tau,

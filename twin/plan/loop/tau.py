@@ -10,12 +10,11 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.task.plan import Stage, Waypoint
 from bridge.task.task_file import Task
-from twin.plan.constrain.kinds import names_keypoint
 from twin.plan.constrain.relations import constraint_of
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.path.planner import waypoints_of
 from twin.plan.path.transfer import Leg
-from twin.plan.problem import Grasp, Problem
+from twin.plan.problem import Grasp
 from twin.robot.model import RobotModel
 
 Bounds = Mapping[str, tuple[int, int]]
@@ -97,7 +96,13 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
 
 
 def refuse_without_stages(task: Task) -> None:
-    """Refuse a task that moves something without saying in which stages."""
+    """Refuse a task that moves something without saying in which stages, or takes it by a part."""
+    for table in task.stages:
+        if "part" in table:
+            raise NoPlanError(
+                f"task {task.name} takes {table.get('grasp')} by its {table['part']}, and grasps "
+                "are no longer sought on one part. Leave the part out."
+            )
     for key in task.manipulated:
         verbs = stages_of(task, key).keys()
         lacking = [verb for verb in ("grasp", "release") if verb not in verbs]
@@ -137,20 +142,6 @@ def plan_stage(
         t_start_ns=start_ns,
         t_end_ns=end_ns,
     )
-
-
-def named_keypoints(problem: Problem) -> tuple[tuple[float, float, float], ...]:
-    """All keypoints at the start, base frame, where a stage names one; named ones have a number."""
-    tables = problem.scene.task.stages
-    asked = [table.get(kind, ()) for table in tables for kind in ("subgoal", "path")]
-    if not any(names_keypoint(record) for records in asked for record in records):
-        return ()
-    Ts = problem.scene.Ts_base_object
-    places = [
-        each.p_m if each.object_id is None else se3.apply(Ts[each.object_id], each.p_m)
-        for each in problem.keypoints
-    ]
-    return tuple((float(x), float(y), float(z)) for x, y, z in places)
 
 
 def goals_of(task: Task, key: str) -> list[dict[str, Any]]:

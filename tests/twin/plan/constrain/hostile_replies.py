@@ -110,10 +110,6 @@ def _numbers() -> Iterator[tuple[str, str, str]]:
             yield f"{path[-1]} is {number}", json.dumps(put(path, number)), text_of(path)
     for value in (0, -0.01, 0.6):
         yield f"tolerance {value}", json.dumps(put((*GOAL, "tol"), value)), text_of((*GOAL, "tol"))
-    for keypoint in (-1, 0, 999, 1.5, "0", True):
-        path = (*GOAL, "a")
-        record = json.dumps(put(path, {"kp": keypoint}))
-        yield f"keypoint {keypoint!r}", record, text_of((*path, "kp"))
 
 
 def _names() -> Iterator[tuple[str, str, str]]:
@@ -240,26 +236,6 @@ def _meanings() -> Iterator[tuple[str, str, str]]:
         "beside itself": ({"kind": "beside", "obj": "cube", "reference": "cube"}, ".reference"),
         "a speed to end with": ({"kind": "speed", "max": 0.1}, ""),
         "moved by no way": ({"kind": "moved", "obj": "cube", "by": 0.1, "tol": 0.01}, ".by"),
-        "a flat region": (
-            {
-                "kind": "keepout",
-                "obj": "cube",
-                "region": {"box": {"min": [0, 0, 0], "max": [1, 0, 1]}},
-            },
-            ".region.box",
-        ),
-        "no rotation": (
-            {
-                "kind": "relpose",
-                "obj": "cube",
-                "reference": "box",
-                "p": [0, 0, 0],
-                "q_wxyz": [0, 0, 0, 0],
-                "tol": 0.01,
-                "tol_deg": 5,
-            },
-            ".q_wxyz",
-        ),
         "a direction of nothing": (
             {
                 "kind": "align",

@@ -56,5 +56,3 @@ def test_angles_are_exact_where_a_cosine_is_flat() -> None:
         b = np.array([[np.cos(wanted), np.sin(wanted), 0.0]]) * 3.0
         assert arrays.angle(a, b)[0] == pytest.approx(wanted, rel=1e-6)
         assert arrays.angle(a, -b, undirected=True)[0] == pytest.approx(min(wanted, np.pi - wanted))
-        R = se3.rotation_from_vector(np.array([[0.0, 0.6, 0.8]]) * wanted)
-        assert arrays.turn(R)[0] == pytest.approx(wanted, rel=1e-6, abs=1e-9)

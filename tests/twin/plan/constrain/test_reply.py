@@ -24,7 +24,7 @@ from twin.plan.constrain.schema import (
 SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[5] / "shared" / "data"))
 GIVEN = SHARED / "planning" / "hostile_outputs.json"
 CUBE = Vocabulary.of_task(load_task("cube_into_box"))
-BLOCKS = Vocabulary.of_task(blocks_task(), num_keypoints=2)
+BLOCKS = Vocabulary.of_task(blocks_task())
 HOSTILE = list(hostile_replies())
 CPU_LIMIT_S, MEMORY_LIMIT_BYTES = 0.5, 50e6
 """No slow machine needs that, and what grows with the square of a reply does."""

@@ -257,16 +257,6 @@ def test_neighbours_that_no_hand_comes_near_are_left_out_and_nothing_else(
         assert one.margin == other.margin
 
 
-def test_a_part_restricts_both_contacts() -> None:
-    given = cube_problem()
-    corner = np.array([[x, y, 0.015] for x in (0.012, 0.018) for y in (-0.02, 0.02)])
-    found = GraspSearcher(given, FEW).search("cube", corner)
-    for grasp in found.grasps:
-        for contact in grasp.contacts_m:
-            assert np.linalg.norm(corner - contact, axis=1).min() <= 0.008
-    assert found.rejected["part"] > 0
-
-
 def test_a_less_certain_pose_leaves_less_margin() -> None:
     task, poses = load_task("cube_into_box"), {"cube": standing(0.48, -0.15, 0.02)}
     margins = [

@@ -1,6 +1,5 @@
 """A model on the loopback that answers well, badly, late or with malice."""
 
-import base64
 import json
 import socket
 import sys
@@ -12,7 +11,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "constrain"))
@@ -20,7 +18,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "constrain"))
 from hostile_replies import TASK, put, valid_reply
 
 from bridge.errors import UsageError
-from bridge.media.color import decode_color
 from bridge.task.plan import Stage
 from bridge.task.task_file import load_task
 from twin.plan.constrain.schema import Vocabulary
@@ -38,8 +35,6 @@ QUESTION = Question(
     task=TASK,
     vocabulary=Vocabulary.of_task(load_task("cube_into_box")),
     labels={"cube": "red cube", "box": "open container"},
-    image_u8=np.full((24, 32, 3), 200, dtype=np.uint8),
-    marks={"cube": 1, "box": 2},
 )
 FROM_GRAMMAR = (Stage(id="from_grammar", text="what the grammar makes of it"),)
 SECRET = "sk-very-secret-0123456789"
@@ -262,25 +257,6 @@ def test_a_server_that_knows_no_formats_is_asked_plainly() -> None:
     assert any("asked again in plain words" in remark for remark in answer.remarks)
 
 
-def images_in(body: dict[str, Any]) -> list[str]:
-    content = body["messages"][1]["content"]
-    parts = content if isinstance(content, list) else []
-    return [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
-
-
-def test_images_leave_only_where_that_is_asked_for() -> None:
-    with serving(says(GOOD)) as server:
-        kept = ask(server)
-        sent = ask(server, send_images=True)
-    assert images_in(server.asked[0]) == []
-    assert "no image was sent" in kept.remarks[0]
-    (image,) = images_in(server.asked[1])
-    data = base64.b64decode(image.removeprefix("data:image/jpeg;base64,"))
-    assert decode_color(data).shape == (24, 32, 3)
-    assert "one image was sent" in sent.remarks[0]
-    assert server.url in sent.remarks[0]
-
-
 def test_a_key_comes_from_the_environment_and_is_written_nowhere(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -292,7 +268,7 @@ def test_a_key_comes_from_the_environment_and_is_written_nowhere(
 
     with serving(echo, says(BAD.replace("Take", f"{SECRET} Take")), says(GOOD)) as server:
         failed = ask(server, cache=tmp_path / "cache")
-        repaired = ask(server, cache=tmp_path / "cache", send_images=True)
+        repaired = ask(server, cache=tmp_path / "cache")
     assert server.headers[0]["Authorization"] == f"Bearer {SECRET}"
     assert (failed.answered_by, repaired.answered_by) == (BY_GRAMMAR, BY_REPAIR)
     assert SECRET not in repr((failed, repaired))
