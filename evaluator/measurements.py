@@ -463,21 +463,6 @@ LABEL_OBJECTS = _new(
     "trials where the operator counted as many objects as the predicate on the localised poses / trials labelled by object where both are known",
 )
 
-# Confidence sequences.
-
-SEQUENCE = _new(
-    "sequence.recorded.{task}.{condition}.{policy}",
-    "1",
-    "higher",
-    "successes / trials as labelled, with a betting confidence sequence in the order in which they were recorded (of a table: its rows): it may be looked at after every one, to stop or to continue",
-)
-REPLANNING_EVIDENCE = _new(
-    "sequence.replanning_evidence.recorded",
-    "1",
-    "none",
-    "what a bettor against 'replanning changes nothing' made of 1, over {improved} improved and {worsened} worsened pairs; {enough:.0f} or more: stop, it is shown at {alpha:g}, however often one looked; {most:g} stands for all that is more",
-)
-
 # Images. A mean over views, before and after an alignment or a mask (``{variant}``).
 
 

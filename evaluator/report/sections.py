@@ -102,7 +102,6 @@ SECTIONS: tuple[Section, ...] = (
             ("paired.mcnemar_p_exact.recorded", "McNemar's exact p, as labelled"),
             ("unpaired.boschloo_p.recorded.pooled", "Boschloo's p over pooled trials"),
             ("paired.start_distance_max_m", "Largest distance of paired starts"),
-            ("sequence.replanning_evidence.recorded", "Evidence, valid at any time"),
             ("study.*", ""),
         ),
         tables=("study_arms", "study_gains", "gains", "retries"),
@@ -190,7 +189,6 @@ SECTIONS: tuple[Section, ...] = (
         numbers=(
             ("views.all.psnr_db", "PSNR, raw"),
             ("views.all.psnr_gain_db", "PSNR, after a gain per image"),
-            ("views.all.psnr_pose_gain_db", "PSNR, after pose and gain"),
             ("views.all.ssim", "SSIM, raw"),
             ("views.all.ssim_gain", "SSIM, after a gain per image"),
             ("views.all.lpips*", ""),
@@ -205,11 +203,7 @@ SECTIONS: tuple[Section, ...] = (
         id="sequences",
         title="Enough trials?",
         lead="Whether enough trials were made.",
-        numbers=(
-            ("sequence.recorded.*", ""),
-            ("power.trials_needed.recorded.*", ""),
-        ),
-        tables=("stopping",),
+        numbers=(("power.trials_needed.recorded.*", ""),),
     ),
 )
 

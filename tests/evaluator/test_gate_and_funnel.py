@@ -1,11 +1,7 @@
-"""The gate's worth, reliability, stage funnel, and sequential looking."""
-
-import math
+"""The gate's worth, reliability, and the stage funnel."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from evaluator.errors import UndefinedStatisticError
@@ -24,13 +20,6 @@ from evaluator.statistics.gate import (
     expected_calibration_error,
     kappa,
     reliability_bins,
-)
-from evaluator.statistics.intervals import wilson
-from evaluator.statistics.sequential import (
-    betting_interval,
-    capital_log,
-    sequence_of,
-    stop_or_continue,
 )
 
 
@@ -90,65 +79,6 @@ def test_a_stage_after_a_failed_one_is_not_reached() -> None:
 def test_failures_are_counted_most_frequent_first() -> None:
     found = failure_taxonomy([("ik", ""), *[("clearance", "collision")] * 2, ("ik", "")])
     assert [(kind.clause, kind.count) for kind in found] == [("clearance", 2), ("ik", 2)]
-
-
-def test_all_successes_leave_a_betting_interval_open_upwards() -> None:
-    interval = betting_interval(10, 10)
-    # KT capital: B(10.5, 0.5) / B(0.5, 0.5) = C(20, 10) / 4^10; low = (that / 20)^(1/10).
-    assert interval.low == pytest.approx((math.comb(20, 10) / 4**10 / 20) ** 0.1, abs=1e-12)
-    assert interval.high == 1
-    assert betting_interval(0, 10).high == pytest.approx(1 - interval.low, abs=1e-12)
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_a_betting_interval_is_wider_than_one_that_looks_once(count: tuple[int, int]) -> None:
-    k, n = count
-    anytime, once = betting_interval(k, n), wilson(k, n)
-    assert anytime.low <= k / n <= anytime.high
-    assert anytime.high - anytime.low > 0.9 * (once.high - once.low)
-
-
-def test_the_bettors_capital_is_a_martingale_under_the_truth() -> None:
-    for n in (1, 5, 12):
-        for rate in (0.2, 0.5):
-            chances = [math.comb(n, k) * rate**k * (1 - rate) ** (n - k) for k in range(n + 1)]
-            mean = sum(c * math.exp(capital_log(k, n, rate)) for k, c in enumerate(chances))
-            assert mean == pytest.approx(1, abs=1e-12)
-
-
-def test_a_sequence_never_widens_and_stops_when_the_question_is_answered() -> None:
-    with pytest.raises(UndefinedStatisticError, match="there are no trials"):
-        stop_or_continue(sequence_of([]), 0.5)
-    outcomes = [True, True, False, *[True] * 20]
-    looks = [sequence_of(outcomes[:n]) for n in range(1, len(outcomes) + 1)]
-    widths = [look.high - look.low for look in looks]
-    assert widths == sorted(widths, reverse=True)
-    sequence = looks[-1]
-    assert stop_or_continue(sequence, 0.5).answer == "above"
-    still_open = stop_or_continue(sequence, 0.9)
-    assert not still_open.stop
-    assert still_open.more_trials is None or still_open.more_trials > 0
-    assert stop_or_continue(sequence, 0.999).answer in ("below", "open")
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.booleans(), min_size=1, max_size=60))
-def test_all_at_once_is_one_by_one(outcomes: list[bool]) -> None:
-    looks = [betting_interval(sum(outcomes[:n]), n) for n in range(1, len(outcomes) + 1)]
-    low, high = max(look.low for look in looks), min(look.high for look in looks)
-    if low > high:
-        with pytest.raises(UndefinedStatisticError, match="the rate has changed"):
-            sequence_of(outcomes)
-        return
-    at_once = sequence_of(outcomes)
-    assert (at_once.k, at_once.n) == (sum(outcomes), len(outcomes))
-    assert (at_once.low, at_once.high) == pytest.approx((low, high), abs=1e-12)
-
-
-def test_a_rate_that_changes_is_noticed() -> None:
-    with pytest.raises(UndefinedStatisticError, match="the rate has changed"):
-        sequence_of([True] * 60 + [False] * 200)
 
 
 def test_a_perfect_forecaster_shows_an_error_over_few_trials() -> None:
