@@ -9,7 +9,6 @@ from evaluator.compare.agreement import agreement_intervals, group_agreement, us
 from evaluator.compare.axes import axis_tables
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
     pair_starts,
@@ -113,7 +112,6 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *scorecard,
         *reliability(rows),
         *stages,
-        *decisions(groups),
         *model_results(usable_groups(groups)),
     )
     return _Found(

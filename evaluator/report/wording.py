@@ -51,12 +51,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
 SHARES = ("average.", "rate.")
-UNSIGNED = (
-    "agreement.mae_pp",
-    "agreement.rmse_pp",
-    "agreement.largest_gap_pp",
-    "decision.regret_pp",
-)
+UNSIGNED = ("agreement.mae_pp",)
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
 """Nobody reads more digits before the point; evidence may have hundreds."""

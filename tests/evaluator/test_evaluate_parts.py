@@ -139,21 +139,6 @@ def test_policies_are_what_agreement_is_resampled_by(write_table: Callable[[str]
     assert "policies left out" in results.get("agreement.mae_pp").definition
     band = results.get("agreement.pearson_r_remeasured")
     assert band.interval is not None or "remeasurement" in str(band.reason_without_interval)
-    assert results.get("decision.regret_pp").n == 1
-    assert results.get("agreement.kendall_tau_b").value is not None
-    assert results.get("agreement.calibration_slope").value == pytest.approx(1, abs=0.15)
-
-
-def test_a_choice_among_conditions_is_judged(six_trials: Any) -> None:
-    comparison = compare_run(six_trials.run)
-    regret = comparison.results().get("decision.regret_pp")
-    # Twin: 2/3 against 2/3, recorded 1/3 against 2/3: the worst of the tie loses a third.
-    assert regret.value == pytest.approx(100 / 3)
-    right = comparison.results().get("decision.surely_right")
-    assert (right.k, right.n) == (0, 1)
-    assert comparison.results().get("decision.possibly_right").k == 1
-    assert right.interval is None
-    assert "not a sample" in str(right.reason_without_interval)
 
 
 @pytest.mark.parametrize("method", ["clopper-pearson", "jeffreys"])

@@ -7,7 +7,6 @@ from scipy import stats
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.calibration import (
     brier_interval,
-    calibration_error_interval,
     perfect_forecaster,
 )
 from evaluator.statistics.funnel import failure_taxonomy, funnel
@@ -17,9 +16,7 @@ from evaluator.statistics.gate import (
     brier,
     brier_of_base_rate,
     cost_curve,
-    expected_calibration_error,
     kappa,
-    reliability_bins,
 )
 
 
@@ -52,12 +49,6 @@ def test_kappa_by_hand_and_undefined() -> None:
 def test_reliability_of_a_forecaster_who_is_right_and_of_one_who_is_not() -> None:
     assert brier([1.0, 0.0], [True, False]) == 0
     assert brier([0.5, 0.5], [True, False]) == 0.25 == brier_of_base_rate([True, False])
-    assert expected_calibration_error([1.0, 0.0], [False, True]) == 1
-    said, happened = [0.05, 0.95, 1.0, 0.1], [False, True, True, True]
-    bins = reliability_bins(said, happened)
-    assert [(b.low, b.n, b.succeeded) for b in bins] == [(0.0, 1, 0), (0.1, 1, 1), (0.9, 2, 2)]
-    # 1/4 x 0.05 + 1/4 x 0.9 + 2/4 x 0.025
-    assert expected_calibration_error(said, happened) == pytest.approx(0.25)
     with pytest.raises(UndefinedStatisticError, match="there are no trials"):
         brier([], [])
     with pytest.raises(ValueError, match=r"lies in 0\.\.1"):
@@ -81,16 +72,14 @@ def test_failures_are_counted_most_frequent_first() -> None:
     assert [(kind.clause, kind.count) for kind in found] == [("clearance", 2), ("ik", 2)]
 
 
-def test_a_perfect_forecaster_shows_an_error_over_few_trials() -> None:
+def test_a_perfect_forecaster_shows_what_its_own_outcomes_would() -> None:
     p = (np.arange(20) + 0.5) / 20
-    score, error = perfect_forecaster(p.tolist())
+    score = perfect_forecaster(p.tolist())
     assert score.mean == pytest.approx((p * (1 - p)).mean())
     rng = np.random.default_rng(8)
     drawn = [rng.random(20) < p for _ in range(400)]
-    seen = [expected_calibration_error(p.tolist(), y.tolist()) for y in drawn]
-    assert error.mean == pytest.approx(np.mean(seen), abs=0.01)
-    assert error.mean > 0.15
-    inside = np.mean([error.low <= each <= error.high for each in seen])
+    seen = [brier(p.tolist(), y.tolist()) for y in drawn]
+    inside = np.mean([score.low <= each <= score.high for each in seen])
     assert inside == pytest.approx(0.95, abs=0.04)
     with pytest.raises(UndefinedStatisticError, match="there are no trials"):
         perfect_forecaster([])
@@ -102,14 +91,3 @@ def test_the_brier_interval_of_yes_and_no_is_jeffreys() -> None:
     low, high = stats.beta(3.5, 17.5).ppf([0.025, 0.975])  # 3 of 20 were wrong
     assert found.low == pytest.approx(low, abs=0.01)
     assert found.high == pytest.approx(high, abs=0.015)
-
-
-def test_the_interval_of_the_calibration_error_takes_the_noise_out() -> None:
-    p = [0.1, 0.4, 0.6, 0.9] * 5
-    kept = [False, False, True, True] * 5
-    found = calibration_error_interval(p, kept)
-    assert found.low == 0.0
-    assert found.low <= expected_calibration_error(p, kept) <= found.high
-    wrong = calibration_error_interval([0.95] * 60, [False] * 45 + [True] * 15)
-    assert wrong.low > 0.5
-    assert wrong.low < 0.95 - 0.25 < wrong.high
