@@ -1,7 +1,4 @@
-"""Video files: frames in. PyAV (the extra [video]) does it.
-
-Colour is H.264, depth HEVC of 12 bits without loss.
-"""
+"""Video files of H.264: frames in. PyAV (the extra [video]) does it."""
 
 from pathlib import Path
 from typing import Any
@@ -10,9 +7,8 @@ import numpy as np
 
 from bridge.errors import MissingDependencyError
 
-CODEC, DEPTH_CODEC = "libx264", "libx265"
-RGB, PIX_FMT = "rgb24", "gray12le"
-"""Pixels of colour, and of depth codes of 12 bits."""
+CODEC = "libx264"
+RGB = "rgb24"
 KEYFRAME_EVERY = 2
 """Training reads single frames at random, so every second one can be decoded alone."""
 
@@ -41,7 +37,6 @@ class VideoWriter:
         width: int,
         height: int,
         crf: int,
-        is_depth: bool = False,
         keyframe_every: int = KEYFRAME_EVERY,
     ) -> None:
         """Create the file; sizes that are odd get full chroma, for the usual one needs even.
@@ -50,7 +45,6 @@ class VideoWriter:
             path: The file; its folder is made where needed.
             width: Of every frame [px].
             height: Of every frame [px].
-            is_depth: Frames are 12-bit codes, kept without loss.
 
         Raises:
             MissingDependencyError: Without PyAV, or with one that has no encoder for this.
@@ -63,27 +57,22 @@ class VideoWriter:
         self._intra = av.video.frame.PictureType.I
         self._container = av.open(str(path), "w")
         options = {"g": str(keyframe_every), "bf": "0", "preset": "veryfast", "forced-idr": "1"}
-        if is_depth:
-            options["x265-params"] = "lossless=1:bframes=0:log-level=none"
-        else:
-            options["crf"] = str(crf)
-        codec = DEPTH_CODEC if is_depth else CODEC
-        if codec not in av.codecs_available:
-            raise MissingDependencyError(package=f"av with {codec}", extra="video", purpose="video")
-        self._stream = self._container.add_stream(codec, rate=fps, options=options)
+        options["crf"] = str(crf)
+        if CODEC not in av.codecs_available:
+            raise MissingDependencyError(package=f"av with {CODEC}", extra="video", purpose="video")
+        self._stream = self._container.add_stream(CODEC, rate=fps, options=options)
         self._stream.width, self._stream.height = width, height
         is_even = width % 2 == 0 and height % 2 == 0
-        self.pix_fmt = PIX_FMT if is_depth else "yuv420p" if is_even else "yuv444p"
+        self.pix_fmt = "yuv420p" if is_even else "yuv444p"
         self._stream.pix_fmt = self.pix_fmt
-        self._format = PIX_FMT if is_depth else RGB
 
     def write(self, pixels: np.ndarray, *, first: bool) -> None:
         """Append one frame; the first of an episode can be decoded without those before it.
 
         Args:
-            pixels: RGB, height x width x 3 of uint8; of depth codes, height x width of uint16.
+            pixels: RGB, height x width x 3 of uint8.
         """
-        frame = self._frame_class.from_ndarray(pixels, format=self._format)
+        frame = self._frame_class.from_ndarray(pixels, format=RGB)
         if first:
             frame.pict_type = self._intra
         frame.pts = self.num_frames

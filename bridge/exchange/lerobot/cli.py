@@ -24,7 +24,7 @@ def export_lerobot(
 ) -> int:
     """Write a run's trials as a LeRobotDataset v3.0: Parquet tables and H.264 video.
 
-    With --depth also depth, as lerobot 0.6 stores it. README.md in OUT says what each column is.
+    README.md in OUT says what each column is.
     Example: robot-gst export lerobot runs/demo datasets/demo --fps 30
 
     Args:
@@ -45,7 +45,7 @@ def export_lerobot(
     text = (
         f"{out}: {report.episodes} episodes, {report.frames} rows at {report.fps} Hz, "
         f"actions: {report.action.replace('_', ' ')}, {label}; "
-        f"depth {'as 12-bit HEVC' if config.depth else 'left out'}"
+        "depth left out"
     )
     output.result({"out": str(out), **asdict(report)}, text)
     return 0

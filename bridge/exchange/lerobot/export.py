@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt16
+from jaxtyping import Float, Int, UInt8
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.catalogue import outcome_of
-from bridge.episode.cdr.messages import DepthImage, color_from_message
+from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.clocks import open_episode
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -28,10 +28,9 @@ from bridge.episode.streams import (
     joint_track,
     plans,
 )
-from bridge.episode.topics import COLOR_IMAGE, DEPTH_IMAGE, GRIPPER_STATE
+from bridge.episode.topics import COLOR_IMAGE, GRIPPER_STATE
 from bridge.errors import EpisodeError, UsageError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.depth import SUFFIX
 from bridge.exchange.lerobot.layout import LeRobotConfig
 from bridge.exchange.lerobot.writer import DatasetShape, DatasetWriter
 from bridge.exchange.output import message_named, new_folder, safe_names, write_note
@@ -58,8 +57,6 @@ class Samples:
     images: dict[str, Int[np.ndarray, " num_rows"]]
     """By camera: which of its images belongs to each row."""
     max_image_offset_ns: dict[str, int]
-    depths: dict[str, Int[np.ndarray, " num_rows"]]
-    """By camera: which of its depth images belongs to each row."""
 
     def action(self, kind: ActionKind) -> Float[np.ndarray, "num_rows num_joints"]:
         """Return the actions; the last row of ``next_state`` repeats its own state."""
@@ -77,7 +74,7 @@ def choose_fps(episode: Episode) -> int:
     return DEFAULT_FPS
 
 
-def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
+def sample(episode: Episode, fps: int) -> Samples:
     """Put an episode on the grid, over the time in which joints and all cameras are there."""
     tracks = [joint_track(episode)]
     if any(topic.endswith(GRIPPER_STATE) for topic in episode.topics_of_type(schema.JOINT_STATE)):
@@ -106,20 +103,6 @@ def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
         nearest = _nearest(stamps, stamps_ns)
         images[camera] = numbers[nearest]
         offsets[camera] = int(np.abs(stamps[nearest] - stamps_ns).max())
-    depths = {}
-    for camera in cameras if depth else ():
-        if find_camera_topic(episode, camera, DEPTH_IMAGE[1:]) is None:
-            continue
-        stamps, numbers = _image_stamps(episode, camera, DEPTH_IMAGE)
-        if not len(stamps):
-            raise EpisodeError(
-                path=episode.path,
-                found=f"camera {camera} has a depth topic and no depth images",
-                hint="Leave --depth out, or the episode.",
-            )
-        nearest = _nearest(stamps, stamps_ns)
-        depths[camera] = numbers[nearest]
-        offsets[f"{camera}{SUFFIX}"] = int(np.abs(stamps[nearest] - stamps_ns).max())
     names = tuple(name for track in tracks for name in track.names)
     return Samples(
         names=names,
@@ -128,7 +111,6 @@ def sample(episode: Episode, fps: int, *, depth: bool = False) -> Samples:
         command=_commands(episode, tracks, stamps_ns + NS_PER_S // fps),
         images=images,
         max_image_offset_ns=offsets,
-        depths=depths,
     )
 
 
@@ -158,39 +140,21 @@ def row_images(
             row += 1
 
 
-def row_depths(
-    episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"]
-) -> Iterator[UInt16[np.ndarray, "height width"]]:
-    """Yield the depth of each row [mm]; ``wanted`` never decreases."""
-    row = 0
-    for number, message in enumerate(episode.messages([_topic(episode, camera, DEPTH_IMAGE)])):
-        if row == len(wanted):
-            return
-        if number != wanted[row]:
-            continue
-        with message_named(episode, message.topic, number + 1):
-            depth_mm = DepthImage.from_message(message.type_name, message.data).depth_mm
-        while row < len(wanted) and number == wanted[row]:
-            yield depth_mm
-            row += 1
-
-
-def _topic(episode: Episode, camera: str, ending: str = COLOR_IMAGE) -> str:
-    topic = find_camera_topic(episode, camera, ending[1:])
+def _topic(episode: Episode, camera: str) -> str:
+    topic = find_camera_topic(episode, camera, COLOR_IMAGE[1:])
     assert topic is not None  # noqa: S101  # camera_ids found it
     return topic
 
 
 def _image_stamps(
-    episode: Episode, camera: str, ending: str = COLOR_IMAGE
+    episode: Episode, camera: str
 ) -> tuple[Int[np.ndarray, " num_images"], Int[np.ndarray, " num_images"]]:
     """Stamps of a camera's images and their place in the file; those out of order left out."""
     stamps: list[int] = []
     numbers: list[int] = []
-    read = color_from_message if ending == COLOR_IMAGE else DepthImage.from_message
-    for number, message in enumerate(episode.messages([_topic(episode, camera, ending)])):
+    for number, message in enumerate(episode.messages([_topic(episode, camera)])):
         with message_named(episode, message.topic, number + 1):
-            stamp_ns = read(message.type_name, message.data).stamp_ns
+            stamp_ns = color_from_message(message.type_name, message.data).stamp_ns
         if not stamps or stamp_ns > stamps[-1]:
             stamps.append(stamp_ns)
             numbers.append(number)
@@ -266,11 +230,6 @@ configs:
 ---
 
 """
-_DEPTH_LINE = (
-    f"- Depth (`...{SUFFIX}`) as lerobot 0.6 and later store it: 12-bit codes on a logarithmic "
-    "scale from 0.01 to 10 m, HEVC without further loss; at most 2 mm off up to 10 m, code 0 is "
-    "no measurement. Statistics are in millimetres, of what was measured.\n"
-)
 _ACTIONS = {
     "plan": (
         "what the executed plan commands for the time of the next row (joints interpolated "
@@ -311,8 +270,7 @@ def card_text(shape: DatasetShape, kind: ActionKind, table: list[dict[str, Any]]
         f"- Cameras: {cameras}. A row has the image nearest in time, re-encoded as H.264 "
         f"(crf {shape.crf}, lossy).\n"
         f"- `{layout.DONE}` is true in the last row. {success}\n"
-        f"{_DEPTH_LINE if shape.depths else ''}"
-        f"- Left out: {'' if shape.depths else 'depth, '}plans, events, verdicts.\n"
+        "- Left out: depth, plans, events, verdicts.\n"
         "- Image statistics look at every fourth pixel of both axes.\n"
     )
 
@@ -383,13 +341,12 @@ def export_lerobot(
         first = open_episode(files[0], clock=config.clock)
         fps = config.fps or choose_fps(first)
         success = [_success(run, Episode.open(path)) for path in files]
-        kind, sizes, depth_sizes = _look(files, fps, config, advance)
+        kind, sizes = _look(files, fps, config, advance)
         cameras = safe_names(sizes)
         shape = DatasetShape(
             fps=fps,
             names=sample(first, fps).names,
             cameras={safe: sizes[camera] for camera, safe in cameras.items()},
-            depths={cameras[camera] + SUFFIX: size for camera, size in depth_sizes.items()},
             robot_type=first.info.robot or first.info.cell,
             labelled=None not in success,
             crf=config.crf,
@@ -430,13 +387,7 @@ def _add_all(
     """Write one episode after another; yields what there is to say of each."""
     for number, path in enumerate(files):
         episode = open_episode(path, clock=config.clock)
-        samples = sample(episode, shape.fps, depth=config.depth)
-        depths = {
-            cameras[camera] + SUFFIX: _depths(
-                episode, camera, wanted, shape.depths[cameras[camera] + SUFFIX]
-            )
-            for camera, wanted in samples.depths.items()
-        }
+        samples = sample(episode, shape.fps)
         writer.add(
             task=_task(episode),
             state=samples.state,
@@ -445,51 +396,47 @@ def _add_all(
             images={
                 safe: _images(episode, camera, samples.images[camera], shape.cameras[safe])
                 for camera, safe in cameras.items()
-            }
-            | depths,
+            },
         )
         yield _row(number, episode, samples, success[number])
 
 
 def _look(
     files: Sequence[Path], fps: int, config: LeRobotConfig, advance: Advance
-) -> tuple[ActionKind, Sizes, Sizes]:
+) -> tuple[ActionKind, Sizes]:
     """Check that all episodes agree before anything is written; decide what the actions are.
 
     Returns:
-        The actions, and the sizes of images and of depth by camera.
+        The actions, and the sizes of images by camera.
     """
     names: tuple[str, ...] = ()
     sizes: Sizes = {}
-    depth_sizes: Sizes = {}
     without_plan: list[Path] = []
     for number, path in enumerate(files):
         episode = open_episode(path, clock=config.clock)
-        samples = sample(episode, fps, depth=config.depth)
+        samples = sample(episode, fps)
         found = {camera: _size(episode, camera, samples) for camera in samples.images}
-        found_depth = {camera: _depth_size(episode, camera, samples) for camera in samples.depths}
         if number == 0:
-            names, sizes, depth_sizes = samples.names, found, found_depth
-        if (samples.names, found, found_depth) != (names, sizes, depth_sizes):
+            names, sizes = samples.names, found
+        if (samples.names, found) != (names, sizes):
             raise EpisodeError(
                 path=path,
-                found=f"joints {', '.join(samples.names)}, cameras {_words(found)}, depth "
-                f"{_words(found_depth)}, but {files[0].name} has {', '.join(names)}, "
-                f"{_words(sizes)}, {_words(depth_sizes)}",
+                found=f"joints {', '.join(samples.names)}, cameras {_words(found)}, "
+                f"but {files[0].name} has {', '.join(names)}, {_words(sizes)}",
                 hint="One dataset has one robot and one set of cameras; choose with --episodes.",
             )
         if samples.command is None:
             without_plan.append(path)
         advance(number + 1, path.stem)
     if config.action == "next-state" or (config.action == "auto" and without_plan):
-        return "next_state", sizes, depth_sizes
+        return "next_state", sizes
     if without_plan:
         raise EpisodeError(
             path=without_plan[0],
             found="no executed plan that says every joint and the gripper's width",
             hint="Leave --action plan out; the next state is the action then.",
         )
-    return "plan", sizes, depth_sizes
+    return "plan", sizes
 
 
 def _words(sizes: dict[str, tuple[int, int]]) -> str:
@@ -499,19 +446,6 @@ def _words(sizes: dict[str, tuple[int, int]]) -> str:
 def _size(episode: Episode, camera: str, samples: Samples) -> tuple[int, int]:
     image_u8 = next(row_images(episode, camera, samples.images[camera][:1]))
     return image_u8.shape[0], image_u8.shape[1]
-
-
-def _depth_size(episode: Episode, camera: str, samples: Samples) -> tuple[int, int]:
-    depth_mm = next(row_depths(episode, camera, samples.depths[camera][:1]))
-    return depth_mm.shape[0], depth_mm.shape[1]
-
-
-def _depths(
-    episode: Episode, camera: str, wanted: Int[np.ndarray, " num_rows"], size: tuple[int, int]
-) -> Iterator[UInt16[np.ndarray, "height width"]]:
-    for row, depth_mm in enumerate(row_depths(episode, camera, wanted)):
-        _refuse_size(episode, f"depth of {camera}", row, depth_mm, size)
-        yield depth_mm
 
 
 def _refuse_size(
@@ -566,7 +500,7 @@ def _write_about(
     choices = {
         "format": f"LeRobotDataset {layout.VERSION}",
         "action": kind,
-        "left_out": [] if shape.depths else ["depth"],
+        "left_out": ["depth"],
         "episodes": table,
     }
     write_note(folder, made_by="export lerobot", sources=files, choices=choices)

@@ -15,18 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Float, Int
 
 from bridge.clock import ns_from_s
 from bridge.episode import schema
-from bridge.episode.cdr.messages import CompressedColor, DepthImage, JointSample
+from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.metadata import EpisodeInfo, Outcome, imported_info
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import (
     COLOR_IMAGE,
-    DEPTH_IMAGE,
     JOINT_STATES,
     camera_topic,
     cell_topic,
@@ -34,12 +33,10 @@ from bridge.episode.topics import (
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.depth import SUFFIX
 from bridge.exchange.lerobot.layout import DatasetInfo, LeRobotFormatError, parquet, read_info
 from bridge.exchange.lerobot.video import read_frames
 from bridge.exchange.output import is_of_stand_in
 from bridge.media.color import JPEG_MAGIC, JPEG_QUALITY, encode_jpeg
-from bridge.media.video_writer import PIX_FMT
 from bridge.terminal import Advance
 
 BATCH_ROWS = 1024
@@ -266,8 +263,6 @@ class _Plan:
     joints: dict[str, str]
     cameras: dict[str, str]
     """Camera id by feature key."""
-    depths: dict[str, str]
-    """The same of depth videos; that of a camera's colour where there is one of the name."""
     left_out: tuple[str, ...]
 
 
@@ -324,14 +319,12 @@ def _is_there(run: RunFolder, entry: EpisodeEntry, origin: dict[str, str]) -> bo
 def _plan(info: DatasetInfo, cell: str) -> _Plan:
     joints: dict[str, str] = {}
     cameras: dict[str, str] = {}
-    depths: dict[str, str] = {}
     left_out = []
     for key, feature in info.features.items():
         if key in layout.DEFAULT_FEATURES:
             continue
-        if feature.depth is not None:
-            camera = _safe(key.removeprefix(layout.IMAGES).removeprefix("observation."))
-            depths[key] = camera.removesuffix(SUFFIX) or camera
+        if feature.is_depth:
+            left_out.append(f"{key} (depth)")
         elif feature.dtype in ("video", "image"):
             camera = _safe(key.removeprefix(layout.IMAGES).removeprefix("observation."))
             while camera in cameras.values():
@@ -343,7 +336,7 @@ def _plan(info: DatasetInfo, cell: str) -> _Plan:
             )
         else:
             left_out.append(f"{key} ({feature.dtype} {list(feature.shape)})")
-    return _Plan(joints=joints, cameras=cameras, depths=depths, left_out=tuple(left_out))
+    return _Plan(joints=joints, cameras=cameras, left_out=tuple(left_out))
 
 
 def _safe(text: str) -> str:
@@ -366,7 +359,6 @@ def _write(
     stamps_ns = _stamps_ns(info, rows)
     columns = {key: _numbers(info, rows, key) for key in plan.joints}
     images = {key: _images(info, rows, key) for key in plan.cameras}
-    depths = {key: _depths(info, rows, key) for key in plan.depths}
     writer = EpisodeWriter(run.episodes_dir / f"{_episode_id(entry)}.mcap")
     try:
         writer.describe(about, outcome=_outcome(rows))
@@ -384,8 +376,6 @@ def _write(
                 )
             for key, camera in plan.cameras.items():
                 _write_image(writer, camera_topic(cell, camera), stamp_ns, next(images[key]))
-            for key, camera in plan.depths.items():
-                _write_depth(writer, camera_topic(cell, camera), stamp_ns, next(depths[key]))
         writer.add_metadata("source", _source(info, plan, rows, origin))
         return writer.close()
     except BaseException:
@@ -406,25 +396,6 @@ def _write_image(writer: EpisodeWriter, prefix: str, stamp_ns: int, data: bytes)
         type_name=schema.COMPRESSED_IMAGE,
         log_time_ns=stamp_ns,
     )
-
-
-def _write_depth(
-    writer: EpisodeWriter, prefix: str, stamp_ns: int, depth_mm: UInt16[np.ndarray, "h w"]
-) -> None:
-    frame_id = f"{prefix.rsplit('/', 1)[-1]}_color_optical"
-    depth = DepthImage(stamp_ns=stamp_ns, frame_id=frame_id, depth_mm=depth_mm)
-    topic = f"{prefix}{DEPTH_IMAGE}"
-    writer.write(topic, depth.to_cdr(), type_name=schema.IMAGE, log_time_ns=stamp_ns)
-
-
-def _depths(
-    info: DatasetInfo, rows: EpisodeRows, key: str
-) -> Iterator[UInt16[np.ndarray, "height width"]]:
-    coding, span = info.features[key].depth, rows.entry.videos[key]
-    assert coding is not None  # noqa: S101  # chosen by it
-    times_s = span.from_s + np.arange(rows.entry.length) / info.fps
-    for codes in read_frames(span.path, times_s.tolist(), 0.5 / info.fps, PIX_FMT):
-        yield coding.decode(codes)
 
 
 def _stamps_ns(info: DatasetInfo, rows: EpisodeRows) -> Int[np.ndarray, " num_rows"]:
@@ -522,12 +493,7 @@ def _source(
         "times": "nominal, from 0; the format keeps no clock",
         "units": "as in the dataset, not converted",
         "images": f"video frames re-encoded as JPEG q{JPEG_QUALITY}: {', '.join(videos) or 'none'}",
-        "depth": {
-            key: f"12-bit codes of {coding.min_m:g} to {coding.max_m:g} m; code 0: no measurement"
-            for key in plan.depths
-            if (coding := info.features[key].depth) is not None
-        },
-        "topics": {**plan.joints, **plan.cameras, **plan.depths},
+        "topics": {**plan.joints, **plan.cameras},
         "left_out": plan.left_out,
     }
     return {name: json.dumps(value) for name, value in record.items()}

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 from bridge.clock import ClockChoice
 from bridge.errors import BridgeError, MissingDependencyError, PathNotFoundError, refuse_outside
-from bridge.exchange.lerobot.depth import DepthCoding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +27,6 @@ class LeRobotConfig:
     """Only the episodes with these ids, of any kind."""
     crf: int = 23
     """Quality of the H.264 video, lower is better."""
-    depth: bool = False
-    """Also depth, as lerobot 0.6 and later store it: 12-bit HEVC without further loss."""
     clock: ClockChoice = "recorded"
     """corrected takes offset and drift of the sources' clocks out of all stamps."""
 
@@ -82,8 +79,8 @@ class Feature:
     shape: tuple[int, ...]
     names: tuple[str, ...]
     """One per number; made up where the dataset names none."""
-    depth: DepthCoding | None = None
-    """Of a depth video."""
+    is_depth: bool = False
+    """A video of depth codes, which are no colours."""
 
     @property
     def is_numeric_vector(self) -> bool:
@@ -191,9 +188,12 @@ def _feature(key: str, record: dict[str, Any]) -> Feature:
         if len(names) != shape[0] or len(set(names)) != len(names):
             names = [last] if shape[0] == 1 else [f"{last}_{i}" for i in range(shape[0])]
     found = record.get("info") or record.get("video_info") or {}
-    depth = DepthCoding.from_info(found) if record["dtype"] == "video" else None
     return Feature(
-        key=key, dtype=str(record["dtype"]), shape=shape, names=tuple(names), depth=depth
+        key=key,
+        dtype=str(record["dtype"]),
+        shape=shape,
+        names=tuple(names),
+        is_depth=any(found.get(name) is True for name in ("is_depth_map", "video.is_depth_map")),
     )
 
 

@@ -10,9 +10,7 @@ from bridge.exchange.lerobot.layout import LeRobotFormatError
 from bridge.media.video_writer import RGB, pyav
 
 
-def read_frames(
-    path: Path, times_s: Sequence[float], tolerance_s: float, pixels: str = RGB
-) -> Iterator[np.ndarray]:
+def read_frames(path: Path, times_s: Sequence[float], tolerance_s: float) -> Iterator[np.ndarray]:
     """Yield the frame nearest to each time; times ascend [s]."""
     if not len(times_s):
         return
@@ -33,7 +31,7 @@ def read_frames(
                 )
             decoded = container.decode(stream)
             for frame in _nearest(path, decoded, times_s, tolerance_s):
-                yield frame.to_ndarray(format=pixels)
+                yield frame.to_ndarray(format=RGB)
     except (av.FFmpegError, OSError) as error:
         raise LeRobotFormatError(
             path=path,

@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from bridge.errors import MissingDependencyError
 from bridge.exchange.lerobot import layout
-from bridge.exchange.lerobot.depth import DepthCoding
 from bridge.exchange.lerobot.layout import parquet
 from bridge.media.video_writer import VideoWriter
 
@@ -75,21 +74,15 @@ class RunningStats:
 
 @dataclass(kw_only=True)
 class ImageStats:
-    """The same over the pixels of images, per channel; counts images.
-
-    Colour is scaled to 0..1; depth is in millimetres, where something was measured.
-    """
+    """The same over the pixels of images, scaled to 0..1, per channel; counts images."""
 
     pixels: RunningStats = field(default_factory=RunningStats)
     images: int = 0
 
     def add(self, pixels: np.ndarray) -> None:
-        """Add one image: height x width x 3 of uint8, or height x width of depth in uint16 [mm]."""
+        """Add one image: height x width x 3 of uint8."""
         thinned = pixels[::PIXEL_STRIDE, ::PIXEL_STRIDE]
-        if pixels.ndim == 3:
-            self.pixels.add(thinned.reshape(-1, 3).astype(np.float64) / 255.0)
-        else:
-            self.pixels.add(thinned[thinned > 0].reshape(-1, 1).astype(np.float64))
+        self.pixels.add(thinned.reshape(-1, 3).astype(np.float64) / 255.0)
         self.images += 1
 
     def merge(self, other: "ImageStats") -> None:
@@ -119,8 +112,6 @@ class DatasetShape:
     """Joints of state and action."""
     cameras: dict[str, tuple[int, int]]
     """Height and width by camera."""
-    depths: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Height and width of the depth of those cameras that have it, by the feature's name."""
     robot_type: str
     labelled: bool
     """Whether ``next.success`` is written."""
@@ -137,12 +128,6 @@ class DatasetShape:
             features[layout.IMAGES + camera] = {
                 "dtype": "video",
                 "shape": [height, width, 3],
-                "names": ["height", "width", "channels"],
-            }
-        for camera, (height, width) in self.depths.items():
-            features[layout.IMAGES + camera] = {
-                "dtype": "video",
-                "shape": [height, width, 1],
                 "names": ["height", "width", "channels"],
             }
         flags = (layout.DONE, layout.SUCCESS) if self.labelled else (layout.DONE,)
@@ -187,8 +172,7 @@ class DatasetWriter:
         self._data: Any = None
         self._episodes: Any = None
         self._rows: list[dict[str, Any]] = []
-        self._coding = DepthCoding()
-        self._videos = {camera: _Video() for camera in (*shape.cameras, *shape.depths)}
+        self._videos = {camera: _Video() for camera in shape.cameras}
         self._stats: dict[str, RunningStats | ImageStats] = {}
 
     def add(
@@ -297,16 +281,14 @@ class DatasetWriter:
         video, key = self._videos[camera], layout.IMAGES + camera
         if video.writer is None:
             path = self._folder / layout.VIDEO_PATH.format(video_key=key, **vars(video.place))
-            is_depth = camera in self._shape.depths
-            height, width = (self._shape.depths if is_depth else self._shape.cameras)[camera]
+            height, width = self._shape.cameras[camera]
             shape = {"width": width, "height": height, "crf": self._shape.crf}
-            video.writer = VideoWriter(path, fps=self._shape.fps, is_depth=is_depth, **shape)
+            video.writer = VideoWriter(path, fps=self._shape.fps, **shape)
             video.pix_fmt = video.writer.pix_fmt
         first = video.writer.num_frames
         found = ImageStats()
         for pixels in frames:
-            coded = self._coding.encode(pixels) if camera in self._shape.depths else pixels
-            video.writer.write(coded, first=found.images == 0)
+            video.writer.write(pixels, first=found.images == 0)
             found.add(pixels)
         stats[key] = found
         used: dict[str, int | float] = {
@@ -369,18 +351,16 @@ class DatasetWriter:
     def _info(self) -> dict[str, Any]:
         features = self._shape.features()
         for camera, video in self._videos.items():
-            is_depth = camera in self._shape.depths
             height, width, channels = features[layout.IMAGES + camera]["shape"]
             features[layout.IMAGES + camera]["info"] = {
                 "video.height": height,
                 "video.width": width,
-                "video.codec": "hevc" if is_depth else "h264",
+                "video.codec": "h264",
                 "video.pix_fmt": video.pix_fmt,
                 "video.is_depth_map": False,
                 "video.fps": self._shape.fps,
                 "video.channels": channels,
                 "has_audio": False,
-                **(self._coding.to_info() if is_depth else {}),
             }
         return {
             "codebase_version": layout.VERSION,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot_dataset import LENGTHS, Dataset, png, run, shade, state
+from lerobot_dataset import CAMERA, LENGTHS, Dataset, png, run, shade, state
 
 from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.reader import Episode
@@ -73,6 +73,17 @@ def test_the_episode_says_what_it_is_made_of(dataset: Dataset, tmp_path: Path) -
     assert "re-encoded as JPEG" in source["images"]
     assert "nominal" in source["times"]
     assert source["left_out"] == ["observation.env (float32 [2, 2])"]
+
+
+@pytest.mark.parametrize("flag", ["is_depth_map", "video.is_depth_map"])
+def test_depth_is_left_out_and_never_taken_for_colour(
+    dataset: Dataset, tmp_path: Path, flag: str
+) -> None:
+    dataset.info["features"][CAMERA]["info"] = {flag: True}
+    assert run("import", "lerobot", dataset.write(), tmp_path / "run") == 0
+    episode = Episode.open(min((tmp_path / "run" / "episodes").iterdir()))
+    assert f"{CAMERA} (depth)" in episode.metadata_records["source"]["left_out"]
+    assert not [topic for topic in episode.topics() if "/front/" in topic]
 
 
 def test_a_selection_imports_only_those_and_a_second_run_only_the_rest(
