@@ -73,8 +73,10 @@ GONE: dict[str, str] = {
     ),
     **dict.fromkeys(
         ("evaluate --live", "evaluate --recorder", "evaluate --connect"),
-        "robot-gst evaluate RUN --goal 0.8 says of all trials so far whether to stop or continue.",
+        "robot-gst evaluate RUN says of all trials so far how many more would settle the ranking.",
     ),
+    "evaluate --goal": "evaluate says task by task how many more trials would settle the ranking.",
+    "export lerobot --depth": "robot-gst export tum writes depth; a LeRobot data set has colour.",
     "design --past": "Say what is expected: --rate, --gain, --agreement.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",

@@ -24,7 +24,7 @@ from dashboards.answers import kept
 from dashboards.comparison import judge
 from dashboards.config import DashboardConfig
 from dashboards.errors import NotHereError
-from dashboards.guard import Admission, Guard, is_loopback
+from dashboards.guard import Admission, Guard
 from dashboards.library import Library, derived_path, episode_path, scene_stamps
 from dashboards.loading import LOADING
 from dashboards.overview_page import build_overview, neighbours
@@ -52,7 +52,7 @@ def create_app(
     """
     admission = admission or Admission()
     live = live or DashboardConfig()
-    pages = Pages(library, live, looks_beside=is_loopback(admission.host))
+    pages = Pages(library, live)
     routes = [
         Route("/", pages.overview, middleware=SMALL),
         Route("/numbers", pages.numbers, middleware=SMALL),
@@ -148,20 +148,13 @@ def _download(path: Path) -> Response:
 class Pages:
     """Answers for one library of runs. Plain functions: Starlette runs them in threads."""
 
-    def __init__(
-        self,
-        library: Library,
-        live: DashboardConfig,
-        *,
-        looks_beside: bool = True,
-    ) -> None:
+    def __init__(self, library: Library, live: DashboardConfig) -> None:
         """Remember the runs and load the templates."""
         self._library = library
         self._environment = _environment()
         self.studies = StudyPages(
             self._run,
             self._page,
-            lambda run: library.others(run, beside=looks_beside),
             self._part,
             live,
         )

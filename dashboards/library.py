@@ -10,8 +10,6 @@ from bridge.errors import UsageError
 from dashboards.errors import NotHereError
 
 RESULTS = "results.json"
-MOST_BESIDE = 500
-"""Folders that are looked at for runs."""
 Stamps = tuple[tuple[str, int, int], ...]
 """Name, time of writing [ns] and size of files."""
 
@@ -53,24 +51,6 @@ class Library:
             message = f"no run is named {name!r}. Runs shown: {', '.join(self.runs)}."
             raise NotHereError(message)
         return self.runs[name]
-
-    def others(self, run: RunFolder, *, beside: bool) -> dict[str, RunFolder]:
-        """Return the runs that one can be compared with, by name.
-
-        Args:
-            beside: Also the runs in the same folder that are not shown.
-        """
-        here = run.path.resolve()
-        found = {name: other for name, other in self.runs.items() if other.path.resolve() != here}
-        known = {here, *(other.path.resolve() for other in found.values())}
-        try:
-            near = sorted(here.parent.iterdir()) if beside else []
-        except OSError:  # not ours to list
-            near = []
-        for path in near[:MOST_BESIDE]:
-            if (path / "episodes").is_dir() and path.resolve() not in known:
-                found.setdefault(path.name, RunFolder.open(path))
-        return found
 
 
 def episode_path(run: RunFolder, episode_id: str) -> Path:

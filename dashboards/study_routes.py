@@ -1,6 +1,6 @@
 """Addresses of pages about many trials at once. What reads episodes is imported when asked for."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -26,8 +26,6 @@ PARTS = ("summary", "topics", "clocks", "verdicts")
 _SHARING = Lock()
 RunOf = Callable[[Request], RunFolder]
 Page = Callable[..., Response]
-OthersOf = Callable[[RunFolder], Mapping[str, RunFolder]]
-"""Gives the runs that one may be compared with, by name."""
 
 
 class StudyPages:
@@ -37,7 +35,6 @@ class StudyPages:
         self,
         run_of: RunOf,
         page: Page,
-        others_of: OthersOf,
         part: Callable[[str, object], str],
         config: DashboardConfig,
     ) -> None:
@@ -46,7 +43,7 @@ class StudyPages:
         Args:
             part: Fills in a part of the page Live, by name, with what is heard.
         """
-        self._run, self._page, self._others, self._part = run_of, page, others_of, part
+        self._run, self._page, self._part = run_of, page, part
         self._config = config
         self._feed: LiveFeed | None = None
         self._making = Lock()
@@ -59,7 +56,6 @@ class StudyPages:
             Route("/failures", self.failures),
             Route("/failures/picture/{id}", self.picture),
             Route("/failures/clip/{id}", self.clip),
-            Route("/compare", self.compare),
             Route("/share", self.share),
             Route("/live", self.live),
             Route("/live/events", self.events),
@@ -106,21 +102,6 @@ class StudyPages:
         except MissingDependencyError as error:
             raise NotHereError(str(error)) from error
         return kept(data, "video/mp4")
-
-    def compare(self, request: Request) -> Response:
-        """``/compare?with=RUN``: only what differs."""
-        with LOADING:
-            from dashboards.compare_page import build_compare  # noqa: PLC0415  # loads the evaluator
-
-        run = self._run(request)
-        others = self._others(run)
-        name = request.query_params.get("with", "")
-        if name and name not in others:
-            message = f"no run {name!r} to compare with. There are: {', '.join(others) or 'none'}."
-            raise NotHereError(message)
-        judged = {each: judge(other) if each == name else None for each, other in others.items()}
-        found = build_compare(run, judge(run), judged, request.query_params)
-        return self._page("compare.html", request, page=found)
 
     def share(self, request: Request) -> Response:
         """``/share?trial=ID&trial=ID``: these trials in one file, to be saved and sent."""

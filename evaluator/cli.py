@@ -35,7 +35,6 @@ def evaluate(
     against: Path | None = None,
     reviews: tuple[Path, ...] = (),
     interval: Literal["wilson", "clopper-pearson", "jeffreys"] = "wilson",
-    goal: float | None = None,
     force: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
     latex: bool = False,
@@ -61,8 +60,6 @@ def evaluate(
         reviews: A second rater's labels (columns trial_id, rater, time, result, cause; or a folder
             of such files), beside those in RUN/reviews: kappa of each two raters.
         interval: Interval of success rates.
-        goal: A success rate from 0 to 1: say for each group whether its trials settle that it lies
-            above or below, at any time, or how many more that may take.
         force: Read every file of the run again, whatever RUN/results/cache remembers.
         everything: Show and write the tables that nobody decides by, and list every number.
         latex: Write the headline tables as LaTeX, too.
@@ -71,15 +68,9 @@ def evaluate(
     """
     from evaluator.thresholds import parse_thresholds
 
-    if goal is not None and not 0 < goal < 1:
-        from bridge.errors import UsageError
-
-        message = f"--goal {goal} is not a success rate between 0 and 1, for example 0.8."
-        raise UsageError(message)
     thresholds = [] if fail_under is None else parse_thresholds(fail_under)
     asked = _Asked(
         interval=interval,
-        goal=goal,
         tables=tables,
         images=images,
         force=force,
@@ -179,7 +170,6 @@ class _Asked:
     """What was asked of the sources."""
 
     interval: str
-    goal: float | None
     tables: TableOptions
     images: ImageOptions
     force: bool
@@ -240,7 +230,6 @@ def _compare(sources: Sequence[Path], asked: _Asked, output: Output) -> "tuple[C
         comparison = compare_run(
             run,
             method=asked.interval,
-            goal=asked.goal,
             images=asked.images,
             cache=cache,
             output=output,
@@ -269,7 +258,7 @@ def _with_others(
 def _compare_table(source: Path, asked: _Asked) -> "Comparison":
     from evaluator.compare import compare_csv
 
-    return compare_csv(source, method=asked.interval, goal=asked.goal, options=asked.tables)
+    return compare_csv(source, method=asked.interval, options=asked.tables)
 
 
 def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> "Comparison":
@@ -278,7 +267,6 @@ def _compare_several(sources: Sequence[Path], asked: _Asked, output: Output) -> 
     return compare_several(
         sources,
         method=asked.interval,
-        goal=asked.goal,
         options=asked.tables,
         force=asked.force,
         output=output,

@@ -16,7 +16,6 @@ from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
 from evaluator.quantity import quantity_of as quantity_of
 from evaluator.quantity import slug as slug
-from evaluator.statistics import gate
 
 # ruff: noqa: E501  # one line for each definition
 
@@ -248,7 +247,6 @@ SPEARMAN = _agreement(
     "higher",
     "Spearman rank correlation of the same rates {what}; average ranks",
 )
-KENDALL = _agreement("kendall_tau_b", "1", "higher", "Kendall's tau-b of the same rates {what}")
 BIAS = _agreement(
     "bias_pp",
     "pp",
@@ -256,24 +254,6 @@ BIAS = _agreement(
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
 MAE = _agreement("mae_pp", "pp", "lower", "mean |sim rate - recorded rate| {what}")
-RMSE = _agreement(
-    "rmse_pp",
-    "pp",
-    "lower",
-    "square root of the mean (sim rate - recorded rate)^2 {what}",
-)
-CALIBRATION_SLOPE = _agreement(
-    "calibration_slope",
-    "1",
-    "none",
-    "slope of recorded = a + b x sim, least squares {what}; 1 is calibrated, noise pulls it towards 0",
-)
-CALIBRATION_INTERCEPT = _agreement(
-    "calibration_intercept_pp",
-    "pp",
-    "none",
-    "intercept of the same line {what}",
-)
 ORDER_ACCURACY = _agreement(
     "order_accuracy",
     "1",
@@ -304,45 +284,6 @@ VARIED_MMRV = _agreement(
     "lower",
     "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
 )
-MMRV_SIM = _agreement(
-    "mmrv_sim_gap",
-    "1",
-    "lower",
-    "mean maximum rank violation {what}; convention: gap of sim rates (arguments swapped, as some published code does); it grows with the number of groups",
-)
-LARGEST_GAP = _new(
-    "agreement.largest_gap_pp",
-    "pp",
-    "lower",
-    "largest |sim rate - recorded rate| {what}",
-)
-DECISIONS = {
-    name: _new(
-        f"decision.{part}",
-        "1",
-        "higher",
-        f"tasks in which {words} (best: highest rate, ties together) / tasks with a choice of condition or policy",
-    )
-    for name, part, words in (
-        (
-            "confident",
-            "surely_right",
-            "every choice that is best in the twin is among the recorded best",
-        ),
-        (
-            "possibly_right",
-            "possibly_right",
-            "one choice that is best in the twin is among the recorded best",
-        ),
-    )
-}
-REGRET = _new(
-    "decision.regret_pp",
-    "pp",
-    "lower",
-    "recorded success lost by choosing what is best in the twin, the worst of a tie, mean over tasks with a choice",
-)
-
 # Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
 
 AGREED = _new(
@@ -431,23 +372,11 @@ BRIER_OF_BASE_RATE = _new(
     "none",
     "Brier score of always saying the observed success rate; above it the probability is worth nothing",
 )
-ECE = _new(
-    "reliability.ece",
-    "1",
-    "lower",
-    f"expected calibration error: {gate.NUM_BINS} bins of equal width, sum of n_bin / n x |mean probability - success rate|; biased upwards for few trials, which the interval takes out; {_WHOSE}",
-)
 BRIER_PERFECT = _new(
     "reliability.brier_perfect",
     "1",
     "none",
     "Brier score of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
-)
-ECE_PERFECT = _new(
-    "reliability.ece_perfect",
-    "1",
-    "none",
-    "expected calibration error of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 LABEL_AGREED = _new(
     "label.localised.rate",
@@ -461,21 +390,6 @@ LABEL_OBJECTS = _new(
     "1",
     "higher",
     "trials where the operator counted as many objects as the predicate on the localised poses / trials labelled by object where both are known",
-)
-
-# Confidence sequences.
-
-SEQUENCE = _new(
-    "sequence.recorded.{task}.{condition}.{policy}",
-    "1",
-    "higher",
-    "successes / trials as labelled, with a betting confidence sequence in the order in which they were recorded (of a table: its rows): it may be looked at after every one, to stop or to continue",
-)
-REPLANNING_EVIDENCE = _new(
-    "sequence.replanning_evidence.recorded",
-    "1",
-    "none",
-    "what a bettor against 'replanning changes nothing' made of 1, over {improved} improved and {worsened} worsened pairs; {enough:.0f} or more: stop, it is shown at {alpha:g}, however often one looked; {most:g} stands for all that is more",
 )
 
 # Images. A mean over views, before and after an alignment or a mask (``{variant}``).

@@ -141,7 +141,6 @@ EVENT = "gst/Event"
 DROPS = "recorder/Drops"
 CLOCKS = "recorder/Clocks"
 STATUS = "recorder/Status"
-ENTRY = "recorder/Entry"
 POSES_IN_FRAME = "foxglove.PosesInFrame"
 COMPRESSED_VIDEO = "foxglove.CompressedVideo"
 
@@ -156,7 +155,6 @@ _JSON_SCHEMAS = {
     DROPS: ("bridge.episode", "schemas/drops.schema.json"),
     CLOCKS: ("bridge.episode", "schemas/clocks.schema.json"),
     STATUS: ("bridge.episode", "schemas/status.schema.json"),
-    ENTRY: ("bridge.episode", "schemas/entry.schema.json"),
     POSES_IN_FRAME: ("bridge.episode", "schemas/poses_in_frame.schema.json"),
 }
 

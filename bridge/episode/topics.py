@@ -62,7 +62,6 @@ RENDERED_IMAGE = "/rendered/image"
 COLOR_TOPIC = re.compile(f"{CAMERAS}([^/]+){COLOR_IMAGE}$")
 RECORDED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color|recorded)(?:/image)?$")
 RENDERED_TOPIC = re.compile(r"/cam/([^/]+)/(?:color/)?(?:rendered|replayed)(?:/image)?$")
-POSE_ALIGNED_TOPIC = re.compile(r"/cam/([^/]+)/pose_aligned(?:/image)?$")
 MASK_TOPIC = re.compile(r"/cam/([^/]+)/mask/([a-z_]+)(?:/image)?$")
 RECORDED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/recorded/depth(?:_in_color)?$")
 RENDERED_DEPTH_TOPIC = re.compile(r"/cam/([^/]+)/rendered/depth$")

@@ -14,16 +14,12 @@ from scipy.ndimage import correlate1d
 
 from bridge.errors import BridgeError, UndefinedStatisticError
 
-Alignment = Literal["raw", "gain", "affine"]
+Alignment = Literal["raw", "gain"]
 """How a replayed image was brightened before it was scored."""
 ALIGNMENTS: dict[Alignment, str] = {
     "raw": "no colour alignment",
     "gain": (
         "after one gain per image and channel (least squares on the recorded image, "
-        "then clipped to 0..1)"
-    ),
-    "affine": (
-        "after one gain and offset per image and channel (least squares on the recorded image, "
         "then clipped to 0..1)"
     ),
 }
@@ -89,8 +85,7 @@ def aligned(
     Args:
         recorded_u8: The one to come near to: 8 bits, or numbers in 0..1.
         replayed_u8: The one to brighten: 8 bits, or numbers in 0..1.
-        alignment: ``raw`` changes nothing, ``gain`` fits a factor, ``affine`` a factor and an
-            offset.
+        alignment: ``raw`` changes nothing, ``gain`` fits a factor.
     """
     check_same_shape(recorded_u8, replayed_u8)
     replayed = as_float(replayed_u8)
@@ -99,10 +94,8 @@ def aligned(
     recorded = as_float(recorded_u8)
     channels = []
     for a, b in zip(np.moveaxis(replayed, -1, 0), np.moveaxis(recorded, -1, 0), strict=True):
-        shift_a, shift_b = (a.mean(), b.mean()) if alignment == "affine" else (0.0, 0.0)
-        power = float(np.square(a - shift_a).sum())
-        gain = float(((a - shift_a) * (b - shift_b)).sum()) / power if power > 0 else 1.0
-        channels.append(gain * (a - shift_a) + shift_b)
+        power = float(np.square(a).sum())
+        channels.append(float((a * b).sum()) / power * a if power > 0 else a)
     return np.asarray(np.clip(np.stack(channels, axis=-1), 0.0, 1.0))
 
 

@@ -7,12 +7,9 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from bridge.episode import schema
-from bridge.episode.catalogue import read_entry
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.images import COLOR_LAYOUTS, image_header, pixel_rows
 from bridge.episode.cdr.messages import CompressedColor
@@ -243,10 +240,6 @@ class LiveRecorder:
         self._services = serve_control(session, core)
         name = f"/rec/{config.recorder}/status"
         self._status = session.publisher(name, schema.STATUS, qos=Qos.PREVIEW)
-        self._episodes = session.publisher(
-            f"/rec/{config.recorder}/episode", schema.ENTRY, qos=Qos.CONTROL
-        )
-        core.tell_of_episodes(self._say_episode)
         session.declare_alive(f"rec/{config.recorder}/alive")
         self._thread = threading.Thread(target=self._tell, name="status", daemon=True)
         self._thread.start()
@@ -275,20 +268,6 @@ class LiveRecorder:
         if self._status.has_subscribers():
             data = json.dumps(self.core.status()).encode()
             self._status.put(data, source_ns=self.session.now_ns())
-
-    def _say_episode(self, path: Path) -> None:
-        """Tell whoever follows the session what is known of an episode now."""
-        with contextlib.suppress(Exception):  # the episode is safe; this is a courtesy
-            if not self._episodes.has_subscribers():
-                return
-            about = {
-                "schema_version": 1,
-                "recorder": self._recorder,
-                "run": str(self.run.path.resolve()),
-            }
-            entry = asdict(read_entry(self.run, path))
-            data = json.dumps({**about, **entry}).encode()
-            self._episodes.put(data, source_ns=self.session.now_ns())
 
     def close(self) -> dict[str, Any] | None:
         """Finish the open episode, then leave the network; returns the answer to that stop."""

@@ -12,13 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, replace
-from pathlib import Path
 
 from bridge.clock import StepWatch
 from bridge.episode import metadata
 from bridge.episode.catalogue import label_episode, read_entry
 from bridge.episode.contract import find_contract
-from bridge.episode.run_folder import RunFolder, check_episode_id, part_name
+from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import BridgeError, GstError
 from bridge.record.clocks import ClockBook
 from bridge.record.config import RecorderConfig
@@ -86,7 +85,6 @@ class Recorder:
             run, self.config, self.input_queue, self._life, now_ns, self.presence.status
         )
         self._steps = StepWatch(now_ns, wall_ns=wall_ns)
-        self._tell: Callable[[Path], None] = lambda path: None
         self._next_second_s = 0.0
         if self._life.is_quiet:
             self.input_queue.be_quiet(0)
@@ -236,10 +234,7 @@ class Recorder:
             self.presence.end()
             return self._life.stop(outcome, command, discard=discard, reason=reason)
 
-        answer = self._command(act)
-        if not discard:
-            self._tell(self._run.episodes_dir / part_name(answer["episode"], 1))
-        return answer
+        return self._command(act)
 
     def _say(self, text: str) -> None:
         self.news.append(text)
@@ -270,7 +265,6 @@ class Recorder:
         task = self._task_of(info) if task is None else task
         info = described_by(info, task)
         answer = self._command(lambda command: self._life.snapshot(info, command, task))
-        self._tell(self._run.episodes_dir / part_name(info.id, 1))
         return {**answer, **self._keep(task)}
 
     def label(
@@ -308,7 +302,6 @@ class Recorder:
         if text and not outcome.detail:
             outcome = replace(outcome, detail=text)
         note = label_episode(self._run, name, outcome)
-        self._tell(self._run.episodes_dir / part_name(name, 1))
         return {"ok": True, "episode": name, "note": str(note)}
 
     def episodes(self, last: int) -> Answer:
@@ -332,13 +325,6 @@ class Recorder:
     def note_recovered(self, reports: list[Answer]) -> None:
         """Show in the status what was found cut off when the recorder began."""
         self._status.recovered = reports
-
-    def tell_of_episodes(self, tell: Callable[[Path], None]) -> None:
-        """Call this with the first file of every episode that was finished or labelled.
-
-        It runs on the thread that gave the command, and must not raise.
-        """
-        self._tell = tell
 
     def also_tell(self, name: str, ask: Callable[[], object]) -> None:
         """Add something to every status and episode; ``ask`` must answer at once."""

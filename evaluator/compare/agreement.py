@@ -13,18 +13,12 @@ from evaluator.compare.rows import RateGroup
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     BIAS,
-    CALIBRATION_INTERCEPT,
-    CALIBRATION_SLOPE,
-    KENDALL,
-    LARGEST_GAP,
     MAE,
     MMRV_RECORDED,
-    MMRV_SIM,
     ORDER_ACCURACY,
     PEARSON_R,
     PEARSON_R_OF_CONDITION,
     PEARSON_R_REMEASURED,
-    RMSE,
     SPEARMAN,
     Quantity,
 )
@@ -233,21 +227,16 @@ Statistic = Callable[[], float]
 TABLE: tuple[tuple[str, str, float], ...] = (
     ("Pearson r", "pearson", 1.0),
     ("Spearman rho", "spearman", 1.0),
-    ("Kendall tau-b", "kendall", 1.0),
     ("bias (pp)", "bias", 100.0),
     ("mean absolute error (pp)", "mae", 100.0),
-    ("root mean square error (pp)", "rmse", 100.0),
-    ("calibration slope", "slope", 1.0),
-    ("calibration intercept (pp)", "intercept", 100.0),
     ("pairwise order accuracy", "order", 1.0),
     ("MMRV, recorded gap", "mmrv-recorded", 1.0),
-    ("MMRV, sim gap", "mmrv-sim", 1.0),
 )
 """Words, name of the statistic, and factor to the printed unit."""
 
 
 def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
-    """Measure over groups: r, ranks, bias, errors, calibration line, MMRV in both conventions."""
+    """Measure over groups: r, ranks, bias, errors, MMRV."""
     usable = usable_groups(groups)
     intervals = GroupIntervals(usable)
     units = sorted({group.unit for group in usable})
@@ -259,14 +248,6 @@ def group_agreement(groups: Sequence[RateGroup]) -> list[Measurement]:
         *_pearson_by_condition(usable),
         _remeasured(usable, intervals, what),
         *_rest(usable, make),
-        measured(
-            LARGEST_GAP.of(what=what),
-            lambda: 100 * agreement.largest_gap(**_both(usable)),
-            n=len(usable),
-            counted="group",
-            reason_without_interval="a largest value grows with the number of groups",
-            episodes=_episodes(usable),
-        ),
     ]
 
 
@@ -331,22 +312,15 @@ def measure_over(
 
 
 def _rest(groups: Sequence[RateGroup], make: "partial[Measurement]") -> list[Measurement]:
-    """Ranks, errors, the calibration line, and MMRV in both conventions."""
+    """Ranks, errors and MMRV."""
     both = _both(groups)
     recorded, sim = both["recorded"], both["sim"]
     return [
         make(SPEARMAN, "spearman", lambda: agreement.spearman(recorded, sim)),
-        make(KENDALL, "kendall", lambda: agreement.kendall(recorded, sim)),
         make(BIAS, "bias", lambda: agreement.bias(**both)),
         make(MAE, "mae", lambda: agreement.mean_absolute_error(**both)),
-        make(RMSE, "rmse", lambda: agreement.root_mean_square_error(**both)),
-        make(CALIBRATION_SLOPE, "slope", lambda: agreement.calibration_line(**both).slope),
-        make(
-            CALIBRATION_INTERCEPT, "intercept", lambda: agreement.calibration_line(**both).intercept
-        ),
         make(ORDER_ACCURACY, "order", lambda: agreement.order_accuracy(**both).value),
         make(MMRV_RECORDED, "mmrv-recorded", partial(agreement.mmrv, **both, gap="recorded")),
-        make(MMRV_SIM, "mmrv-sim", partial(agreement.mmrv, **both, gap="sim")),
     ]
 
 

@@ -9,7 +9,6 @@ from evaluator.compare.agreement import agreement_intervals, group_agreement, us
 from evaluator.compare.axes import axis_tables
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import (
     gain_tests,
     pair_starts,
@@ -22,7 +21,6 @@ from evaluator.compare.measure import refuse_alike
 from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow
-from evaluator.compare.sequences import sequences, stopping_table
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
 from evaluator.compare.success import (
@@ -67,7 +65,6 @@ def compare_rows(
     source: str,
     stand_in: bool | None,
     method: str = "wilson",
-    goal: float | None = None,
     void_causes: Sequence[str] = VOID_CAUSES,
 ) -> Comparison:
     """Measure everything that follows from trial rows alone, wherever they came from."""
@@ -82,7 +79,7 @@ def compare_rows(
         rows=tuple(rows),
         groups=found.groups,
         measurements=found.measurements,
-        tables=_tables(rows, found, empty.recorded_word, goal),
+        tables=_tables(rows, found, empty.recorded_word),
         exclusions=found.exclusions,
         missing=tuple(_missing(rows, found.measurements)),
     )
@@ -115,9 +112,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *scorecard,
         *reliability(rows),
         *stages,
-        *decisions(groups),
         *model_results(usable_groups(groups)),
-        *sequences(rows, pairs),
     )
     return _Found(
         groups=groups,
@@ -130,9 +125,7 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
     )
 
 
-def _tables(
-    rows: Sequence[TrialRow], found: _Found, word: str, goal: float | None
-) -> tuple[Table, ...]:
+def _tables(rows: Sequence[TrialRow], found: _Found, word: str) -> tuple[Table, ...]:
     """Lay out what was found; ``word`` is what the recorded side is called."""
     groups, measurements = found.groups, found.measurements
     return (
@@ -148,7 +141,6 @@ def _tables(
         *found.stage_tables,
         *failures_table(rows, word),
         *axis_tables(rows, word),
-        *stopping_table(rows, goal),
         trials_table(rows, word),
     )
 

@@ -13,8 +13,6 @@ from evaluator.measurements import (
     BRIER,
     BRIER_OF_BASE_RATE,
     BRIER_PERFECT,
-    ECE,
-    ECE_PERFECT,
     KAPPA,
     NPV,
     PHI,
@@ -24,7 +22,6 @@ from evaluator.result import Interval, Measurement, Table
 from evaluator.statistics.calibration import (
     Perfect,
     brier_interval,
-    calibration_error_interval,
     perfect_forecaster,
 )
 from evaluator.statistics.gate import (
@@ -33,7 +30,6 @@ from evaluator.statistics.gate import (
     brier,
     brier_of_base_rate,
     cost_curve,
-    expected_calibration_error,
     kappa,
     phi,
 )
@@ -177,20 +173,12 @@ def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
             BRIER.of(),
             lambda: (brier(probabilities, happened), brier_interval(probabilities, happened)),
         ),
-        make(BRIER_PERFECT.of(), lambda: _shown(ideal[0]), reason_without_interval=CERTAIN),
+        make(BRIER_PERFECT.of(), lambda: _shown(ideal), reason_without_interval=CERTAIN),
         make(
             BRIER_OF_BASE_RATE.of(),
             lambda: brier_of_base_rate(happened),
             reason_without_interval="the outcomes' own rate; what it would be on others is unknown",
         ),
-        make(
-            ECE.of(),
-            lambda: (
-                expected_calibration_error(probabilities, happened),
-                calibration_error_interval(probabilities, happened),
-            ),
-        ),
-        make(ECE_PERFECT.of(), lambda: _shown(ideal[1]), reason_without_interval=CERTAIN),
     ]
     return measurements
 

@@ -8,7 +8,6 @@ from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord
 from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.decisions import decisions
 from evaluator.compare.gains import gain_tests, replanning_gains
 from evaluator.compare.measure import refuse_alike, vouched_rate
 from evaluator.compare.model import model_results
@@ -38,7 +37,6 @@ def compare_records(
         *group_agreement(groups),
         *gains,
         *gain_tests(groups),
-        *decisions(groups),
         *model_results(usable_groups(groups)),
     )
     return Comparison(

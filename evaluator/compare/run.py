@@ -44,7 +44,6 @@ def compare_run(
     run: RunFolder,
     *,
     method: str = "wilson",
-    goal: float | None = None,
     images: ImageOptions = ImageOptions(),  # noqa: B008  # frozen
     cache: SummaryCache | None = None,
     output: Output = QUIET,
@@ -60,7 +59,7 @@ def compare_run(
     views = compare_views(contents.derived, contents.sources, nets=nets, cache=cache)
     methods = compare_renders(images, contents.derived, contents.sources, nets=nets)
     motions = _imported_motions(contents)
-    base = compare_read([read], name=read.name, method=method, goal=goal)
+    base = compare_read([read], name=read.name, method=method)
     # Words of what is missing come first, then those of images and imported motions.
     return replace(
         _with_parts(base, (views, methods, motions)),
@@ -158,7 +157,6 @@ def compare_read(
     name: str,
     more_rows: Sequence[TrialRow] = (),
     method: str = "wilson",
-    goal: float | None = None,
 ) -> Comparison:
     """Measure everything that the trials of some runs say together."""
     rows = [row for read in reads for row in read.rows]
@@ -177,7 +175,6 @@ def compare_read(
             [*(row.stand_in for row in more_rows), *(mark for r in reads for mark in _marks(r))]
         ),
         method=method,
-        goal=goal,
         void_causes=tuple(dict.fromkeys(cause for r in reads for cause in r.void_causes)),
     )
     trials = [trial for read in reads for trial in read.trials]

@@ -52,7 +52,6 @@ def compare_several(
     sources: Sequence[Path],
     *,
     method: str = "wilson",
-    goal: float | None = None,
     options: TableOptions = AS_SAVED,
     force: bool = False,
     output: Output = QUIET,
@@ -70,7 +69,7 @@ def compare_several(
     if not (trials or gathered.reads) and any(each.rates for each in gathered.taken):
         base = _rates_alone(gathered, sources, method, options)
     else:
-        base = _trials(gathered, trials, sources, method, goal, options)
+        base = _trials(gathered, trials, sources, method, options)
     if not base.measurements:
         lines = "\n".join(f"  {one.path}: {one.reason}" for one in gathered.left[:12])
         message = f"Nothing in {_named(sources)} could be read as results.\n{lines}"
@@ -193,7 +192,6 @@ def _trials(
     trials: Sequence[TrialRow],
     sources: Sequence[Path],
     method: str,
-    goal: float | None,
     options: TableOptions,
 ) -> Comparison:
     """Measure trials of runs and tables together."""
@@ -203,7 +201,7 @@ def _trials(
     reads = [replace(read, rows=[new[row.episode] for row in read.rows]) for read in gathered.reads]
     rows = settled[len(inside) :]
     if reads:
-        base = compare_read(reads, name=_named(sources), more_rows=rows, method=method, goal=goal)
+        base = compare_read(reads, name=_named(sources), more_rows=rows, method=method)
         base = replace(
             base, missing=(*base.missing, f"images: {ALONE}", f"imported motions: {ALONE}")
         )
@@ -214,7 +212,6 @@ def _trials(
             source="trials",
             stand_in=stand_in_of(row.stand_in for row in rows),
             method=method,
-            goal=goal,
         )
     return _from(base, gathered, unknown_sides(rows), merged)
 

@@ -56,7 +56,6 @@ def compare_csv(
     path: Path,
     *,
     method: str = "wilson",
-    goal: float | None = None,
     options: TableOptions = AS_SAVED,
 ) -> Comparison:
     """Compare a table; its content tells which.
@@ -67,18 +66,13 @@ def compare_csv(
     Raises:
         TableError: Naming the row that contradicts itself.
     """
-    found = compare_taken(take(path, options), method=method, goal=goal, options=options)
-    if goal is None or any(table.id == "stopping" and table.rows for table in found.tables):
-        return found
-    missing = "stop or continue: --goal needs recorded outcomes of single trials, one after another"
-    return replace(found, missing=(*found.missing, missing))
+    return compare_taken(take(path, options), method=method, options=options)
 
 
 def compare_taken(
     taken: Taken,
     *,
     method: str = "wilson",
-    goal: float | None = None,
     options: TableOptions = AS_SAVED,
 ) -> Comparison:
     """Compare what one file or folder holds."""
@@ -92,7 +86,7 @@ def compare_taken(
     settled_rows, merged = settle_names(map(row_from_record, taken.trials), options.names)
     stand_in = stand_in_of(record.stand_in for record in taken.trials)
     base = compare_rows(
-        settled_rows, run=path.stem, source="trials", stand_in=stand_in, method=method, goal=goal
+        settled_rows, run=path.stem, source="trials", stand_in=stand_in, method=method
     )
     return _with_source(base, path, unknown_sides(settled_rows), [*read_as, *merged])
 

@@ -42,12 +42,11 @@ class ImageMetric:
         return f"{self.id}_{variant}"
 
 
-MaskMode = Literal["full", "mask-pixels", "black-background"]
+MaskMode = Literal["full", "mask-pixels"]
 """Which pixels a number is about."""
 MASK_MODES: dict[MaskMode, str] = {
     "full": "full frame, no mask",
     "mask-pixels": "only the pixels of the mask",
-    "black-background": "full frame, both images black outside the mask",
 }
 UNSTATED = "not stated"
 """What a stamp says where its source does not: a published table seldom states all of it."""

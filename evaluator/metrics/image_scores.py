@@ -20,7 +20,7 @@ from bridge.media.image_quality import (
     ssim_maps,
 )
 from evaluator.errors import UndefinedStatisticError
-from evaluator.metrics.image_protocol import ImageMetric, MaskMode
+from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.lpips import LPIPS_METRICS, PerceptualNet
 
 GAUSSIAN = f"gaussian {WINDOW} x {WINDOW} sigma {SIGMA}"
@@ -91,7 +91,6 @@ def score_image(
     ),
     *,
     mask: Bool[np.ndarray, "height width"] | None = None,
-    mode: MaskMode = "mask-pixels",
     alignment: Alignment = "raw",
     nets: Sequence[PerceptualNet] = (),
 ) -> ImageScore:
@@ -100,15 +99,12 @@ def score_image(
     Args:
         recorded_u8: 8 bits, or float in 0..1.
         replayed_u8: The same; its axes have their own names, so that a wrong size is explained.
-        mode: What the mask does; metrics of whole images are undefined over single pixels.
+        mask: Pixels that count; metrics of whole images are undefined over single ones.
         alignment: Brightening before the comparison; whole images decide it, whatever the mask.
     """
     replayed = aligned(recorded_u8, replayed_u8, alignment)
     recorded = as_float(recorded_u8)
     pixels = recorded.shape[0] * recorded.shape[1] if mask is None else int(mask.sum())
-    if mask is not None and mode == "black-background":
-        recorded, replayed = (np.where(mask[..., None], i, 0.0) for i in (recorded, replayed))
-        mask = None
     values: dict[str, float] = {}
     reasons: dict[str, str] = {}
     maps: SsimMaps | None = None

@@ -24,7 +24,6 @@ TABLES: dict[str, str] = {
     "agreement_intervals": "whether the agreement would hold for other tasks",
     "funnel": "on which stage to work",
     "failures": "which cause to remove first",
-    "stopping": "whether to record more trials",
     "end_points_*": "whether the engine's friction and timing are right",
     "motion": "whether to work on the controller or on the calibration",
     "final_states": "whether the localisation is good enough for the task",

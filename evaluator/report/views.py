@@ -210,29 +210,6 @@ def _baselines(rows: Rows) -> Rows:
     ]
 
 
-def _stopping(rows: Rows) -> Rows:
-    def interval(row: Record) -> Shown:
-        if not _known(row["low"]):
-            return None
-        return f"[{100 * row['low']:.1f}, {100 * row['high']:.1f}] %"
-
-    def advice(row: Record) -> Shown:
-        if not _known(row["low"]):
-            return str(row["why undefined"])
-        return f"stop: {row['answer']} {100 * row['goal']:g} %" if row["stop"] else "continue"
-
-    return [
-        _picked(row, "task", "condition", "policy", "trials")
-        | {
-            "condition": _words(row["condition"]),
-            "interval at any time": interval(row),
-            "advice": advice(row),
-            "more trials at this rate": row["more trials at this rate"],
-        }
-        for row in rows
-    ]
-
-
 def _states(rows: Rows) -> Rows:
     """Put both ends of the interval into one cell, where the lower one stood."""
 
@@ -292,7 +269,6 @@ _VIEWS: dict[str, Callable[[Rows], Rows]] = {
     "gains": _gains,
     "layout": _layout,
     "gate_baselines": _baselines,
-    "stopping": _stopping,
     "final_states": _states,
     "published": _published,
 }

@@ -31,7 +31,6 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("motion.executed.position_mean_m", "Tool: recorded to executed replay"),
     ("views.all.psnr_db", "PSNR of held-out views, raw"),
     ("views.all.psnr_gain_db", "The same after a gain per image and channel"),
-    ("views.all.psnr_pose_gain_db", "The same after pose and gain fitted per image"),
     ("views.all.ssim", "SSIM of held-out views"),
     ("views.all.ssim_zero", "The same, zeros beyond the border"),
     ("views.all.depth_median_abs_m", "Depth of held-out views, median error of an image"),
@@ -51,13 +50,8 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 }
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
-SHARES = ("average.", "rate.", "sequence.recorded.")
-UNSIGNED = (
-    "agreement.mae_pp",
-    "agreement.rmse_pp",
-    "agreement.largest_gap_pp",
-    "decision.regret_pp",
-)
+SHARES = ("average.", "rate.")
+UNSIGNED = ("agreement.mae_pp",)
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
 """Nobody reads more digits before the point; evidence may have hundreds."""

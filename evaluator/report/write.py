@@ -28,7 +28,6 @@ SHOWN = (
     "gains",
     "retries",
     "image_methods",
-    "stopping",
     "notes",
 )
 """Tables a terminal shows; the others are in the report."""

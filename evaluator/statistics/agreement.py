@@ -6,7 +6,7 @@ changes its sign and MMRV its meaning when they are swapped.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -99,46 +99,6 @@ def mean_absolute_error(*, recorded: Sequence[Number], sim: Sequence[Number]) ->
     """Return mean |sim - recorded|; 0 is perfect."""
     gaps = _gaps("mean absolute error", recorded, sim)
     return float(sum(map(abs, gaps)) / len(gaps))
-
-
-def root_mean_square_error(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return sqrt(mean (sim - recorded)^2); 0 is perfect, and never below the mean |gap|."""
-    gaps = _gaps("RMSE", recorded, sim)
-    return math.sqrt(sum(gap * gap for gap in gaps) / len(gaps))
-
-
-def largest_gap(*, recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return max |sim - recorded| over groups."""
-    return float(max(map(abs, _gaps("largest gap", recorded, sim))))
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalibrationLine:
-    """recorded = intercept + slope x sim; slope 1 and intercept 0 is a calibrated twin."""
-
-    slope: float
-    intercept: float
-
-
-def calibration_line(*, recorded: Sequence[Number], sim: Sequence[Number]) -> CalibrationLine:
-    """Fit recorded on sim by least squares: what a sim rate is worth on the robot.
-
-    Both sides are counts with noise, so the slope is pulled towards 0 (attenuation); it predicts,
-    it does not say what the physics would do.
-
-    Raises:
-        UndefinedStatisticError: Below 3 groups, or when the sim side is constant.
-    """
-    x, y = exact("calibration line", sim, recorded, at_least=MIN_GROUPS)
-    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
-    spread = sum((v - mean_x) ** 2 for v in x)
-    if spread == 0:
-        raise UndefinedStatisticError(
-            statistic="calibration line",
-            reason=f"the twin side is constant ({float(x[0]):g} in all {len(x)} groups)",
-        )
-    slope = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / spread
-    return CalibrationLine(slope=float(slope), intercept=float(mean_y - slope * mean_x))
 
 
 def mmrv(*, recorded: Sequence[Number], sim: Sequence[Number], gap: str = "recorded") -> float:
@@ -266,21 +226,6 @@ def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     return pearson(ranks(x), ranks(y))
 
 
-def kendall(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
-    """Return Kendall's tau-b: concordant minus discordant pairs, corrected for ties (1945).
-
-    (C - D) / sqrt((pairs - pairs tied in recorded) (pairs - pairs tied in sim)).
-
-    Range: -1 to 1. Undefined when: fewer than 3 groups, or one side is constant.
-    """
-    x, y = varying("Kendall tau-b", recorded, sim)
-    pairs = [(i, j) for j in range(len(x)) for i in range(j)]
-    signs = [(_sign(x[i] - x[j]), _sign(y[i] - y[j])) for i, j in pairs]
-    concordance = sum(a * b for a, b in signs)
-    untied_x, untied_y = sum(a != 0 for a, _ in signs), sum(b != 0 for _, b in signs)
-    return concordance / math.sqrt(untied_x * untied_y)
-
-
 def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Interval:
     """Return Fisher's z interval of Pearson's r. The groups must be independent of each other.
 
@@ -300,55 +245,4 @@ def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Inter
     half = normal_quantile(0.5 + level / 2) / math.sqrt(num_groups - 3)
     return Interval(
         low=math.tanh(z - half), high=math.tanh(z + half), level=level, method="fisher-z"
-    )
-
-
-def _sign(value: Number) -> int:
-    return (value > 0) - (value < 0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Decision:
-    """The candidates the twin calls best against those that are."""
-
-    sim_best: frozenset[str]
-    """Every candidate with the highest sim rate; several when they tie."""
-    recorded_best: frozenset[str]
-    possibly_right: bool
-    """One of the twin's best is among the recorded best."""
-    confident: bool
-    """Every one of the twin's best is."""
-    regret: Fraction
-    """Best recorded rate minus that of the twin's choice, the worst of a tie."""
-
-
-def choose(*, recorded: Mapping[str, Number], sim: Mapping[str, Number]) -> Decision:
-    """Choose among candidates by the twin and judge the choice by the recorded rates.
-
-    Source: the decision audit of sim-to-real correlations (winner sets and selection regret,
-    with ties as sets). Exact on counts.
-
-    Raises:
-        UndefinedStatisticError: Below two candidates: there is nothing to choose.
-    """
-    if recorded.keys() != sim.keys():
-        message = f"different candidates: {sorted(recorded)} recorded, {sorted(sim)} in the twin"
-        raise ValueError(message)
-    if len(recorded) < 2:
-        raise UndefinedStatisticError(
-            statistic="decision",
-            reason=f"{len(recorded)} candidate{'s' if len(recorded) != 1 else ''}; a choice needs "
-            "two",
-        )
-    x = {name: Fraction(rate) for name, rate in recorded.items()}
-    y = {name: Fraction(rate) for name, rate in sim.items()}
-    sim_best = frozenset(name for name in y if y[name] == max(y.values()))
-    recorded_best = frozenset(name for name in x if x[name] == max(x.values()))
-    losses = [max(x.values()) - x[name] for name in sim_best]
-    return Decision(
-        sim_best=sim_best,
-        recorded_best=recorded_best,
-        possibly_right=bool(sim_best & recorded_best),
-        confident=sim_best <= recorded_best,
-        regret=max(losses),
     )

@@ -104,15 +104,10 @@ RATE = Scale(there=PLAIN.there, back=PLAIN.back, slope=PLAIN.slope, low=0.0, hig
 SCALES: dict[str, Scale] = {
     "pearson": CORRELATION,
     "spearman": CORRELATION,
-    "kendall": CORRELATION,
     "bias": PLAIN,
     "mae": ERROR,
-    "rmse": ERROR,
-    "slope": PLAIN,
-    "intercept": PLAIN,
     "order": SHARE,
     "mmrv-recorded": RATE,
-    "mmrv-sim": RATE,
 }
 """By the names of ``weighted.STATISTICS``."""
 

@@ -29,16 +29,10 @@ INSTEAD = {
 HOLDS_FROM = {
     "tango": (5, "pairs"),
     "student-t:length": (50, "episodes"),
-    "jackknife-points:rmse": (8, "groups"),
-    "jackknife-points:intercept": (15, "groups"),
     "jackknife-points:mmrv-recorded": (15, "groups"),
-    "jackknife-points:mmrv-sim": (15, "groups"),
-    "jackknife-clusters:mmrv-sim": (8, "policies"),
     "remeasurement:spearman": (6, "groups"),
-    "remeasurement:kendall": (6, "groups"),
     "remeasurement:order": (6, "groups"),
     "remeasurement:mmrv-recorded": (4, "groups"),
-    "remeasurement:mmrv-sim": (4, "groups"),
 }
 """Smallest number that an interval is printed for, and what it counts; any where none is named."""
 Size = int | tuple[int, int]

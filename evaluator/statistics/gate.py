@@ -13,20 +13,6 @@ import numpy as np
 
 from evaluator.errors import UndefinedStatisticError
 
-NUM_BINS = 10
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReliabilityBin:
-    """The predictions of one bin against what happened."""
-
-    low: float
-    high: float
-    """The last bin holds its upper end, the others do not."""
-    n: int
-    mean_probability: float
-    succeeded: int
-
 
 def brier(predicted: Sequence[float], happened: Sequence[bool]) -> float:
     """Return the mean of (p - outcome)^2 (Brier 1950).
@@ -43,39 +29,6 @@ def brier_of_base_rate(happened: Sequence[bool]) -> float:
         raise UndefinedStatisticError(statistic="Brier score", reason="there are no trials")
     rate = sum(happened) / len(happened)
     return rate * (1 - rate)
-
-
-def expected_calibration_error(
-    predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
-) -> float:
-    """Return sum over bins of n_bin / n x |mean probability - success rate|.
-
-    Bins of equal width over 0..1, empty ones count nothing (Naeini et al. 2015; Guo et al. 2017,
-    equation 3). Biased upwards for few trials: with n = 10 a perfect forecaster has about 0.2.
-
-    Range: 0 to 1, 0 is perfect.
-    """
-    bins = reliability_bins(predicted, happened, num_bins=num_bins)
-    return sum(abs(b.mean_probability * b.n - b.succeeded) for b in bins) / len(happened)
-
-
-def reliability_bins(
-    predicted: Sequence[float], happened: Sequence[bool], *, num_bins: int = NUM_BINS
-) -> list[ReliabilityBin]:
-    """Return the bins that hold trials, in order."""
-    p = _checked("reliability", predicted, happened)
-    answers = np.array(happened, dtype=bool)
-    places = np.minimum((p * num_bins).astype(int), num_bins - 1)
-    return [
-        ReliabilityBin(
-            low=place / num_bins,
-            high=(place + 1) / num_bins,
-            n=int((places == place).sum()),
-            mean_probability=float(p[places == place].mean()),
-            succeeded=int(answers[places == place].sum()),
-        )
-        for place in np.unique(places).tolist()
-    ]
 
 
 def _checked(statistic: str, predicted: Sequence[float], happened: Sequence[bool]) -> np.ndarray:

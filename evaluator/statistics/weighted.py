@@ -87,12 +87,6 @@ def _over_pairs(counts: Counts, of_pair: np.ndarray) -> Float64[np.ndarray, " se
     return np.asarray(((counts @ of_pair) * counts).sum(axis=1) / 2)
 
 
-def _kendall(counts: Counts, recorded: Side, sim: Side) -> Values:
-    first, second = _signs(recorded), _signs(sim)
-    sums = (_over_pairs(counts, of) for of in (first * second, np.abs(first), np.abs(second)))
-    return ratio(*sums)
-
-
 def _order(counts: Counts, recorded: Side, sim: Side) -> Values:
     first, second = _signs(recorded), _signs(sim)
     differ = np.abs(first)
@@ -129,33 +123,11 @@ def _weighted_mean(counts: Counts, values: Side) -> Values:
     return means, np.ones(len(counts), dtype=bool)
 
 
-def _rmse(counts: Counts, recorded: Side, sim: Side) -> Values:
-    squares, defined = _weighted_mean(counts, (sim - recorded) ** 2)
-    return np.sqrt(squares), defined
-
-
-def _slope(counts: Counts, recorded: Side, sim: Side) -> Values:
-    _, _, shared, _, spread = _moments(counts, recorded, sim)
-    defined = spread > EPSILON
-    return shared / np.where(defined, spread, 1.0), defined
-
-
-def _intercept(counts: Counts, recorded: Side, sim: Side) -> Values:
-    mean_recorded, mean_sim, *_ = _moments(counts, recorded, sim)
-    slope, defined = _slope(counts, recorded, sim)
-    return mean_recorded - slope * mean_sim, defined
-
-
 STATISTICS: dict[str, Statistic] = {
     "pearson": _pearson,
     "spearman": _spearman,
-    "kendall": _kendall,
     "bias": lambda counts, recorded, sim: _weighted_mean(counts, sim - recorded),
     "mae": lambda counts, recorded, sim: _weighted_mean(counts, np.abs(sim - recorded)),
-    "rmse": _rmse,
-    "slope": _slope,
-    "intercept": _intercept,
     "order": _order,
     "mmrv-recorded": _mmrv,
-    "mmrv-sim": lambda counts, recorded, sim: _mmrv(counts, sim, recorded),
 }

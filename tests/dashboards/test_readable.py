@@ -14,7 +14,7 @@ PAGES = (
     *("", "?show=disagree&sort=-name", "?q=nothing+is+called+that", "?task=elsewhere"),
     *("?condition=with_replanning", "numbers", "twin"),
     *("queue", "queue?show=flagged", "label", "label?rater=Ann", "reviews"),
-    *("failures", "failures?failed=wrong_no", "compare", "live"),
+    *("failures", "failures?failed=wrong_no", "live"),
     *("episode/trial_0001", "episode/trial_0002?t=1", "episode/trial_0004", "nowhere"),
 )
 

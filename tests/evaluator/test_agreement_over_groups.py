@@ -1,4 +1,4 @@
-"""Rank agreement, error, calibration, resampling and decisions over groups."""
+"""Rank agreement, error and resampling over groups."""
 
 import math
 from fractions import Fraction
@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics import agreement
-from evaluator.statistics.agreement import choose
 from evaluator.statistics.bootstrap import (
     GroupSample,
     student_interval,
@@ -28,19 +27,9 @@ def rng() -> np.random.Generator:
 def test_errors_keep_their_order(recorded: list[Fraction], data: st.DataObject) -> None:
     sim = data.draw(st.permutations(recorded))
     absolute = agreement.mean_absolute_error(recorded=recorded, sim=sim)
-    square = agreement.root_mean_square_error(recorded=recorded, sim=sim)
-    largest = agreement.largest_gap(recorded=recorded, sim=sim)
     assert abs(agreement.bias(recorded=recorded, sim=sim)) <= absolute + 1e-12
-    assert absolute <= square + 1e-12
-    assert square <= largest + 1e-12
-
-
-def test_the_calibration_line_recovers_a_line_exactly() -> None:
-    sim = [Fraction(1, 10), Fraction(5, 10), Fraction(9, 10)]
-    line = agreement.calibration_line(recorded=[v / 2 + Fraction(1, 5) for v in sim], sim=sim)
-    assert (line.slope, line.intercept) == (0.5, 0.2)
-    with pytest.raises(UndefinedStatisticError, match="twin side is constant"):
-        agreement.calibration_line(recorded=sim, sim=[1, 1, 1])
+    gaps = [abs(s - r) for r, s in zip(recorded, sim, strict=True)]
+    assert min(gaps) - 1e-12 <= absolute <= max(gaps) + 1e-12
 
 
 def test_order_accuracy_counts_ties_of_the_twin_as_half() -> None:
@@ -86,24 +75,3 @@ def test_student_gives_no_interval_of_no_width() -> None:
         student_interval([Fraction(1, 3)] * 3)
     with pytest.raises(UndefinedStatisticError, match="2 values"):
         student_interval([1, 2])
-
-
-def test_a_high_r_may_choose_wrongly() -> None:
-    recorded = {"a": Fraction(9, 10), "b": Fraction(8, 10), "c": Fraction(1, 10)}
-    sim = {"a": Fraction(8, 10), "b": Fraction(9, 10), "c": Fraction(1, 10)}
-    assert agreement.pearson(list(recorded.values()), list(sim.values())) > 0.9
-    decision = choose(recorded=recorded, sim=sim)
-    assert not decision.possibly_right
-    assert decision.regret == Fraction(1, 10)
-
-
-def test_ties_are_sets_and_the_worst_of_them_counts() -> None:
-    decision = choose(recorded={"a": 0.5, "b": 0.75}, sim={"a": 1, "b": 1})
-    assert decision.sim_best == {"a", "b"}
-    assert decision.possibly_right
-    assert not decision.confident
-    assert float(decision.regret) == 0.25
-    with pytest.raises(UndefinedStatisticError, match="1 candidate; a choice needs two"):
-        choose(recorded={"a": 1}, sim={"a": 1})
-    with pytest.raises(ValueError, match="different candidates"):
-        choose(recorded={"a": 1}, sim={"b": 1})

@@ -13,7 +13,6 @@ from evaluator.statistics import coverage
 from evaluator.statistics.coverage import newcombe_coverage, rate_coverage
 from evaluator.statistics.differences import newcombe_difference
 from evaluator.statistics.intervals import RATE_INTERVALS, clopper_pearson, jeffreys, wilson
-from evaluator.statistics.sequential import betting_interval
 from evaluator.statistics.weighted import STATISTICS
 
 REQUIRED = range(5, 101)
@@ -43,14 +42,6 @@ def test_coverage_of_a_rate_is_the_chance_of_the_counts_whose_interval_holds_it(
     found = rate_coverage(method, n)
     assert found.worst == pytest.approx(min(shares), abs=1e-9)
     assert found.mean == pytest.approx(np.mean(shares), abs=1e-9)
-
-
-@pytest.mark.parametrize("n", [2, 20])
-def test_what_is_guaranteed_for_every_n_holds_when_looked_at_once(n: int) -> None:
-    for rate in coverage.RATES:
-        made = [betting_interval(k, n) for k in range(n + 1)]
-        held = [k for k in range(n + 1) if made[k].low <= rate <= made[k].high]
-        assert binom.pmf(held, n, rate).sum() >= 0.95
 
 
 def an_interval(method: str, level: float = 0.95) -> Interval:

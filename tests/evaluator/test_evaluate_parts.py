@@ -8,13 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.errors import UsageError
 from bridge.task.record import check_record
-from evaluator.cli import evaluate
 from evaluator.compare import Comparison, compare_csv, compare_run
-from evaluator.compare.sequences import stopping_table
-from evaluator.report.wording import measurement_text
-from evaluator.statistics.sequential import sequence_of
 
 HEADER = "trial_id,task,condition,policy,start_id,recorded,sim_planned,verdict,p_success\n"
 
@@ -144,21 +139,6 @@ def test_policies_are_what_agreement_is_resampled_by(write_table: Callable[[str]
     assert "policies left out" in results.get("agreement.mae_pp").definition
     band = results.get("agreement.pearson_r_remeasured")
     assert band.interval is not None or "remeasurement" in str(band.reason_without_interval)
-    assert results.get("decision.regret_pp").n == 1
-    assert results.get("agreement.kendall_tau_b").value is not None
-    assert results.get("agreement.calibration_slope").value == pytest.approx(1, abs=0.15)
-
-
-def test_a_choice_among_conditions_is_judged(six_trials: Any) -> None:
-    comparison = compare_run(six_trials.run)
-    regret = comparison.results().get("decision.regret_pp")
-    # Twin: 2/3 against 2/3, recorded 1/3 against 2/3: the worst of the tie loses a third.
-    assert regret.value == pytest.approx(100 / 3)
-    right = comparison.results().get("decision.surely_right")
-    assert (right.k, right.n) == (0, 1)
-    assert comparison.results().get("decision.possibly_right").k == 1
-    assert right.interval is None
-    assert "not a sample" in str(right.reason_without_interval)
 
 
 @pytest.mark.parametrize("method", ["clopper-pearson", "jeffreys"])
@@ -186,29 +166,6 @@ def test_units_mixed_in_one_cell_are_undefined_and_named(maker: Any) -> None:
     rate = results.get("rate.recorded_object.cube_into_box.without_replanning.scripted")
     assert rate.value is None
     assert "t1 in objects and t2 in subtasks" in str(rate.reason_if_undefined)
-
-
-def test_a_goal_is_answered_or_the_trials_it_may_take_are_named(
-    write_table: Callable[[str], Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")  # words of a narrow table are broken over lines
-    lines = [line(i, True, True) for i in range(20)]
-    lines += [line(100 + i, i % 2 == 0, True, condition="with_replanning") for i in range(6)]
-    path = write_table(HEADER + "\n".join(lines) + "\n")
-    assert evaluate(path, out=tmp_path / "out", goal=0.6) == 0
-    (table,) = stopping_table(compare_csv(path).rows, 0.6)
-    settled, still_open = table.rows
-    assert settled[3] == 0.6
-    assert 0.6 < settled[5] < settled[6]
-    assert settled[7:9] == (True, "above")
-    assert still_open[7] is False
-    assert still_open[9] > 20
-    assert "stop: above 60 %" in capsys.readouterr().out
-    with pytest.raises(UsageError, match="--goal 60"):
-        evaluate(path, goal=60.0)
 
 
 WORDS = st.sampled_from(["success", "failure", "", "unknown"])
@@ -239,39 +196,10 @@ def test_whatever_the_trials_say_the_results_fit_the_schema(
     """One task, constant sides, all success, nothing known: a number or a reason, never a crash."""
     path = tmp_path_factory.mktemp("any") / "trials.csv"
     path.write_text(text)
-    results = compare_csv(path, goal=0.5).results()
+    results = compare_csv(path).results()
     check_record(results.to_record(), name="results", package="evaluator")
     ids = [measurement.id for measurement in results.measurements]
     assert len(ids) == len(set(ids))
     for m in results.measurements:
         if m.interval is not None:
             assert m.interval.low < m.interval.high or m.unit == "count", m.id
-
-
-def test_a_thousand_improved_pairs_are_evidence_and_no_overflow(
-    write_table: Callable[[str], Path],
-) -> None:
-    header = "trial_id,task,condition,start_id,recorded\n"
-    lines = [f"a{i},cube,without_replanning,s{i},failure" for i in range(1100)]
-    lines += [f"b{i},cube,with_replanning,s{i},success" for i in range(1100)]
-    comparison = compare_csv(write_table(header + "\n".join(lines) + "\n"))
-    evidence = comparison.results().get("sequence.replanning_evidence.recorded")
-    assert evidence.value == pytest.approx(1e300)
-    assert measurement_text(evidence).startswith("1e+300 (n = 1100 pairs)")
-    comparison.results().to_record()
-
-
-def test_a_sequence_goes_by_when_trials_were_recorded_and_not_by_their_names(maker: Any) -> None:
-    second = 1_000_000_000
-    outcomes = ["success"] * 9 + ["failure"] * 6
-    for number, outcome in enumerate(outcomes, start=1):
-        start_ns = 10 * second + 100 * number * second
-        maker.trial(f"trial_{number}", recorded=outcome, start_id=f"s{number}", start_ns=start_ns)
-    results = compare_run(maker.run).results()
-    rate = results.get("sequence.recorded.cube_into_box.without_replanning.scripted")
-    expected = sequence_of([outcome == "success" for outcome in outcomes])
-    assert rate.interval is not None
-    assert (rate.interval.low, rate.interval.high) == (expected.low, expected.high)
-    by_name = sorted(range(15), key=lambda i: f"trial_{i + 1}")
-    other = sequence_of([outcomes[i] == "success" for i in by_name])
-    assert (other.low, other.high) != (expected.low, expected.high)  # else this shows nothing

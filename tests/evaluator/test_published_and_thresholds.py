@@ -256,13 +256,6 @@ def test_a_table_names_the_intervals_that_it_prints(method: str, rates: str, gai
     assert "Wilson" not in table_of(compare_csv(RATES, method="jeffreys").results(), "success").note
 
 
-def test_a_goal_that_nothing_can_answer_is_said(write_table: Callable[[str], Path]) -> None:
-    assert "--goal needs" in compare_csv(RATES, goal=0.8).missing[-1]
-    assert not any("--goal" in text for text in compare_csv(RATES).missing)
-    trials = "trial_id,task,recorded\na,cube,success\nb,cube,failure\n"
-    assert not any("--goal" in m for m in compare_csv(write_table(trials), goal=0.8).missing)
-
-
 def test_no_gain_at_all_is_not_called_underpowered(write_table: Callable[[str], Path]) -> None:
     lines = [
         f"a,{condition}_replanning,{side},trial,10,50,,"

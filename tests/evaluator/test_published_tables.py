@@ -54,16 +54,10 @@ def test_a_published_table_gives_the_numbers_of_numpy_and_an_interval(path: Path
     assert r.interval is not None, r.reason_without_interval
     assert -1 <= r.interval.low < r.interval.high <= 1
     assert (r.interval.low, r.interval.high) != (-1, 1)
-    slope, intercept = np.polyfit(sim, real, 1)
     for name, value in (
         ("bias_pp", 100 * np.mean(sim - real)),
         ("mae_pp", 100 * np.mean(np.abs(sim - real))),
-        ("rmse_pp", 100 * np.sqrt(np.mean((sim - real) ** 2))),
-        ("largest_gap_pp", 100 * np.max(np.abs(sim - real))),
-        ("calibration_slope", slope),
-        ("calibration_intercept_pp", 100 * intercept),
         ("mmrv_recorded_gap", max_violation(real, real, sim)),
-        ("mmrv_sim_gap", max_violation(sim, real, sim)),
     ):
         assert results.get(f"agreement.{name}").value == pytest.approx(value, abs=1e-9), name
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from evaluator.statistics import agreement
 from evaluator.statistics.differences import (
     boschloo,
     mcnemar,
@@ -70,18 +69,6 @@ def test_boschloo_agrees_with_scipy(table: tuple[int, int, int, int]) -> None:
     k1, n1, k2, n2 = table
     theirs = stats.boschloo_exact([[k1, k2], [n1 - k1, n2 - k2]], n=64)
     assert boschloo(*table) == pytest.approx(theirs.pvalue, abs=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_kendall_and_the_calibration_line_agree_with_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    x, y = (rng.integers(0, 6, 9) / 5).tolist(), (rng.integers(0, 6, 9) / 5).tolist()
-    assert agreement.kendall(x, y) == pytest.approx(stats.kendalltau(x, y).statistic, abs=EXACT)
-    line = agreement.calibration_line(recorded=y, sim=x)
-    theirs = stats.linregress(x, y)
-    assert (line.slope, line.intercept) == pytest.approx(
-        (theirs.slope, theirs.intercept), abs=EXACT
-    )
 
 
 def restricted_score(improved: int, worsened: int, n: int, d: float) -> float:

@@ -1,7 +1,7 @@
 """Pair the images of a ``views`` episode, and score each pair in every way its topics allow.
 
 Topics end in ``/cam/<id>/`` and ``rendered/image``, ``recorded/image`` (or, in the source episode,
-``color/image``), ``pose_aligned/image``, ``mask/<name>/image`` or ``mask/<name>`` (white inside),
+``color/image``), ``mask/<name>/image`` or ``mask/<name>`` (white inside),
 ``rendered/depth``, ``recorded/depth`` and ``recorded/depth_in_color``. Images are worked on by a
 few threads, as NumPy and the image decoders let go of the interpreter.
 """
@@ -22,7 +22,6 @@ from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
 from bridge.episode.topics import (
     MASK_TOPIC,
-    POSE_ALIGNED_TOPIC,
     RECORDED_DEPTH_TOPIC,
     RECORDED_TOPIC,
     RENDERED_DEPTH_TOPIC,
@@ -48,8 +47,6 @@ class Variant:
     mode: MaskMode = "full"
     mask: str = ""
     """Name of the mask, where there is one."""
-    posed: bool = False
-    """Whether the image was rendered where pose and brightness fit the recorded one."""
     learned: bool = False
     """Whether LPIPS is computed for it too; a network takes seconds for each image."""
 
@@ -62,11 +59,6 @@ class Variant:
     @property
     def alignment_words(self) -> str:
         """What was fitted to the recorded image, for a stamp."""
-        if self.posed:
-            return (
-                "camera pose and one gain per channel fitted to the recorded image: not strictly "
-                "held out"
-            )
         return ALIGNMENTS[self.alignment]
 
     @property
@@ -77,18 +69,13 @@ class Variant:
 
 RAW = Variant(name="raw", learned=True)
 GAIN = Variant(name="gain", alignment="gain", learned=True)
-AFFINE = Variant(name="affine", alignment="affine")
-POSE_GAIN = Variant(name="pose_gain", alignment="gain", posed=True)
-_TAKEN = {variant.name for variant in (RAW, GAIN, AFFINE, POSE_GAIN)}
+_TAKEN = {variant.name for variant in (RAW, GAIN)}
 
 
-def masked(name: str) -> tuple[Variant, Variant]:
-    """Return both ways to use a mask: its pixels alone, and everything else black."""
-    own = f"mask_{name}" if name in _TAKEN or name.endswith("_black") else name
-    return (
-        Variant(name=own, mode="mask-pixels", mask=name),
-        Variant(name=f"{own}_black", mode="black-background", mask=name, learned=True),
-    )
+def masked(name: str) -> Variant:
+    """Return the way to score the pixels of a mask alone."""
+    own = f"mask_{name}" if name in _TAKEN else name
+    return Variant(name=own, mode="mask-pixels", mask=name)
 
 
 def score_variants(
@@ -101,15 +88,14 @@ def score_variants(
     *,
     nets: Sequence[PerceptualNet] = (),
 ) -> dict[Variant, ImageScore]:
-    """Score one pair in every way but re-posed."""
-    ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None), (AFFINE, None)]
-    ways += [(variant, mask) for name, mask in masks.items() for variant in masked(name)]
+    """Score one pair in every way."""
+    ways: list[tuple[Variant, np.ndarray | None]] = [(RAW, None), (GAIN, None)]
+    ways += [(masked(name), mask) for name, mask in masks.items()]
     return {
         variant: score_image(
             recorded,
             rendered,
             mask=mask,
-            mode=variant.mode,
             alignment=variant.alignment,
             nets=nets if variant.learned else (),
         )
@@ -199,11 +185,10 @@ def spread(
         return list(pool.map(work, items))
 
 
-RENDERED, RECORDED, POSED = "rendered", "recorded", "pose_aligned"
+RENDERED, RECORDED = "rendered", "recorded"
 _COLOR_TOPICS = (
     (RENDERED, RENDERED_TOPIC),
     (RECORDED, RECORDED_TOPIC),
-    (POSED, POSE_ALIGNED_TOPIC),
 )
 _DEPTH_TOPICS = (
     (RENDERED, RENDERED_DEPTH_TOPIC),
@@ -223,7 +208,7 @@ class ViewScore:
     size: tuple[int, int]
     """Height and width [px]."""
     scores: Mapping[Variant, ImageScore]
-    """At least raw, gain and affine; pose_gain and both ways of each mask where there are any."""
+    """At least raw and gain; one of each mask where there are any."""
     depth: DepthScore | None
     jpeg: bool
     """The rendered image was stored lossily."""
@@ -238,9 +223,7 @@ class ViewScore:
 class Images:
     """Undecoded images of one views episode."""
 
-    color: dict[str, dict[Key, bytes]] = field(
-        default_factory=lambda: {RENDERED: {}, RECORDED: {}, POSED: {}}
-    )
+    color: dict[str, dict[Key, bytes]] = field(default_factory=lambda: {RENDERED: {}, RECORDED: {}})
     masks: dict[str, dict[Key, bytes]] = field(default_factory=dict)
     depth: dict[str, dict[Key, bytes]] = field(default_factory=lambda: {RENDERED: {}, RECORDED: {}})
 
@@ -321,9 +304,6 @@ def _score(images: Images, nets: Sequence[PerceptualNet], key: Key) -> ViewScore
         recorded_u8, rendered_u8 = decode_color(recorded), decode_color(rendered)
         refuse_swapped(as_float(recorded_u8), as_float(rendered_u8))
         scores = score_variants(recorded_u8, rendered_u8, images.masks_of(key), nets=nets)
-        posed = images.color[POSED].get(key)
-        if posed is not None:
-            scores[POSE_GAIN] = score_image(recorded_u8, decode_color(posed), alignment="gain")
         depth = _score_depth(images, key)
     except GstError as error:
         return f"{where}: {error}"

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from evaluator.compare.images.scores import AFFINE, GAIN, POSE_GAIN, RAW, Variant, ViewScore
+from evaluator.compare.images.scores import GAIN, RAW, Variant, ViewScore
 from evaluator.compare.measure import measured
 from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import Quantity
@@ -132,14 +132,8 @@ def _lacking(metric: ImageMetric, scores: Sequence[ImageScore]) -> str:
     return f"not in the mean: {len(without)} of {len(scores)} images ({reason})"
 
 
-_ALIGNED = tuple(
-    (f"PSNR {words} (dB)", METRICS["psnr_db"], variant)
-    for words, variant in (("gain", GAIN), ("affine", AFFINE), ("pose and gain", POSE_GAIN))
-)
-
-
 def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> Table:
-    """List every view with its raw scores, and PSNR after each alignment."""
+    """List every view with its raw scores, and PSNR after a gain."""
     others = [metric for metric in PLAIN_METRICS if metric.id not in ("psnr_db", "ssim")]
     learned = [m for m in METRICS.values() if any(m.id in s.scores[RAW].values for s in scores)]
     others += [metric for metric in learned if metric not in PLAIN_METRICS]
@@ -148,8 +142,7 @@ def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> T
         title=title,
         columns=(
             *("camera", "stamp_ns", "PSNR (dB)", "SSIM", "pixels"),
-            *(name for name, _, _ in _ALIGNED),
-            *("depth (mm)", *(metric.column for metric in others)),
+            *("PSNR gain (dB)", "depth (mm)", *(metric.column for metric in others)),
         ),
         rows=tuple(
             (
@@ -158,7 +151,7 @@ def per_image_table(table_id: str, title: str, scores: Sequence[ViewScore]) -> T
                 _rounded(s.scores[RAW].psnr_db, 3),
                 _rounded(s.scores[RAW].ssim, 4),
                 s.scores[RAW].num_pixels,
-                *(_rounded(s.psnr_db(variant), 3) for _, _, variant in _ALIGNED),
+                _rounded(s.psnr_db(GAIN), 3),
                 None if s.depth is None else round(1e3 * s.depth.mean_abs_m, 2),
                 *(_rounded(s.scores[RAW].values.get(metric.id), 4) for metric in others),
             )

@@ -17,10 +17,8 @@ from bridge.errors import GstError
 from bridge.media.color import decode_color
 from evaluator.cache import SummaryCache
 from evaluator.compare.images.scores import (
-    AFFINE,
     GAIN,
     NUM_WORST,
-    POSE_GAIN,
     RAW,
     RECORDED,
     RENDERED,
@@ -94,8 +92,7 @@ def _summary_of(score: ViewScore) -> ViewSummary:
 
 
 def _score_of(view: ViewSummary) -> ViewScore:
-    variants = [RAW, GAIN, AFFINE, POSE_GAIN]
-    variants += [variant for name in view.masks for variant in masked(name)]
+    variants = [RAW, GAIN, *map(masked, view.masks)]
     named = {variant.name: variant for variant in variants}
     height, width = view.size
     return ViewScore(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot_dataset import LENGTHS, Dataset, png, run, shade, state
+from lerobot_dataset import CAMERA, LENGTHS, Dataset, png, run, shade, state
 
 from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.reader import Episode
@@ -75,12 +75,15 @@ def test_the_episode_says_what_it_is_made_of(dataset: Dataset, tmp_path: Path) -
     assert source["left_out"] == ["observation.env (float32 [2, 2])"]
 
 
-def test_a_video_of_depth_is_left_out(dataset: Dataset, tmp_path: Path) -> None:
-    key = next(key for key, each in dataset.info["features"].items() if each["dtype"] == "video")
-    dataset.info["features"][key]["info"] = {"is_depth_map": True}
+@pytest.mark.parametrize("flag", ["is_depth_map", "video.is_depth_map"])
+def test_depth_is_left_out_and_never_taken_for_colour(
+    dataset: Dataset, tmp_path: Path, flag: str
+) -> None:
+    dataset.info["features"][CAMERA]["info"] = {flag: True}
     assert run("import", "lerobot", dataset.write(), tmp_path / "run") == 0
-    episode = Episode.open(next((tmp_path / "run" / "episodes").iterdir()))
-    assert f"{key} (depth)" in episode.metadata_records["source"]["left_out"]
+    episode = Episode.open(min((tmp_path / "run" / "episodes").iterdir()))
+    assert f"{CAMERA} (depth)" in episode.metadata_records["source"]["left_out"]
+    assert not [topic for topic in episode.topics() if "/front/" in topic]
 
 
 def test_a_selection_imports_only_those_and_a_second_run_only_the_rest(
