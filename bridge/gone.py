@@ -76,7 +76,6 @@ GONE: dict[str, str] = {
         "robot-gst evaluate RUN says of all trials so far how many more would settle the ranking.",
     ),
     "evaluate --goal": "evaluate says task by task how many more trials would settle the ranking.",
-    "export lerobot --depth": "robot-gst export tum writes depth; a LeRobot data set has colour.",
     "design --past": "Say what is expected: --rate, --gain, --agreement.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",
