@@ -250,10 +250,7 @@ def maker(tmp_path: Path) -> RunMaker:
 
 @pytest.fixture(scope="session")
 def six_trials_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three starts without and with replanning; the twin is wrong about one of six.
-
-    Recorded: S F F without, S S F with. Twin: S F S without, S S F with.
-    """
+    """Three starts without and with replanning; the twin is wrong about one of six."""
     maker = RunMaker(run=RunFolder.create(tmp_path_factory.mktemp("six") / "monday"))
     table: tuple[tuple[str, str, str, bool], ...] = (
         ("a1", "without_replanning", "success", True),

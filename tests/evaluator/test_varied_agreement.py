@@ -167,11 +167,7 @@ MISSES = 1 + SIMULATIONS // 10
 @pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_the_interval_of_r_covers_the_correlation_of_groups_like_these() -> None:
-    """Simulated: log-odds of groups, correlated 0.7, ten trials each.
-
-    Each trial has a chance of its own on either side, of which its outcome and its shares are
-    draws, so that both sides err together as those of one start do.
-    """
+    """Simulated: log-odds of groups, correlated 0.7, ten trials each."""
     rng = np.random.default_rng(7)
     covariance = np.array([[2.0, 1.4], [1.4, 2.0]])
     many = rng.multivariate_normal([0, 0], covariance, 200_000)

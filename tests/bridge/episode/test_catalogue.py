@@ -128,15 +128,6 @@ def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:
     assert list_episodes(run)[0].outcome == "success"
 
 
-def test_all_parts_of_a_split_episode_are_one_line(run: RunFolder) -> None:
-    sizes = []
-    for name in ("t1", "t1.2", "t1.3"):
-        path = write(run, name, id="t1", messages=2)
-        sizes.append(path.stat().st_size)
-    (entry,) = list_episodes(run)
-    assert (entry.id, entry.parts, entry.size_bytes) == ("t1", 3, sum(sizes))
-
-
 def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder) -> None:
     write(run, "t1", lost=0)
     with EpisodeWriter(run.episodes_dir / "t1.2.mcap") as writer:

@@ -1,9 +1,4 @@
-"""``export lerobot``: the layout the format's repository states, and what the numbers mean.
-
-Golden facts (paths, column names, dtypes) are those of ``huggingface/lerobot``, main branch of
-2026: ``datasets/utils.py`` (path templates, default features), ``dataset_writer.py`` (offset
-columns, one row group per episode), ``dataset_metadata.py`` (episode columns, info).
-"""
+"""``export lerobot``: the layout the format's repository states, and what the numbers mean."""
 
 import json
 from collections.abc import Callable

@@ -27,7 +27,6 @@ from bridge.sources.folder.messages import folder_messages, read_index
 BESIDE = Path(__file__).parents[4] / "shared" / "data"
 DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
 KITCHEN = DATA / "rgbd_7scenes_redkitchen_a"
-SHELF = DATA / "rgbd_apc_shelf_wristcam"
 WIDTH, HEIGHT = 8, 6
 
 

@@ -113,10 +113,7 @@ def some_postures(count: int) -> np.ndarray:
 
 
 def record_targets(run: RunFolder, count: int = 12, more: Sequence[np.ndarray] = ()) -> Path:
-    """A camera in the hand sees a target from several stops, and once on the move.
-
-    At the first stop also at ``more`` places.
-    """
+    """A camera in the hand sees a target from several stops, and once on the move."""
     robot, rng = load_robot(URDF), np.random.default_rng(1)
     recording = Recording(run.episodes_dir / "probe_1.mcap", some_postures(count))
     for index, joints in enumerate(recording.postures):

@@ -47,10 +47,7 @@ def dropped(urdf: str, steps: int = 120) -> tuple[np.ndarray, str]:
 
 
 def test_what_a_world_before_was_told_changes_nothing(urdf: str) -> None:
-    """Clients are used again: settings, bodies and constraints of one world end with it.
-
-    But for the contact breaking threshold, which PyBullet keeps for the whole process.
-    """
+    """Clients are used again: settings, bodies and constraints of one world end with it."""
     while engine._IDLE:
         pybullet.disconnect(physicsClientId=engine._IDLE.pop())
     first = dropped(urdf, 60)[1]

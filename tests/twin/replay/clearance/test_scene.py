@@ -11,7 +11,6 @@ from scripted_plans import joints_over
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
 from twin.replay.clearance.bodies import SCENE, distances_to_boxes_m, own_links, planes_of
-from twin.replay.clearance.bounding_spheres import bounding_spheres_of
 from twin.replay.clearance.monitor import ClearanceMonitor, Reach, State
 from twin.replay.clearance.static_obstacles import unmodelled_obstacles
 from twin.replay.clearance.surroundings import Surroundings, posture_clearance
@@ -145,36 +144,6 @@ def test_taking_a_container_out_leaves_distances_that_are_never_too_large() -> N
     assert np.abs(local.values_m - full.values_m)[close & (full.values_m > 0)].max() < 2 * VOXEL_M
 
 
-def test_no_point_of_a_hull_is_farther_from_its_tree_than_is_subtracted(
-    hulls: RobotHulls,
-) -> None:
-    from scipy.spatial import ConvexHull, cKDTree
-
-    rng = np.random.default_rng(5)
-    for hull in hulls.hulls[3:]:
-        tree = bounding_spheres_of(hull.points_m, 0.004)
-        corners = hull.points_m[ConvexHull(hull.points_m).simplices]
-        weights = rng.dirichlet(np.ones(3), size=len(corners))
-        points = np.einsum("nk,nkj->nj", weights, corners)
-        finest = tree.points_m[tree.children[:, 0] == tree.children[:, 1]]
-        assert cKDTree(finest).query(points)[0].max() <= tree.cover_m + 1e-9
-
-
-def test_everything_below_a_point_of_a_tree_is_within_its_radius() -> None:
-    tree = bounding_spheres_of(np.random.default_rng(6).uniform(-0.05, 0.05, (30, 3)))
-    parent = np.full(len(tree.points_m), -1)
-    for index, (begin, end) in enumerate(tree.children):
-        assert np.all(parent[begin:end] == -1)
-        parent[begin:end] = index
-    assert np.flatnonzero(parent == -1).tolist() == list(range(tree.num_roots))
-    for index in np.flatnonzero(tree.children[:, 0] == tree.children[:, 1]):
-        above = parent[index]
-        while above >= 0:
-            away = np.linalg.norm(tree.points_m[index] - tree.points_m[above])
-            assert away + tree.cover_m <= tree.radius_m[above] + 1e-9
-            above = parent[above]
-
-
 def test_reach_bounds_how_far_any_point_of_a_link_moves(hulls: RobotHulls) -> None:
     rng = np.random.default_rng(8)
     reach = Reach(hulls)
@@ -199,10 +168,7 @@ def test_reach_bounds_how_far_any_point_of_a_link_moves(hulls: RobotHulls) -> No
 def test_a_post_passed_between_two_states_is_not_missed(
     script: SimpleNamespace, static: StaticSdf | None
 ) -> None:
-    """20 ms apart both states are free, and the gripper went through the post in between.
-
-    Without the grid the post is not known, and nothing is made up.
-    """
+    """20 ms apart both states are free, and the gripper went through the post in between."""
     scene = replace(script.scene(), static_sdf=static)
     robot = load_robot(scene.urdf)
     monitor = monitor_of(script, scene)

@@ -327,20 +327,3 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
         assert row["accepted"] is None
     assert summary["counts"]["planned dynamic"]["n"] == 1
     assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
-
-
-def test_a_plan_made_during_an_execution_has_no_known_start(script: SimpleNamespace) -> None:
-    task = script.scene().task
-    phases = [
-        Phase(name="start", plan_id=None, after_ns=None, before_ns=100),
-        Phase(name="end", plan_id="a", after_ns=200, before_ns=300),
-    ]
-    first = StartState(Ts_base_object={"cube": np.eye(4)})
-    second = StartState(Ts_base_object={"box": np.eye(4)})
-    starts = StartStates(task, phases, [first, second])
-    assert starts.at(100) is first
-    assert starts.at(250) is second
-    assert starts.at(300) is second
-    during = starts.at(150)
-    assert not during.Ts_base_object
-    assert "being executed" in during.reasons["cube"]

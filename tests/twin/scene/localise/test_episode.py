@@ -108,10 +108,7 @@ def frames() -> dict[str, RgbdFrame]:
 def episode(
     tmp_path: Path, stage: Callable[..., Any], task: Task, frames: dict[str, RgbdFrame]
 ) -> Episode:
-    """Start at 1, 2, 3 s; execution from 4 to 6 s; the cube is in the box at 7 and 8 s.
-
-    A truth camera and a truth pose beside them lie: they show the cube elsewhere.
-    """
+    """Start at 1, 2, 3 s; execution from 4 to 6 s; the cube is in the box at 7 and 8 s."""
     if not frames:
         rng = np.random.default_rng(0)
         for name, poses in (("start", START), ("end", END)):

@@ -16,10 +16,6 @@ from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.language import MIN_SPLATS, NAMED, numbered, query
 
 
-def masks(labels: np.ndarray, **keys: tuple[int, ...]) -> dict[str, np.ndarray]:
-    return {key: np.isin(np.arange(len(labels)), ids) for key, ids in keys.items()}
-
-
 def test_a_known_object_takes_what_the_segmenter_joined_with_it_and_no_more() -> None:
     # Thing 1 is mostly the duck's, thing 2 hardly, thing 3 not at all.
     labels = np.repeat([0, 1, 2, 3], [40, 50, 60, 30]).astype(np.uint16)
