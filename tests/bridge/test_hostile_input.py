@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from mcap.writer import Writer
 
 import robot_gst
@@ -18,7 +19,6 @@ from bridge.episode.catalogue import list_episodes
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import (
     FrameTransform,
-    JointSample,
     transforms_from_cdr,
     transforms_to_cdr,
 )
@@ -103,13 +103,7 @@ def test_an_image_that_claims_gigabytes_is_refused(size: tuple[int, int]) -> Non
 
 
 def sample(stamp_ns: int, names: tuple[str, ...], position: list[float]) -> bytes:
-    return JointSample(
-        stamp_ns=stamp_ns,
-        names=names,
-        position=np.array(position),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    ).to_cdr()
+    return at_positions(stamp_ns, names, np.array(position)).to_cdr()
 
 
 def test_joints_of_several_publishers_are_put_in_one_order(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 import robot_gst
 from bridge.episode import schema
@@ -14,7 +15,6 @@ from bridge.episode.cdr.messages import (
     CameraInfo,
     DepthImage,
     FrameTransform,
-    JointSample,
     PoseSample,
     string_to_cdr,
     transforms_to_cdr,
@@ -73,10 +73,7 @@ class Recording:
             ("/c/joint_states", ARM_JOINTS, joints),
             ("/c/gripper/state", ("gripper_width",), np.array([0.06])),
         ):
-            none = np.zeros(0)
-            sample = JointSample(
-                stamp_ns=stamp_ns, names=tuple(names), position=values, velocity=none, effort=none
-            )
+            sample = at_positions(stamp_ns, tuple(names), values)
             self.put(topic, sample.to_cdr(), schema.JOINT_STATE, stamp_ns)
 
     def target(self, camera_id: str, T_camera_target: np.ndarray, stamp_ns: int) -> None:

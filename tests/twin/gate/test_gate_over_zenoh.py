@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gate_fakes import JUDGED, accept
+from joint_samples import at_positions
 from loopback import free_endpoint
 from own_process import ROOT
 
@@ -21,7 +22,6 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -62,13 +62,7 @@ def sessions(endpoint: str) -> Iterator[tuple[WireSession, WireSession]]:
 
 
 def still_at(stamp_ns: int, names: tuple[str, ...] = ARM_JOINTS) -> bytes:
-    sample = JointSample(
-        stamp_ns=stamp_ns,
-        names=names,
-        position=np.zeros(len(names)),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    )
+    sample = at_positions(stamp_ns, names, np.zeros(len(names)))
     return sample.to_cdr()
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from live_cell import CAMERA, IMAGE, S, calibrate, event, look, place, shoot
 
 from bridge.episode.cdr.messages import (
@@ -11,7 +12,6 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -45,14 +45,7 @@ def calibration_of(folder: Path, link: str, stream: str = "color") -> Calibratio
 
 
 def joints(view: LiveView, stamp_ns: int, position: np.ndarray = HOME) -> None:
-    none = np.zeros(0)
-    sample = JointSample(
-        stamp_ns=stamp_ns,
-        names=tuple(ARM_JOINTS),
-        position=position,
-        velocity=none,
-        effort=none,
-    )
+    sample = at_positions(stamp_ns, tuple(ARM_JOINTS), position)
     view.take("/standin/joint_states", sample.to_cdr(), stamp_ns)
 
 
@@ -174,10 +167,7 @@ def test_joints_count_as_life_and_say_where_the_arm_is() -> None:
 
 def test_a_gripper_that_publishes_beside_the_arm_does_not_take_its_place() -> None:
     view = LiveView("standin")
-    other = JointSample(
-        stamp_ns=8 * S, names=("finger",), position=np.zeros(1), velocity=np.zeros(0),
-        effort=np.zeros(0),
-    )  # fmt: skip
+    other = at_positions(8 * S, ("finger",), np.zeros(1))
     view.take("/standin/joint_states", other.to_cdr(), 8 * S)
     first = view.joints()
     assert first is not None

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -118,10 +118,7 @@ def write_recording(run: RunFolder, urdf: str) -> Episode:
                 ("joint_states", ARM_JOINTS, joints),
                 ("gripper/state", ("gripper_width",), np.array([0.05])),
             ):
-                sample = JointSample(
-                    stamp_ns=stamp, names=names, position=values,
-                    velocity=np.zeros(0), effort=np.zeros(0),
-                )  # fmt: skip
+                sample = at_positions(stamp, names, values)
                 say(f"/cell/{topic}", sample.to_cdr(), schema.JOINT_STATE, stamp)
             for name in poses if index % 5 == 0 else ():
                 image = CompressedColor(stamp_ns=stamp, frame_id=name, format="jpeg", data=b"-")

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -62,10 +63,7 @@ def write_trial(
             stamp = T0 + SECOND + round(stamp_s * 1e9)
             tracks = (("joint_states", ARM_JOINTS), ("gripper/state", ("gripper_width",)))
             for topic, names in tracks:
-                sample = JointSample(
-                    stamp_ns=stamp, names=names, position=np.full(len(names), joints_rad),
-                    velocity=np.zeros(0), effort=np.zeros(0),
-                )  # fmt: skip
+                sample = at_positions(stamp, names, np.full(len(names), joints_rad))
                 writer.write(
                     f"/standin/{topic}",
                     sample.to_cdr(),

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from mcap.reader import make_reader
 
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -75,13 +76,7 @@ def run(
             writer.write_json("/standin/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, recorded in (("joint_states", track), ("gripper/state", widths)):
             for stamp, position in zip(recorded.stamps_ns, recorded.position, strict=True):
-                sample = JointSample(
-                    stamp_ns=int(stamp),
-                    names=recorded.names,
-                    position=position,
-                    velocity=np.zeros(0),
-                    effort=np.zeros(0),
-                )
+                sample = at_positions(int(stamp), recorded.names, position)
                 writer.write(
                     f"/standin/{topic}",
                     sample.to_cdr(),

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.cli.episodes import label
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -79,13 +80,7 @@ def write(folder: RunFolder, script: SimpleNamespace, good: ReplayResult) -> Wri
                     continue
                 names = tuple(f"{rename}{name}" for name in track.names)
                 for stamp_ns, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
-                    sample = JointSample(
-                        stamp_ns=stamp_ns,
-                        names=names,
-                        position=track.position[0] if still else row,
-                        velocity=np.zeros(0),
-                        effort=np.zeros(0),
-                    )
+                    sample = at_positions(stamp_ns, names, track.position[0] if still else row)
                     writer.write(
                         f"/lab/{topic}",
                         sample.to_cdr(),
