@@ -221,7 +221,6 @@ def copy_messages(source: Episode, writer: EpisodeWriter) -> None:
 
 
 def write_trial(run: RunFolder, trial: Trial, *, images: bool = True) -> Path:
-    """Write one recorded trial."""
     path = run.episodes_dir / f"{trial.id}.mcap"
     plan = make_plan(trial, 2 if trial.rejected_first else 1)
     with EpisodeWriter(path) as writer:
@@ -408,7 +407,6 @@ def synthetic() -> ModuleType:
 
 @pytest.fixture(scope="session")
 def shared_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """Return a run that tests only read."""
     return make_run(tmp_path_factory.mktemp("runs") / "monday")
 
 
@@ -451,7 +449,6 @@ def browser_of(*runs: RunFolder, admission: Admission | None = None) -> Browser:
 
 @pytest.fixture
 def browser(shared_run: RunFolder) -> Browser:
-    """Return a browser on the shared run."""
     return browser_of(shared_run)
 
 

@@ -313,7 +313,6 @@ def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="session")
 def everything(evaluation_run_once: RunFolder) -> Comparison:
-    """The evaluation of that run."""
     with lean_checks.unchecked(), coarse_model():
         return compare_run(evaluation_run_once)
 

@@ -36,7 +36,6 @@ def pool() -> Iterator[ProcessPool]:
 
 @pytest.fixture
 def two(pool: ProcessPool) -> ProcessPool:
-    """Two processes beside this one."""
     return begun(pool, 2)
 
 

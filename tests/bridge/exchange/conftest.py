@@ -247,7 +247,6 @@ def _drops() -> bytes:
 
 @pytest.fixture
 def make_trial(tmp_path: Path) -> Callable[..., Path]:
-    """Write a made trial into ``run/episodes`` and return its path."""
 
     def make(**fields: object) -> Path:
         trial = MadeTrial(**fields)  # type: ignore[arg-type]

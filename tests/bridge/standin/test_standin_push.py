@@ -1,20 +1,15 @@
 """A stage that pushes: level, straight, at an even speed, closed; and the cell that does it."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
-from bridge.sources.standin.cell import HOME_SEED_RAD, CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile, nominal_hidden
+from bridge.sources.standin.cell import HOME_SEED_RAD
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
-from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import NO_ERROR, plan_pick_and_place
-from bridge.sources.standin.streams import Streams
 from bridge.task.plan import Plan
 from bridge.task.task_file import Task, load_task
 from evaluator.metrics.geometric_rule import judge_by_geometry
@@ -84,31 +79,3 @@ def test_geometry_carries_the_cube_in_front_of_the_fingers(push: Task) -> None:
     assert "moved 0 mm" in missed.detail
     short = replace(plan, tau=plan.tau[: len(plan.tau) // 2])
     assert judge_by_geometry(short, push, starts).value is False
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("friction", "result"), [(0.5, "success"), (0.06, "failure")])
-@pytest.mark.usefixtures("unchecked")
-def test_friction_decides_whether_the_cube_stops_at_the_mark(
-    push: Task,
-    make_session: Callable[..., Any],
-    cell_file: CellFile,
-    friction: float,
-    result: str,
-) -> None:
-    hidden = replace(nominal_hidden(cell_file), object_friction=friction)
-    cell = StandinCell(
-        cell_file,
-        push,
-        hidden,
-        Streams(make_session(), "standin"),
-        config=CellConfig(rate_hz=0.0),
-        seed=SEED,
-        start_ns=0,
-    )
-    starts = push.draw_start(np.random.default_rng(SEED))
-    cell.reset(starts)
-    execute_plan(cell, planned(push, starts))
-    outcome = label_trial(push, cell.truth, executed=True)
-    assert outcome.result == result, outcome.detail
-    assert outcome.stages == ({"id": "push", "result": result},)

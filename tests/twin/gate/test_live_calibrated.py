@@ -59,13 +59,11 @@ class Recorder(LiveView):
         self.writer.describe(EpisodeInfo(id=path.stem, kind="trial", cell="standin"))
 
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
-        """Show and write."""
         super().take(topic, data, received_ns, type_name)
         named = type_name or type_of_topic(topic) or ""
         self.writer.write(topic, data, type_name=named, log_time_ns=received_ns)
 
     def episode(self) -> Episode:
-        """What was recorded."""
         self.writer.close()
         return Episode.open(self.path)
 

@@ -56,5 +56,4 @@ def soft_box(
 
 @pytest.fixture(scope="session")
 def box_of_cells() -> Callable[..., SoftModel]:
-    """Make soft boxes."""
     return soft_box

@@ -338,7 +338,6 @@ def drawn(
 def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(
     run: RunFolder, script: SimpleNamespace, tmp_path: Path
 ) -> None:
-    """The arm moves as recorded."""
     scene = script.scene()
     write_scene(run, scene, "cube", block())
     write_recording(run, scene.urdf)

@@ -218,7 +218,6 @@ class PoolForReplays(ProcessPool):
     """Lists jobs in this process, where the fixture localises; replays in the others."""
 
     def run(self, function: Any, items: Any, cost: Any) -> Any:
-        """See ``ProcessPool``."""
         runner = Serial() if function is runner_module.jobs_of else super()
         return runner.run(function, items, cost)
 

@@ -239,38 +239,6 @@ def test_a_rigid_body_that_physics_lost_is_not_judged(
         replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.1))
 
 
-@pytest.mark.slow
-def test_two_replays_of_one_plan_are_the_same_bits(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    again = replay_plan(script.plan(scene), scene, ReplayConfig())
-    assert np.array_equal(again.joints_rad, good.joints_rad)
-    assert np.array_equal(again.clearance_m, good.clearance_m)
-    for name, Ts in good.Ts_base_object.items():
-        assert Ts.tobytes() == again.Ts_base_object[name].tobytes()
-    assert again.verdict == good.verdict
-
-
-@pytest.mark.slow
-def test_twelve_seconds_take_so_many_steps_and_no_more(
-    script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``make bench BENCH=replay_rigid`` measures how long they take."""
-    steps = [0]
-    step = World.step
-
-    def counted(self: World) -> None:
-        steps[0] += 1
-        step(self)
-
-    monkeypatch.setattr(World, "step", counted)
-    scene, config = script.scene(), ReplayConfig()
-    result = replay_plan(script.plan(scene, pace=1.0), scene, config)
-    assert result.stamps_ns[-1] == 12_000_000_000
-    assert steps[0] == (12.0 + config.settle_before_s) * config.physics.rate_hz
-
-
 def test_an_unreachable_first_waypoint_gives_a_verdict_too(script: SimpleNamespace) -> None:
     scene = script.scene()
     plan = script.plan(scene)
