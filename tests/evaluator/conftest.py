@@ -317,12 +317,6 @@ def everything(evaluation_run_once: RunFolder) -> Comparison:
         return compare_run(evaluation_run_once)
 
 
-@pytest.fixture
-def evaluation_run(evaluation_run_once: RunFolder, tmp_path: Path) -> RunFolder:
-    """A fresh copy of that run, for the test to spoil."""
-    return RunFolder(shutil.copytree(evaluation_run_once.path, tmp_path / "everything"))
-
-
 @pytest.fixture(scope="session")
 def load_golden_script() -> Callable[[str], ModuleType]:
     """For tests in the folders below, which cannot import this file."""

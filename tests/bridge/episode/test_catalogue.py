@@ -25,11 +25,6 @@ from bridge.errors import OptionError, UsageError
 DAY_NS = 86_400_000_000_000
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def write(
     run: RunFolder,
     name: str,

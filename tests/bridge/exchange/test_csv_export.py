@@ -7,18 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from joint_samples import at_positions
 
-import robot_gst
 from bridge.episode import schema
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import joint_track, pose_track
 from bridge.episode.writer import EpisodeWriter
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def rows(path: Path) -> list[dict[str, str]]:

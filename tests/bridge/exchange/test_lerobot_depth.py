@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import robot_gst
 from bridge.episode import schema
 from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.reader import Episode
@@ -22,10 +22,6 @@ pytest.importorskip("pyarrow")
 
 CODING = DepthCoding()
 KEY = "observation.images.side_depth"
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def code_of(depth_mm: float) -> int:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 
-import robot_gst
 from bridge.episode.reader import Episode
 from bridge.exchange.lerobot.writer import RunningStats
 
@@ -17,10 +17,6 @@ av = pytest.importorskip("av")
 pq = pytest.importorskip("pyarrow.parquet")
 
 START_NS = 1_700_000_000_123_456_789
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 @pytest.fixture(scope="module")

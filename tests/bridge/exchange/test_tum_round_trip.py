@@ -6,17 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from PIL import Image
 
-import robot_gst
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
 from bridge.episode.streams import rgbd_frames
 from bridge.geometry import se3
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def images(path: Path, camera: str, kind: str) -> list[tuple[int, object]]:

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,11 +37,6 @@ def make_sample() -> MakeSample:
         return WireSample(**{**values, **changes})  # type: ignore[arg-type]
 
     return make
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 @pytest.fixture

@@ -129,11 +129,6 @@ def record_targets(run: RunFolder, count: int = 12, more: Sequence[np.ndarray] =
     return recording.path
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def calibrate(run: RunFolder, *arguments: str) -> int:
     return robot_gst.run(["calibrate", str(run.path), *arguments])
 

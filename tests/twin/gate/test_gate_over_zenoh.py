@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from gate_fakes import JUDGED, accept
 from joint_samples import at_positions
-from loopback import free_endpoint
 from own_process import ROOT
 
 from bridge.episode.cdr.messages import (
@@ -43,12 +42,6 @@ from twin.gate.service import GateError, claim_gate, serve_gate, watch_cell
 
 CAMERA = Camera(width=8, height=6, fx=10.0, fy=10.0, cx=4.0, cy=3.0)
 S = 1_000_000_000
-
-
-@pytest.fixture
-def endpoint() -> str:
-    """Where the router of ``sessions`` listens."""
-    return free_endpoint()
 
 
 @pytest.fixture

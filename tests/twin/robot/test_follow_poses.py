@@ -3,18 +3,12 @@
 import numpy as np
 import pytest
 
-from bridge.robots.default import ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.inverse import UrInverse, pose_error
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import RobotModel
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
 
 
 def arc(start: np.ndarray, end: np.ndarray, count: int = 60) -> np.ndarray:

@@ -26,11 +26,6 @@ from twin.robot.posture import PostureTrack, width_track
 POSTURE = np.array([0.3, -1.3, 1.5, -1.6, -1.4, 0.4])
 
 
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
-
-
 @pytest.mark.parametrize(
     ("tolerance_m", "tolerance_rad", "reached"),
     [(0.1, math.pi, True), (0.1, 1e-9, False), (1e-9, math.pi, False), (1e-9, 1e-9, False)],

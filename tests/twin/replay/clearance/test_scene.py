@@ -189,21 +189,6 @@ def test_a_post_passed_between_two_states_is_not_missed(
     assert again.measure(0, after, 0.0, {}) > 0.01
 
 
-def test_a_thin_wall_of_the_box_is_not_jumped_over(script: SimpleNamespace) -> None:
-    """6 mm of wall, 60 mm of motion."""
-    scene = script.scene()
-    wall_x = 0.5 + 0.078
-    monitor = monitor_of(script, scene, allowed_contacts=())
-    robot = load_robot(scene.urdf)
-    before = joints_over(scene, wall_x - 0.03, 0.19, 0.045)
-    T = robot.T_base_tcp(before)
-    T[0, 3] += 0.06
-    after = solve_ik(robot, T, IkConfig(), warm_start_rad=before).joints_rad
-    monitor.measure(0, before, 0.0, {})
-    monitor.measure(20_000_000, after, 0.0, {})
-    assert any(failure.bodies[1] == "box" for failure in monitor.failures)
-
-
 def ball(centre: tuple[float, float, float], radius: float = 0.03) -> np.ndarray:
     """Nodes of a soft ball."""
     rng = np.random.default_rng(9)

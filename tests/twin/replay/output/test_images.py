@@ -156,11 +156,6 @@ def result_of(scene: ReplayScene, movable: str, nodes_m: np.ndarray | None = Non
     )  # fmt: skip
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def pictures(
     run: RunFolder,
     episode: Episode,
@@ -316,23 +311,6 @@ def test_calibrated_cameras_see_from_where_the_calibration_has_them(
                 np.testing.assert_allclose(found, expected, atol=1.5, err_msg=name)
                 checked += 1
     assert checked >= 4
-
-
-def drawn(
-    run: RunFolder, episode: Episode, result: ReplayResult, scene: ReplayScene
-) -> list[tuple[str, int, bytes]]:
-    return [
-        (camera_id, image.stamp_ns, image.data)
-        for camera_id, image in render_replay(
-            run,
-            episode,
-            result,
-            scene,
-            start_ns=T0,
-            executed=True,
-            planned=True,
-        )
-    ]
 
 
 def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(

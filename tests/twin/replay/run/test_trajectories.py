@@ -18,11 +18,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.process_pool import ProcessPool, Serial
 from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
 from bridge.terminal import Output
 from twin.replay import run_job as run_job_module
-from twin.replay import runner
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.job import ReplayJob
@@ -212,31 +210,6 @@ def test_both_engines_write_an_episode_each_and_the_first_decides(
     monkeypatch.setattr(runner_module, "run_job", lambda job: done.append(job) or dynamic[0])
     replay_run(run, config, QUIET)
     assert len(done) == 1, "an engine's episode that is missing is made again"
-
-
-class PoolForReplays(ProcessPool):
-    """Lists jobs in this process, where the fixture localises; replays in the others."""
-
-    def run(self, function: Any, items: Any, cost: Any) -> Any:
-        runner = Serial() if function is runner_module.jobs_of else super()
-        return runner.run(function, items, cost)
-
-
-@pytest.mark.slow
-def test_two_processes_say_what_one_process_says(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = ReplayRunConfig(replay=QUICK)
-    replay_run(run, config, QUIET)
-    before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(runner, "ProcessPool", PoolForReplays)
-    summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
-    assert not any(row["skipped"] or row["error"] for row in summary["rows"])
-    assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
-
-
-def _messages(path: Path) -> list[tuple[str, int, bytes]]:
-    return [(m.topic, m.publish_time_ns, m.data) for m in Episode.open(path).messages()]
 
 
 def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:

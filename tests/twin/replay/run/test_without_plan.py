@@ -141,17 +141,6 @@ def test_what_was_executed_is_replayed_and_nothing_is_said_to_be_planned(
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
 
 
-@pytest.mark.slow
-def test_an_imported_episode_is_replayed_once_somebody_says_of_which_task(
-    folder: RunFolder, write: Write, seen: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(EpisodeInfo(id="bag", kind="imported"))
-    assert cli.replay(folder.path, config=QUICK) == 2
-    assert "nobody said of which task it is a trial: robot-gst label" in capsys.readouterr().out
-    label(folder.path, "bag", task="cube_into_box", result="failure", output=QUIET)
-    assert cli.replay(folder.path, config=QUICK) == 0
-
-
 @pytest.mark.parametrize(
     ("how", "why"),
     [

@@ -76,11 +76,6 @@ def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: b
             put("/c/cam/side/depth/image", depth.to_cdr(), schema.IMAGE, stamp)
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:
     write_scan(run.episodes_dir / "scan.mcap", "base_link", np.eye(4))
     choices = choose_frames(find_sources(run), FrameConfig(), QUIET).choices
