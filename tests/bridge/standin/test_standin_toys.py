@@ -1,22 +1,16 @@
 """Soft toys in the stand-in cell: physics, plans, pictures and truth."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from bridge.episode import schema
-from bridge.episode.cdr.messages import PointCloudSample, PoseSample
-from bridge.episode.metadata import Outcome
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile, draw_hidden, nominal_hidden
+from bridge.sources.standin.cell_file import CellFile, nominal_hidden
 from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import arm_kinematics, yaw_of
-from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.planner import (
     NO_ERROR,
     draw_error,
@@ -25,7 +19,6 @@ from bridge.sources.standin.planner import (
 )
 from bridge.sources.standin.render import Renderer
 from bridge.sources.standin.soft import SoftBody
-from bridge.sources.standin.streams import Streams
 from bridge.sources.standin.surfaces import clutter_surfaces, lab_surfaces, object_surfaces
 from bridge.sources.standin.world import World
 from bridge.task.plan import Plan
@@ -48,47 +41,6 @@ def plan_of(task: Task, Ts: dict[str, np.ndarray], error: Any = NO_ERROR) -> Pla
         condition="without_replanning",
         start_id=f"{task.name}/{SEED}",
     )
-
-
-def trial(task: Task, file: CellFile, session: Any) -> tuple[Outcome, StandinCell]:
-    cell = StandinCell(
-        file,
-        task,
-        draw_hidden(file, SEED),
-        Streams(session, "standin"),
-        config=CellConfig(rate_hz=0.0),
-        seed=SEED,
-        start_ns=0,
-    )
-    Ts = task.draw_start(np.random.default_rng(SEED))
-    cell.reset(Ts)
-    cell.wait(0.2)
-    execute_plan(cell, plan_of(task, Ts))
-    return label_trial(task, cell.truth, executed=True), cell
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
-def test_a_sloth_taken_at_its_waist_ends_up_in_the_basket_in_its_own_shape(
-    sloth: Task, toys_cell: CellFile, make_session: Callable[..., Any]
-) -> None:
-    session = make_session()
-    outcome, cell = trial(sloth, toys_cell, session)
-    assert (outcome.result, outcome.unit, outcome.k, outcome.n) == ("success", "trial", 1, 1)
-    assert [stage["result"] for stage in outcome.stages] == ["success"] * 3
-    squeezed = min(float(extents[1]) for extents in cell.truth.extents_m["sloth"])
-    assert squeezed < 0.098, "the grip deforms it"
-    assert max(cell.truth.contact["sloth"]), "and is noticed"
-    # Truth: pose and points at 30 Hz, the points around the pose.
-    poses = session.of("truth/object/sloth/pose")
-    clouds = session.of("truth/object/sloth/nodes")
-    assert len(poses) == len(clouds) == len(cell.truth.stamps_ns)
-    assert {item.type_name for item in clouds} == {schema.POINT_CLOUD}
-    for pose, cloud in list(zip(poses, clouds, strict=True))[::60]:
-        T = PoseSample.from_cdr(pose.data).T_frame_body
-        local = se3.apply(se3.invert(T), PointCloudSample.from_cdr(cloud.data).points_m)
-        assert np.abs(local).max() < 0.1
-        assert np.linalg.norm(local.mean(axis=0)) < 0.02
 
 
 @pytest.mark.parametrize("end", [0, 1])

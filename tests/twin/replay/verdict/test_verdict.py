@@ -162,19 +162,6 @@ def test_an_object_that_was_not_localised_leaves_the_verdict_open(
     assert verdict.accepted is None
 
 
-@pytest.mark.slow
-def test_a_recorded_execution_ends_as_the_motion_it_recorded(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    track, widths = script.recorded_tracks(good, start_ns=1_700_000_000_000_000_000)
-    result = replay_joints(track, widths, scene, ReplayConfig(), plan=script.plan(scene))
-    assert result.verdict.trajectory == "executed"
-    assert result.verdict.accepted is True, result.verdict.reason
-    end = result.Ts_base_object["cube"][-1, :3, 3] - good.Ts_base_object["cube"][-1, :3, 3]
-    assert np.linalg.norm(end) < 0.01
-
-
 def test_a_kinematic_replay_follows_recorded_joints_exactly(
     script: SimpleNamespace, good: ReplayResult
 ) -> None:
