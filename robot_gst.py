@@ -19,7 +19,7 @@ from rich.console import Console
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.gone import refuse_gone
-from bridge.leaves import Command, leaf_commands, refuse_missing_command
+from bridge.leaves import Command, commands_of, leaf_commands, refuse_missing_command
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -27,10 +27,6 @@ HELP = (
 )
 RESUMED = ("demo", "trials", "rebuild", "replay", "evaluate")
 """Commands that keep what they did when they are interrupted, and go on from there."""
-
-EPISODES, PUBLISH = "bridge.cli.episodes", "bridge.cli.publish"
-TASKS = "bridge.cli.tasks"
-RECORDING, EXCHANGE = "bridge.cli.recording", "bridge.cli.exchange"
 
 LISTS = Parameter(consume_multiple=True, negative_iterable="")
 """``--policies nominal loose`` and ``--policies nominal --policies loose`` say the same."""
@@ -49,207 +45,101 @@ USES = (
 START, RECORD, REVIEW, REBUILD, PLAN, EVALUATE, EXCHANGE_USE = USES
 
 CORE: tuple[Command, ...] = (
-    Command(
-        "doctor",
-        f"{EPISODES}:doctor",
-        "Show what is installed, what is missing and how to get it.",
-        "--json",
+    *commands_of(
         START,
+        "bridge.cli.episodes",
+        """
+        doctor | doctor | Show what is installed, what is missing and how to get it. | --json
+        """,
     ),
-    Command(
-        "record", f"{RECORDING}:record", "Record episodes live over zenoh.", "runs/monday", RECORD
-    ),
-    Command(
-        "ctl",
-        f"{RECORDING}:ctl",
-        "Start, stop, mark or label from another terminal.",
-        "start --id trial_1",
+    *commands_of(
         RECORD,
+        "bridge.cli.recording",
+        """
+        record | record | Record episodes live over zenoh. | runs/monday
+        ctl | ctl | Start, stop, mark or label from another terminal. | start --id trial_1
+        """,
     ),
-    Command(
-        "publish folder",
-        f"{PUBLISH}:publish_folder",
-        "Play an RGB-D folder as a live camera.",
-        "DIR --episode scan",
+    *commands_of(
         RECORD,
+        "bridge.cli.publish",
+        """
+        publish folder | publish_folder | Play an RGB-D folder as a live camera. | DIR --episode scan
+        publish episode | publish_episode | Play an episode back with its own timing. | FILE --rate 2 --topics 'lab/**'
+        """,
     ),
-    Command(
-        "publish episode",
-        f"{PUBLISH}:publish_episode",
-        "Play an episode back with its own timing.",
-        "FILE --rate 2 --topics 'lab/**'",
+    *commands_of(
         RECORD,
+        "bridge.cli.tasks",
+        """
+        task check | check | Say what is wrong with task files, or what they ask for. | my_task.toml
+        task new | new | Write a task file to start from. | cube_onto_block
+        """,
     ),
-    Command(
-        "task check",
-        f"{TASKS}:check",
-        "Say what is wrong with task files, or what they ask for.",
-        "my_task.toml",
+    *commands_of(
         RECORD,
+        "twin.cli",
+        """
+        robot check | robot_check | Joints, limits, frames, gripper; what is refused. | mine.toml
+        """,
     ),
-    Command(
-        "task new",
-        f"{TASKS}:new",
-        "Write a task file to start from.",
-        "cube_onto_block",
-        RECORD,
-    ),
-    Command(
-        "robot check",
-        "twin.cli:robot_check",
-        "Joints, limits, frames, gripper; what is refused.",
-        "mine.toml",
-        RECORD,
-    ),
-    Command(
-        "info",
-        f"{EPISODES}:info",
-        "Show what an episode holds.",
-        "runs/demo/episodes/scan.mcap",
+    *commands_of(
         REVIEW,
+        "bridge.cli.episodes",
+        """
+        info | info | Show what an episode holds. | runs/demo/episodes/scan.mcap
+        check | check | Verify an episode and list dropped messages. | runs/demo
+        recover | recover | Repair what a killed recorder left; report what is lost. | runs/demo
+        ls | ls | List the episodes of a run. | runs/demo --outcome failure
+        label | label | Set the outcome of a recorded episode. | runs/demo trial_1 --result failure
+        """,
     ),
-    Command(
-        "check",
-        f"{EPISODES}:check",
-        "Verify an episode and list dropped messages.",
-        "runs/demo",
+    *commands_of(
         REVIEW,
+        "dashboards.cli",
+        """
+        dashboard | dashboard | Serve review pages on the loopback address. | runs/monday
+        view | view | Open an episode and its replays in Rerun's 3D viewer. | runs/monday
+        share | share | Write trials with their clips into one file to send. | runs/monday --trials trial_0003
+        """,
     ),
-    Command(
-        "recover",
-        f"{EPISODES}:recover",
-        "Repair what a killed recorder left; report what is lost.",
-        "runs/demo",
-        REVIEW,
-    ),
-    Command(
-        "ls",
-        f"{EPISODES}:ls",
-        "List the episodes of a run.",
-        "runs/demo --outcome failure",
-        REVIEW,
-    ),
-    Command(
-        "label",
-        f"{EPISODES}:label",
-        "Set the outcome of a recorded episode.",
-        "runs/demo trial_1 --result failure",
-        REVIEW,
-    ),
-    Command(
-        "dashboard",
-        "dashboards.cli:dashboard",
-        "Serve review pages on the loopback address.",
-        "runs/monday",
-        REVIEW,
-    ),
-    Command(
-        "view",
-        "dashboards.cli:view",
-        "Open an episode and its replays in Rerun's 3D viewer.",
-        "runs/monday",
-        REVIEW,
-    ),
-    Command(
-        "share",
-        "dashboards.cli:share",
-        "Write trials with their clips into one file to send.",
-        "runs/monday --trials trial_0003",
-        REVIEW,
-    ),
-    Command(
-        "rebuild",
-        "twin.cli:rebuild",
-        "Fit a Gaussian-splat scene; render held-out views.",
-        "runs/monday --budget 60s",
+    *commands_of(
         REBUILD,
+        "twin.cli",
+        """
+        rebuild | rebuild | Fit a Gaussian-splat scene; render held-out views. | runs/monday --budget 60s
+        render | render | Render the rebuilt scene to PNG. | runs/monday
+        calibrate | calibrate | Calibrate cameras or physics from recorded episodes. | runs/monday --cameras
+        replay | replay | Replay every planned and executed trajectory in the twin. | runs/monday --workers 2
+        """,
     ),
-    Command(
-        "render", "twin.cli:render", "Render the rebuilt scene to PNG.", "runs/monday", REBUILD
-    ),
-    Command(
-        "calibrate",
-        "twin.cli:calibrate",
-        "Calibrate cameras or physics from recorded episodes.",
-        "runs/monday --cameras",
-        REBUILD,
-    ),
-    Command(
-        "replay",
-        "twin.cli:replay",
-        "Replay every planned and executed trajectory in the twin.",
-        "runs/monday --workers 2",
-        REBUILD,
-    ),
-    Command(
-        "gate",
-        "twin.cli:gate",
-        "Judge plans over zenoh before the robot moves.",
-        "runs/monday",
+    *commands_of(
         PLAN,
+        "twin.cli",
+        """
+        gate | gate | Judge plans over zenoh before the robot moves. | runs/monday
+        """,
     ),
-    Command(
-        "evaluate",
-        "evaluator.cli:evaluate",
-        "Compute success rates and agreement; write a report.",
-        "runs/monday",
+    *commands_of(
         EVALUATE,
+        "evaluator.cli",
+        """
+        evaluate | evaluate | Compute success rates and agreement; write a report. | runs/monday
+        design | design | Size a study before its first trial, and lock its protocol. | runs/study --rate 0.5 --gain 0.3 --width 0.4
+        """,
     ),
-    Command(
-        "design",
-        "evaluator.cli:design",
-        "Size a study before its first trial, and lock its protocol.",
-        "runs/study --rate 0.5 --gain 0.3 --width 0.4",
-        EVALUATE,
-    ),
-    Command(
-        "import rgbd",
-        f"{EXCHANGE}:import_rgbd",
-        "An RGB-D folder: scene.json, TUM, 7-Scenes.",
-        "DIR runs/x",
+    *commands_of(
         EXCHANGE_USE,
-    ),
-    Command(
-        "import images",
-        f"{EXCHANGE}:import_images",
-        "Posed images without depth: COLMAP, transforms.json.",
-        "DIR runs/x",
-        EXCHANGE_USE,
-    ),
-    Command(
-        "import rosbag2",
-        f"{EXCHANGE}:import_rosbag2",
-        "A rosbag2 recording, byte for byte.",
-        "BAG runs/x",
-        EXCHANGE_USE,
-    ),
-    Command(
-        "import trials",
-        f"{EXCHANGE}:import_trials",
-        "A trials CSV, for evaluate.",
-        "trials.csv runs/x",
-        EXCHANGE_USE,
-    ),
-    Command(
-        "export tum",
-        f"{EXCHANGE}:export_tum",
-        "Cameras as folders of the TUM RGB-D layout.",
-        "EPISODE DIR",
-        EXCHANGE_USE,
-    ),
-    Command(
-        "export rosbag2",
-        f"{EXCHANGE}:export_rosbag2",
-        "An episode as a rosbag2 folder.",
-        "EPISODE DIR",
-        EXCHANGE_USE,
-    ),
-    Command(
-        "export csv",
-        f"{EXCHANGE}:export_csv",
-        "Joints, poses, events ... as tidy CSV files.",
-        "runs/x DIR",
-        EXCHANGE_USE,
+        "bridge.cli.exchange",
+        """
+        import rgbd | import_rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
+        import images | import_images | Posed images without depth: COLMAP, transforms.json. | DIR runs/x
+        import rosbag2 | import_rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
+        import trials | import_trials | A trials CSV, for evaluate. | trials.csv runs/x
+        export tum | export_tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
+        export rosbag2 | export_rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR
+        export csv | export_csv | Joints, poses, events ... as tidy CSV files. | runs/x DIR
+        """,
     ),
 )
 

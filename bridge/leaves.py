@@ -41,18 +41,27 @@ class Leaf:
     commands: tuple[Command, ...] = ()
 
 
+def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
+    """Read a table: name, function of the module, what it does, what may follow its name."""
+    rows = [[cell.strip() for cell in line.split("|")] for line in table.strip().splitlines()]
+    return tuple(
+        Command(name, f"{module}:{function}", text, example, use)
+        for name, function, text, example in rows
+    )
+
+
 LEAVES: dict[str, Leaf] = {
     "planner": Leaf(
         modules=("twin.plan",),
         extra="replay",
         purpose="planning",
         commands=(
-            Command(
-                "plan",
-                "twin.plan.cli:plan",
-                "Plan from words, or for a cell that asks over zenoh.",
-                "runs/monday --task 'put the cube into the box' --dry",
+            *commands_of(
                 "Plan and gate",
+                "twin.plan.cli",
+                """
+                plan | plan | Plan from words, or for a cell that asks over zenoh. | runs/monday --task 'put the cube into the box' --dry
+                """,
             ),
         ),
     ),
@@ -91,26 +100,20 @@ LEAVES: dict[str, Leaf] = {
         extra="standin",
         purpose="the stand-in cell",
         commands=(
-            Command(
-                "demo",
-                "dashboards.standin_cli:demo",
-                "Run the whole loop on the stand-in cell, in minutes.",
-                "runs/demo",
+            *commands_of(
                 "Start here",
+                "dashboards.standin_cli",
+                """
+                demo | demo | Run the whole loop on the stand-in cell, in minutes. | runs/demo
+                trials | trials | Try policies without and with replanning on the same starts. | runs/study --trials 20
+                """,
             ),
-            Command(
-                "trials",
-                "dashboards.standin_cli:trials",
-                "Try policies without and with replanning on the same starts.",
-                "runs/study --trials 20",
-                "Start here",
-            ),
-            Command(
-                "publish standin",
-                "bridge.sources.standin.cli:publish_standin",
-                "The stand-in cell: a simulated laboratory.",
-                "--trials 3 --seed 1",
+            *commands_of(
                 "Record",
+                "bridge.sources.standin.cli",
+                """
+                publish standin | publish_standin | The stand-in cell: a simulated laboratory. | --trials 3 --seed 1
+                """,
             ),
         ),
     ),
@@ -125,12 +128,12 @@ LEAVES: dict[str, Leaf] = {
         extra="ur",
         purpose="publishing a UR arm",
         commands=(
-            Command(
-                "publish ur",
-                "bridge.sources.ur.cli:publish_ur",
-                "A UR arm: joints, tool, gripper, modes.",
-                "192.168.1.10 --cell lab",
+            *commands_of(
                 "Record",
+                "bridge.sources.ur.cli",
+                """
+                publish ur | publish_ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
+                """,
             ),
         ),
     ),
@@ -139,12 +142,12 @@ LEAVES: dict[str, Leaf] = {
         extra="realsense",
         purpose="publishing RealSense cameras",
         commands=(
-            Command(
-                "publish realsense",
-                "bridge.sources.realsense.cli:publish_realsense",
-                "RealSense cameras: colour, depth, calibration.",
-                "--cell lab --camera side=123622270224",
+            *commands_of(
                 "Record",
+                "bridge.sources.realsense.cli",
+                """
+                publish realsense | publish_realsense | RealSense cameras: colour, depth, calibration. | --cell lab --camera side=123622270224
+                """,
             ),
         ),
     ),
@@ -153,19 +156,13 @@ LEAVES: dict[str, Leaf] = {
         extra="video",
         purpose="exchange with LeRobot",
         commands=(
-            Command(
-                "import lerobot",
-                "bridge.exchange.lerobot.cli:import_lerobot",
-                "A LeRobotDataset v3.0, one episode file each.",
-                "DIR runs/x --episodes 0-9",
+            *commands_of(
                 "Exchange",
-            ),
-            Command(
-                "export lerobot",
-                "bridge.exchange.lerobot.cli:export_lerobot",
-                "Trials as a LeRobotDataset v3.0.",
-                "runs/x DIR",
-                "Exchange",
+                "bridge.exchange.lerobot.cli",
+                """
+                import lerobot | import_lerobot | A LeRobotDataset v3.0, one episode file each. | DIR runs/x --episodes 0-9
+                export lerobot | export_lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
+                """,
             ),
         ),
     ),

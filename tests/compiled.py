@@ -1,9 +1,4 @@
-"""Compile what a fresh clone has not compiled yet: each worker of a test run its share.
-
-Workers collect the same tests at the same time. Each of them would rewrite the assertions of every
-test file and put checks into every module of the packages, a minute of work in all, where one of
-them has to.
-"""
+"""Compile what a fresh clone has not compiled yet: each worker of a test run its share."""
 
 import functools
 import sys

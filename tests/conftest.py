@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
@@ -13,6 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import compiled
 import lean_checks
+
+if TYPE_CHECKING:
+    from bridge.episode.run_folder import RunFolder
 
 lean_checks.install()  # before any room is imported
 gc.disable()  # until all is imported
@@ -39,6 +43,20 @@ LONG_FILES = (
 )
 """Files of about twenty seconds or more. Workers take whole files in this order: one that came
 last would leave the other worker idle."""
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> "RunFolder":
+    from bridge.episode.run_folder import RunFolder
+
+    return RunFolder.create(tmp_path / "run")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    from loopback import free_endpoint
+
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -1,7 +1,4 @@
-"""Chromium without a window, for tests of pages, driven over its DevTools pipe.
-
-No driver and no open port are needed.
-"""
+"""Chromium without a window, for tests of pages, driven over its DevTools pipe."""
 
 import base64
 import json

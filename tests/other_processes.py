@@ -27,12 +27,7 @@ def ended_within(pid: int, seconds: float) -> bool:
 
 
 def check_an_interrupted_evaluation(code: str, run: Path, at_work: str) -> None:
-    """Law: Ctrl-C ends an evaluation with the way to continue, and all that it started.
-
-    Args:
-        code: Evaluates the run it is given; prints the id of the process it starts, then
-            ``at_work`` when it may be interrupted.
-    """
+    """Law: Ctrl-C ends an evaluation with the way to continue, and all that it started."""
     with subprocess.Popen(
         [sys.executable, "-c", code, str(run)],
         stdout=subprocess.PIPE,

@@ -1,9 +1,6 @@
 """The attack on the gate in small, and the oracle that judges it against other kinematics."""
 
-import copy
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,6 @@ from bridge.task.task_file import load_task
 from twin.errors import TwinError
 from twin.gate.twin_process import Question, answer
 from twin.replay.config import ReplayConfig
-from twin.robot.model import load_robot
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
@@ -98,57 +94,3 @@ def test_no_family_of_mutations_gets_a_yes_for_a_plan_that_is_unsafe(
         assert said is True or family != "valid"
         unsafe += [family] if why else []
     assert len(unsafe) >= len(QUICK) // 2, unsafe
-
-
-@pytest.mark.slow
-def test_the_real_gate_withstands_a_short_attack(tmp_path: Path) -> None:
-    command = [sys.executable, "benchmarks/attack_gate.py", "40", "--seed", "3"]
-    done = subprocess.run(
-        [*command, "--folder", str(tmp_path), "--endpoint", "tcp/127.0.0.1:17448"],
-        cwd=ROOT, capture_output=True, text=True, timeout=280, check=False,
-        env={**os.environ, "GST_BENCH_RESULTS": str(tmp_path)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "attack_gate.json").read_text())
-    assert report["unsafe_yes"] == []
-    assert report["families"]["valid"]["yes"] == 2
-    assert sum(row["plans"] for row in report["families"].values()) == 40
-
-
-def test_the_oracle_and_pinocchio_put_the_tool_in_the_same_place(oracle: Oracle) -> None:
-    robot = load_robot(ROBOT.urdf_text())
-    rng = np.random.default_rng(0)
-    for joints in rng.uniform(-3, 3, (20, 6)):
-        frames = oracle._frames(joints, 0.05)
-        for link in ("tcp", "forearm_link", "gripper_left_finger"):
-            theirs = robot.T_base_link(link, joints, 0.05)
-            assert frames[link] == pytest.approx(theirs, abs=1e-9)
-
-
-def test_the_oracle_calls_a_good_plan_safe_and_names_what_is_wrong_with_others(
-    oracle: Oracle, bases: list[dict[str, Any]]
-) -> None:
-    assert [oracle.unsafe(plan) for plan in bases] == ["", ""]
-    low = min(bases[0]["tau"], key=lambda w: w["p_m"][2])
-    for change, why in (
-        (lambda p: p.update(robot="panda"), "other_robot"),
-        (lambda p: p["stages"][0]["allowed_contacts"].append(["gripper", "table"]), "contacts"),
-        (lambda p: p["tau"][3].update(t_ns=0), "times"),
-        (lambda p: p["tau"][3]["p_m"].__setitem__(0, float("nan")), "not_a_number"),
-        (lambda p: [_turn(w, 0.07) for w in p["tau"]], "start_joints"),
-        (lambda p: _turn(p["tau"][60], 0.9), "joint_speed"),
-    ):
-        plan = copy.deepcopy(bases[0])
-        change(plan)
-        assert oracle.unsafe(plan) == why
-    deep = copy.deepcopy(bases[0])
-    solve = Kinematics()
-    for w in deep["tau"]:
-        share = max(0.0, 1.0 - (w["p_m"][2] - low["p_m"][2]) / 0.1)
-        w["p_m"][2] -= 0.015 * share
-        w["joints_rad"] = solve.joints(w["p_m"], w["q_wxyz"], w["joints_rad"])
-    assert oracle.unsafe(deep) == "gripper_into_table"
-
-
-def _turn(waypoint: dict[str, Any], angle_rad: float) -> None:
-    waypoint["joints_rad"][5] += angle_rad

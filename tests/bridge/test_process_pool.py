@@ -1,7 +1,4 @@
-"""Work on several processes: a death costs one piece, a bug one answer, and nothing is lost.
-
-What the processes do here are expressions, so that they need nothing of this file.
-"""
+"""Work on several processes: a death costs one piece, a bug one answer, and nothing is lost."""
 
 import os
 import signal

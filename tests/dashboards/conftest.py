@@ -12,10 +12,11 @@ import httpx
 import numpy as np
 import pytest
 from coarse_model import coarse_model
+from joint_samples import at_positions
 from starlette.applications import Starlette
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import CompressedColor, JointSample, PoseSample
+from bridge.episode.cdr.messages import CompressedColor, PoseSample
 from bridge.episode.metadata import Derived, EpisodeInfo, Outcome
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
@@ -196,13 +197,7 @@ class _Log:
         )
 
     def joints(self, topic: str, names: tuple[str, ...], values: np.ndarray, ns: int) -> None:
-        sample = JointSample(
-            stamp_ns=ns,
-            names=names,
-            position=np.asarray(values, dtype=np.float64),
-            velocity=np.zeros(0),
-            effort=np.zeros(0),
-        )
+        sample = at_positions(ns, names, np.asarray(values, dtype=np.float64))
         self.put(topic, schema.JOINT_STATE, sample.to_cdr(), ns)
 
     def pose(self, topic: str, p_m: np.ndarray, ns: int) -> None:
@@ -226,7 +221,6 @@ def copy_messages(source: Episode, writer: EpisodeWriter) -> None:
 
 
 def write_trial(run: RunFolder, trial: Trial, *, images: bool = True) -> Path:
-    """Write one recorded trial."""
     path = run.episodes_dir / f"{trial.id}.mcap"
     plan = make_plan(trial, 2 if trial.rejected_first else 1)
     with EpisodeWriter(path) as writer:
@@ -413,7 +407,6 @@ def synthetic() -> ModuleType:
 
 @pytest.fixture(scope="session")
 def shared_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """Return a run that tests only read."""
     return make_run(tmp_path_factory.mktemp("runs") / "monday")
 
 
@@ -456,7 +449,6 @@ def browser_of(*runs: RunFolder, admission: Admission | None = None) -> Browser:
 
 @pytest.fixture
 def browser(shared_run: RunFolder) -> Browser:
-    """Return a browser on the shared run."""
     return browser_of(shared_run)
 
 

@@ -32,11 +32,6 @@ def trial(seed: int, condition: str, task: str = TASK, policy: str = "perturbed"
     return Trial(task=task, policy=policy, start_seed=seed, condition=condition)
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def record(
     run: RunFolder,
     name: str,

@@ -44,7 +44,6 @@ def run(shared_run: RunFolder, tmp_path: Path) -> RunFolder:
 
 @pytest.fixture
 def pages(run: RunFolder, synthetic: ModuleType) -> Any:
-    """Return a browser on that run."""
     return synthetic.browser_of(run)
 
 

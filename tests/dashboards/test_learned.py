@@ -37,7 +37,6 @@ def source(task: str, start: int, **changed: object) -> dict[str, Any]:
 def learning(
     folder: Path, sources: Mapping[str, list[dict[str, Any]]], **others: object
 ) -> RunFolder:
-    """A run that learned from some trials."""
     run = RunFolder.create(folder / "learn")
     tasks = {
         name: {

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from live_recorder import open_recorder
-from loopback import free_endpoint
 from test_review_index import HOSTILE
 
 from bridge.episode import schema
@@ -27,11 +26,6 @@ from dashboards.library import Library
 from dashboards.live_page import LiveFeed, LiveState, feed_of, told
 
 WAIT_S = 15.0
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
 
 
 @pytest.fixture

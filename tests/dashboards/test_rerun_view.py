@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun.chunk as rc
+from joint_samples import at_positions
 from rerun.urdf import UrdfTree
 from rerun_cell import CUBE_STL, T_BASE_CAMERA, urdf, write_cell_run
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import CompressedColor, JointSample
+from bridge.episode.cdr.messages import CompressedColor
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -166,9 +167,7 @@ def test_an_episode_without_robot_cameras_or_run_is_still_exported(
     path = tmp_path / "alone.mcap"
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id="alone", kind="trial", task="no_such_task"))
-        sample = JointSample(
-            stamp_ns=5, names=("a",), position=np.zeros(1), velocity=np.zeros(0), effort=np.zeros(0)
-        )
+        sample = at_positions(5, ("a",), np.zeros(1))
         writer.write(
             "/x/joint_states", sample.to_cdr(), type_name=schema.JOINT_STATE, log_time_ns=5
         )

@@ -85,13 +85,7 @@ def environment(copy: Path) -> dict[str, str]:
 
 
 def run_without(leaf: str | None, stored: Path, scan: Path, folder: Path) -> dict[str, Any]:
-    """Run the core's commands in a copy without a leaf; what came of each, by its name.
-
-    Args:
-        leaf: None takes nothing away.
-        stored: A run with trials and a scene; it is copied, as is the next.
-        scan: A run with a scan and no scene.
-    """
+    """Run the core's commands in a copy without a leaf; what came of each, by its name."""
     copy, run, told = folder / "copy", folder / "run", folder / "told.json"
     copy_without(leaf, copy)
     shutil.copytree(stored, run)

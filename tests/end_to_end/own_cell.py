@@ -1,11 +1,4 @@
-"""The README's "Record your own cell", typed as written, in a laboratory that nobody plans for.
-
-``PYTHONPATH=tests:tests/bridge/sources python tests/end_to_end/own_cell.py RUN`` plays a UR5
-controller and two RealSense cameras (librealsense's software device) which the stand-in's world
-moves and renders, types the recipe, and ends with 0 when the report has the twin's number. Only
-addresses differ from the README's. Trial 2 grasps beside the cube. The report cannot know that all
-this is simulated: its numbers are no robot's.
-"""
+"""The README's "Record your own cell", typed as written, in a laboratory that nobody plans for."""
 
 import json
 import os

@@ -1,8 +1,4 @@
-"""Copy a run without its plans, verdicts and events, as another recorder would have left it.
-
-``python tests/end_to_end/without_plans.py RUN OUT`` writes with the mcap library alone: labels,
-cameras, joints and descriptions stay byte for byte; nothing says when anything was executed.
-"""
+"""Copy a run without its plans, verdicts and events, as another recorder would have left it."""
 
 import shutil
 import sys

@@ -250,10 +250,7 @@ def maker(tmp_path: Path) -> RunMaker:
 
 @pytest.fixture(scope="session")
 def six_trials_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three starts without and with replanning; the twin is wrong about one of six.
-
-    Recorded: S F F without, S S F with. Twin: S F S without, S S F with.
-    """
+    """Three starts without and with replanning; the twin is wrong about one of six."""
     maker = RunMaker(run=RunFolder.create(tmp_path_factory.mktemp("six") / "monday"))
     table: tuple[tuple[str, str, str, bool], ...] = (
         ("a1", "without_replanning", "success", True),
@@ -316,15 +313,8 @@ def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="session")
 def everything(evaluation_run_once: RunFolder) -> Comparison:
-    """The evaluation of that run."""
     with lean_checks.unchecked(), coarse_model():
         return compare_run(evaluation_run_once)
-
-
-@pytest.fixture
-def evaluation_run(evaluation_run_once: RunFolder, tmp_path: Path) -> RunFolder:
-    """A fresh copy of that run, for the test to spoil."""
-    return RunFolder(shutil.copytree(evaluation_run_once.path, tmp_path / "everything"))
 
 
 @pytest.fixture(scope="session")

@@ -18,10 +18,6 @@ from evaluator.statistics.bootstrap import (
 rates = st.lists(st.fractions(0, 1, max_denominator=10), min_size=3, max_size=7)
 
 
-def rng() -> np.random.Generator:
-    return np.random.default_rng(3)
-
-
 @settings(max_examples=40, deadline=None)
 @given(rates, st.data())
 def test_errors_keep_their_order(recorded: list[Fraction], data: st.DataObject) -> None:

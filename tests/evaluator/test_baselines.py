@@ -63,7 +63,6 @@ def study() -> list[TrialRow]:
 
 
 def by_id(measurements: Sequence[Measurement]) -> dict[str, Measurement]:
-    """Measurements by id."""
     return {m.id: m for m in measurements}
 
 

@@ -77,20 +77,6 @@ def test_kept_and_read_give_the_same_bytes(six_trials: Any, tmp_path: Path) -> N
     assert written(again(run, fresh=True), tmp_path / "fresh") == plain
 
 
-@pytest.mark.slow
-def test_kept_and_read_give_the_same_bytes_with_every_part(
-    evaluation_run: RunFolder, tmp_path: Path
-) -> None:
-    for path in evaluation_run.derived("*views*"):  # they are not kept, and take long
-        path.unlink()
-    first = again(evaluation_run)
-    assert first.motions
-    assert first.states
-    second = again(evaluation_run)
-    assert written(second, tmp_path / "second") == written(first, tmp_path / "first")
-    assert (second.motions, second.states) == (first.motions, first.states)
-
-
 def test_nothing_is_opened_or_hashed_twice(
     six_trials: Any, opened: list[str], hashed: list[str]
 ) -> None:
@@ -102,19 +88,6 @@ def test_nothing_is_opened_or_hashed_twice(
     hashed.clear()
     again(six_trials.run)
     assert (opened, hashed) == ([], [])
-
-
-def test_only_new_episodes_are_read(six_trials: Any, opened: list[str], hashed: list[str]) -> None:
-    settle(six_trials.run)
-    again(six_trials.run)
-    six_trials.trial("c1", recorded="success")
-    replay = six_trials.replay("c1", accepted=True)
-    opened.clear()
-    hashed.clear()
-    comparison = again(six_trials.run)
-    assert set(opened) == {"c1.mcap", replay.name}
-    assert set(hashed) == {"c1.mcap", replay.name}
-    assert comparison.results().get("agreement.sim_planned.rate").n == 7
 
 
 def test_young_files_are_hashed_again_but_not_read_again(
@@ -159,20 +132,6 @@ def test_other_bytes_under_the_old_size_and_time_are_noticed(six_trials: Any) ->
     assert name in before["derived"]
     assert name not in after.provenance["derived"]
     assert any(e.episode == path.name and "CRC" in e.reason for e in after.exclusions)
-
-
-def test_a_replaced_replay_is_noticed(six_trials: Any) -> None:
-    settle(six_trials.run)
-    assert again(six_trials.run).rows[0].sim_planned is True
-    six_trials.run.derived("a1.replay.planned*")[0].unlink()
-    six_trials.replay("a1", accepted=False, offset_m=0.05)
-    comparison = again(six_trials.run)
-    assert comparison.rows[0].sim_planned is False
-    largest = comparison.results().get("motion.planned.position_max_m").value
-    assert largest is not None
-    assert (
-        largest == compare_run(six_trials.run).results().get("motion.planned.position_max_m").value
-    )
 
 
 def test_removed_episodes_vanish(six_trials: Any) -> None:

@@ -18,8 +18,6 @@ from evaluator.compare.summaries import evaluation_pool
 from evaluator.result import write_results
 from evaluator.run_reader.contents import READ_S
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 def begun(pool: ProcessPool, number: int) -> ProcessPool:
     """Start processes, and wait until they can work."""
@@ -38,7 +36,6 @@ def pool() -> Iterator[ProcessPool]:
 
 @pytest.fixture
 def two(pool: ProcessPool) -> ProcessPool:
-    """Two processes beside this one."""
     return begun(pool, 2)
 
 

@@ -80,13 +80,6 @@ def test_jeffreys_reaches_the_ends_where_it_must() -> None:
     assert jeffreys(3, 10).low < 0.3 < jeffreys(3, 10).high
 
 
-def test_boschloo_of_the_papers_gains() -> None:
-    # Design page, finding 3: sloth 4/10 -> 8/10 has 0.089; pooled 17/30 -> 24/30 about 0.056.
-    assert boschloo(4, 10, 8, 10) == pytest.approx(0.089, abs=5e-4)
-    assert boschloo(8, 10, 9, 10) > 0.5
-    assert boschloo(4, 10, 8, 10) == pytest.approx(boschloo(8, 10, 4, 10), abs=1e-9)
-
-
 @pytest.mark.parametrize("table", [(15, 90, 31, 100), (3, 200, 2, 7), (99, 100, 70, 80)])
 def test_boschloo_leaves_out_nothing_that_counts(table: tuple[int, int, int, int]) -> None:
     k1, n1, k2, n2 = table

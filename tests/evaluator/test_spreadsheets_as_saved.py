@@ -118,25 +118,6 @@ def test_names_that_differ_by_case_are_asked_about(write_table: Callable[[str], 
     assert [g.task for g in apart.groups] == ["Cube", "Cup", "cup"]
 
 
-def test_twenty_real_and_two_hundred_simulated_trials_each_keep_their_n(tmp_path: Path) -> None:
-    """The usual published design: other trials on each side, rates of each side's own n."""
-    real, sim = ["trial_id,task,policy,recorded"], ["trial_id,task,policy,sim_planned"]
-    counts = {"A": (15, 160), "B": (9, 110), "C": (4, 40), "D": (12, 120)}
-    for policy, (k_real, k_sim) in counts.items():
-        real += [f"{policy}{i},cup,{policy},{int(i < k_real)}" for i in range(20)]
-        sim += [f"{policy}{i},cup,{policy},{int(i < k_sim)}" for i in range(200)]
-    (tmp_path / "real.csv").write_text("\n".join(real) + "\n")
-    (tmp_path / "sim.csv").write_text("\n".join(sim) + "\n")
-    together = compare_several([tmp_path / "real.csv", tmp_path / "sim.csv"])
-    groups = {g.policy: (g.recorded.k, g.recorded.n, g.sim.k, g.sim.n) for g in together.groups}
-    assert groups == {name: (a, 20, b, 200) for name, (a, b) in counts.items()}
-    r = together.results().get("agreement.pearson_r")
-    assert r.value is not None
-    assert r.interval is not None
-    assert -1 < r.interval.low < r.value < r.interval.high < 1
-    assert not together.exclusions
-
-
 def test_runs_and_tables_are_one_study_and_keep_their_own_ids(
     six_trials: Any, tmp_path: Path
 ) -> None:

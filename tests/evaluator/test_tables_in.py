@@ -1,7 +1,6 @@
 """Trials CSV and rates CSV: what is read, and what is refused with its row."""
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -114,17 +113,6 @@ def test_46_percent_of_ten_trials_is_refused(write_table: Callable[[str], Path])
     ) as caught:
         read_rates(path)
     assert caught.value.row == 2
-
-
-@pytest.mark.parametrize(
-    ("row", "count"),
-    [("3,66.7", Fraction(2, 3)), ("50,46.0", Fraction(23, 50)), ("7,57.1", Fraction(4, 7))],
-)
-def test_a_rounded_rate_finds_its_count(
-    write_table: Callable[[str], Path], row: str, count: Any
-) -> None:
-    path = write_table(f"task,side,n,rate_percent\ncube,real,{row}\n")
-    assert read_rates(path)[0].rate == count
 
 
 @settings(max_examples=40, deadline=None)

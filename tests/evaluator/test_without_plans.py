@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.writer import EpisodeWriter
@@ -25,14 +25,7 @@ def moved(maker: Any, name: str, result: str) -> None:
         writer.describe(info, outcome=outcome)
         for number, angle in enumerate(turn.tolist()):
             stamp_ns = 10**18 + number * STEP_NS
-            nothing = np.zeros(0)
-            sample = JointSample(
-                stamp_ns=stamp_ns,
-                names=("a",),
-                position=np.array([angle]),
-                velocity=nothing,
-                effort=nothing,
-            )
+            sample = at_positions(stamp_ns, ("a",), np.array([angle]))
             data = sample.to_cdr()
             writer.write(
                 "/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=stamp_ns

@@ -1,7 +1,4 @@
-"""The rasteriser again, slow and plain, in torch double precision with autograd.
-
-Every pixel meets every Gaussian; no tiles, no early stop. Written from the same equations.
-"""
+"""The rasteriser again, slow and plain, in torch double precision with autograd."""
 
 from math import factorial, pi
 
@@ -53,10 +50,7 @@ def weights(
     T_camera_base: torch.Tensor,
     alpha_cut: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what each Gaussian adds to each pixel (num, height, width), and its depth there.
-
-    The depth is the mean of z given the pixel under the joint normal distribution of both.
-    """
+    """Return what each Gaussian adds to each pixel (num, height, width), and its depth there."""
     T = T_camera_base
     p = means @ T[:3, :3].T + T[:3, 3]
     front = p[:, 2] > NEAR_M

@@ -1,8 +1,4 @@
-"""Both backends of the rasteriser, call by call.
-
-``gsplat`` itself runs where there is a CUDA device (marker ``gpu``). Everywhere else a plain torch
-function with its documented behaviour stands in for it, so that what we add around it is tested.
-"""
+"""Both backends of the rasteriser, call by call."""
 
 import importlib.util
 import sys

@@ -1,4 +1,4 @@
-"""The native rasteriser against plain torch with autograd, and against finite differences."""
+"""The native rasteriser against plain torch with autograd."""
 
 import importlib.util
 from pathlib import Path
@@ -23,7 +23,6 @@ _spec.loader.exec_module(splat_reference)
 
 CAMERA = Camera(width=45, height=37, fx=50.0, fy=48.0, cx=21.3, cy=19.1)
 ISAS = available_isas()
-FINE = RasterConfig(alpha_cut=2.0**-24, transmittance_stop=0.0, threads=1)
 
 
 def random_cloud(rng: np.random.Generator, count: int, *, num_harmonics: int = 3) -> GaussianCloud:
@@ -95,33 +94,6 @@ def test_gradients_agree_with_autograd(isa: str, num_harmonics: int) -> None:
         assert relative_error(getattr(gradient, name), tensor.grad.numpy()) < 5e-4, name
     assert relative_error(gradient.T_camera_base, T_camera_base.grad.numpy()) < 5e-4
     assert gradient.harmonics.shape == cloud.harmonics.shape
-
-
-def scalar_of(planes: np.ndarray, upstream: np.ndarray) -> float:
-    return float((planes.astype(np.float64) * upstream).sum())
-
-
-@pytest.mark.parametrize("num_harmonics", [3, 15])
-def test_gradients_agree_with_finite_differences(num_harmonics: int) -> None:
-    rng = np.random.default_rng(3)
-    cloud = random_cloud(rng, 12, num_harmonics=num_harmonics)
-    rasteriser = Rasteriser(FINE)
-    planes = rasteriser.draw_planes(cloud, CAMERA, tilted_pose())
-    upstream = rng.normal(size=planes.shape).astype(np.float32)
-    gradient = rasteriser.pull_back(planes, upstream)
-    for name, rows in arrays(cloud):
-        direction = rng.normal(size=rows.shape)
-        step = 2e-4
-        values = []
-        for sign in (1, -1):
-            moved = as_float32(rows + sign * step * direction)
-            shifted = GaussianCloud(**(dict(arrays(cloud)) | {name: moved}))
-            drawn = rasteriser.draw_planes(shifted, CAMERA, tilted_pose())
-            values.append(scalar_of(drawn, upstream))
-        numeric = (values[0] - values[1]) / (2 * step)
-        analytic = float((getattr(gradient, name) * direction).sum())
-        # float32 images differenced over 4e-4: about three digits remain
-        assert numeric == pytest.approx(analytic, rel=2e-2, abs=2e-2), name
 
 
 @pytest.mark.parametrize("isa", ISAS)

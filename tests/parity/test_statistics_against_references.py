@@ -1,16 +1,11 @@
 """Our statistics against statsmodels and SciPy."""
 
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
 from evaluator.statistics.differences import (
     boschloo,
-    mcnemar,
     newcombe_difference,
     tango_difference,
 )
@@ -22,17 +17,6 @@ proportion = pytest.importorskip("statsmodels.stats.proportion")
 
 COUNTS = [(1, 10), (23, 50), (4, 10), (8, 10), (81, 263), (99, 100)]
 EXACT = 1e-9
-
-
-def load_golden(name: str) -> Any:
-    """Import a script beside its recorded answer; tests are no package."""
-    path = Path(__file__).parents[1] / "golden" / f"{name}.py"
-    spec = spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize(("k", "n"), COUNTS)
@@ -51,15 +35,6 @@ def test_newcombe_agrees_with_statsmodels(table: tuple[int, int, int, int]) -> N
     low, high = proportion.confint_proportions_2indep(k2, n2, k1, n1, method="newcomb")
     mine = newcombe_difference(*table)
     assert (mine.low, mine.high) == pytest.approx((low, high), abs=EXACT)
-
-
-@pytest.mark.parametrize(("improved", "worsened"), [(4, 0), (7, 2), (3, 3), (1, 9), (60, 30)])
-def test_mcnemar_agrees_with_statsmodels(improved: int, worsened: int) -> None:
-    from statsmodels.stats.contingency_tables import mcnemar as reference
-
-    pairs = [(False, True)] * improved + [(True, False)] * worsened + [(True, True)] * 3
-    theirs = reference(np.array([[3, worsened], [improved, 0]]), exact=True)
-    assert mcnemar(pairs).p_exact == pytest.approx(theirs.pvalue, abs=EXACT)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,6 @@ def write_official(
     chunked: bool = True,
     chunk_size: int = 2000,
 ) -> Path:
-    """The same by the official writer."""
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=chunk_size, compression=compression, use_chunking=chunked)
     writer.start(profile="ros2", library="official")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_samples import at_positions
 
 from bridge.episode.cdr.batch import joints_of, pose_messages, poses_of
 from bridge.episode.cdr.codec import MalformedMessageError
@@ -31,14 +32,7 @@ def pose(stamp_ns: int, x_m: float, frame: str = "base_link") -> bytes:
 
 
 def joints(stamp_ns: int, position: list[float], names: tuple[str, ...] = ("a", "bc")) -> bytes:
-    nothing = np.zeros(0)
-    return JointSample(
-        stamp_ns=stamp_ns,
-        names=names,
-        position=np.array(position),
-        velocity=nothing,
-        effort=nothing,
-    ).to_cdr()
+    return at_positions(stamp_ns, names, np.array(position)).to_cdr()
 
 
 @pytest.mark.parametrize("frame", ["", "b", "base_link", "world_frame"])

@@ -25,11 +25,6 @@ from bridge.errors import OptionError, UsageError
 DAY_NS = 86_400_000_000_000
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
-
-
 def write(
     run: RunFolder,
     name: str,
@@ -126,15 +121,6 @@ def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:
     assert list_episodes(run)[0].outcome == "failure"
     sidecar.unlink()
     assert list_episodes(run)[0].outcome == "success"
-
-
-def test_all_parts_of_a_split_episode_are_one_line(run: RunFolder) -> None:
-    sizes = []
-    for name in ("t1", "t1.2", "t1.3"):
-        path = write(run, name, id="t1", messages=2)
-        sizes.append(path.stat().st_size)
-    (entry,) = list_episodes(run)
-    assert (entry.id, entry.parts, entry.size_bytes) == ("t1", 3, sum(sizes))
 
 
 def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder) -> None:

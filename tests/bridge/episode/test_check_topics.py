@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from joint_samples import at_positions
 from mcap.writer import Writer
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.cdr.messages import CameraInfo, DepthImage, JointSample
+from bridge.episode.cdr.messages import CameraInfo, DepthImage
 from bridge.episode.check import CheckReport, check_episode
 from bridge.episode.check_topics import SequenceWatch
 from bridge.episode.metadata import EpisodeInfo
@@ -28,13 +29,7 @@ INFO = EpisodeInfo(id="e1", kind="trial")
 
 
 def joint() -> bytes:
-    return JointSample(
-        stamp_ns=0,
-        names=("a",),
-        position=np.zeros(1),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    ).to_cdr()
+    return at_positions(0, ("a",), np.zeros(1)).to_cdr()
 
 
 def depth(width: int, height: int) -> bytes:

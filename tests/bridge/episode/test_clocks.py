@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_samples import at_positions
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr.codec import decode
-from bridge.episode.cdr.messages import JointSample, stamp_of, transforms_from_cdr
+from bridge.episode.cdr.messages import stamp_of, transforms_from_cdr
 from bridge.episode.clocks import (
     SourceClock,
     StampCorrection,
@@ -117,10 +118,7 @@ def test_stamps_alone_show_a_jump_but_no_stall_and_no_playback() -> None:
 
 
 def _joints(stamp_ns: int) -> bytes:
-    none = np.zeros(0)
-    sample = JointSample(
-        stamp_ns=stamp_ns, names=("a",), position=np.ones(1), velocity=none, effort=none
-    )
+    sample = at_positions(stamp_ns, ("a",), np.ones(1))
     return sample.to_cdr()
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.executions import NO_PLAN, executed_events, motion_ns
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -89,10 +89,7 @@ def write(
     with EpisodeWriter(path) as writer:
         writer.describe(info)
         for stamp_ns, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
-            nothing = np.zeros(0)
-            sample = JointSample(
-                stamp_ns=stamp_ns, names=track.names, position=row, velocity=nothing, effort=nothing
-            )
+            sample = at_positions(stamp_ns, track.names, row)
             data = sample.to_cdr()
             writer.write(
                 "/c/joint_states", data, type_name=schema.JOINT_STATE, log_time_ns=stamp_ns

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from joint_samples import at_positions
 
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.check import check_all, check_episode
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.provenance import hash_file
@@ -22,13 +23,7 @@ JOINTS = "/c/joint_states"
 
 
 def joint(stamp_ns: int) -> bytes:
-    return JointSample(
-        stamp_ns=stamp_ns,
-        names=("a",),
-        position=np.array([float(stamp_ns)]),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    ).to_cdr()
+    return at_positions(stamp_ns, ("a",), np.array([float(stamp_ns)])).to_cdr()
 
 
 def write_part(

@@ -26,10 +26,7 @@ def summary_of(path: Path) -> Summary:
 def test_no_message_waits_longer_than_the_flush_time(
     tmp_path_factory: pytest.TempPathFactory, gaps: list[int], flush: int
 ) -> None:
-    """However often new ones come: the oldest decides. Younger than that, none is written.
-
-    Times are multiples of 1/1024 s, which floats hold exactly.
-    """
+    """However often new ones come: the oldest decides. Younger than that, none is written."""
     now = 0
     config = WriterConfig(flush_s=flush / 1024)
     path = tmp_path_factory.mktemp("run") / "e.mcap"

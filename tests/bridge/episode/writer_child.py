@@ -1,8 +1,4 @@
-"""Write at a live rate until killed, telling the parent what was written; or recover in a loop.
-
-Usage: writer_child.py write PATH KIND SECONDS | recover PATH. ``write`` prints one line for each
-message after the writer took it: topic, sequence, monotonic time. After SECONDS it closes the file.
-"""
+"""Write at a live rate until killed, telling the parent what was written; or recover in a loop."""
 
 import sys
 import time

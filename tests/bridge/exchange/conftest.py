@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
@@ -208,12 +209,8 @@ class MadeTrial:
         ).to_cdr()
 
     def _gripper(self, stamp_ns: int) -> bytes:
-        return JointSample(
-            stamp_ns=stamp_ns,
-            names=("gripper_width",),
-            position=np.array([0.08 - (stamp_ns - START_NS) * 1e-11]),
-            velocity=np.zeros(0),
-            effort=np.zeros(0),
+        return at_positions(
+            stamp_ns, ("gripper_width",), np.array([0.08 - (stamp_ns - START_NS) * 1e-11])
         ).to_cdr()
 
 
@@ -250,7 +247,6 @@ def _drops() -> bytes:
 
 @pytest.fixture
 def make_trial(tmp_path: Path) -> Callable[..., Path]:
-    """Write a made trial into ``run/episodes`` and return its path."""
 
     def make(**fields: object) -> Path:
         trial = MadeTrial(**fields)  # type: ignore[arg-type]

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import robot_gst
-
 av = pytest.importorskip("av")
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -18,10 +16,6 @@ pq = pytest.importorskip("pyarrow.parquet")
 FPS, WIDTH, HEIGHT = 10, 48, 32
 LENGTHS = (7, 5, 9)
 CAMERA = "observation.images.front"
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def shade(index: int) -> np.ndarray:

@@ -7,18 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
+from joint_samples import at_positions
 
-import robot_gst
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import joint_track, pose_track
 from bridge.episode.writer import EpisodeWriter
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -94,13 +90,7 @@ def test_a_broken_message_is_named_and_nothing_is_left(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "broken.mcap"
-    good = JointSample(
-        stamp_ns=1,
-        names=("a",),
-        position=np.zeros(1),
-        velocity=np.zeros(0),
-        effort=np.zeros(0),
-    ).to_cdr()
+    good = at_positions(1, ("a",), np.zeros(1)).to_cdr()
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id="broken", kind="trial"))
         for data in (good, good[:9]):
@@ -113,10 +103,7 @@ def test_a_broken_message_is_named_and_nothing_is_left(
 @pytest.mark.parametrize("value", [0.1, -0.0, 5e-324, 1.7976931348623157e308, 1 / 3, 1e22])
 def test_awkward_numbers_survive(tmp_path: Path, value: float) -> None:
     path = tmp_path / "n.mcap"
-    sample = JointSample(
-        stamp_ns=7, names=("a",), position=np.array([value]), velocity=np.zeros(0),
-        effort=np.zeros(0),
-    )  # fmt: skip
+    sample = at_positions(7, ("a",), np.array([value]))
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id="n", kind="trial"))
         writer.write(

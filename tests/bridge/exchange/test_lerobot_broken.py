@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from lerobot_dataset import CAMERA, Dataset, run
+from commands import run
+from lerobot_dataset import CAMERA, Dataset
 
 
 def break_version(dataset: Dataset) -> None:

@@ -1,9 +1,4 @@
-"""``export lerobot``: the layout the format's repository states, and what the numbers mean.
-
-Golden facts (paths, column names, dtypes) are those of ``huggingface/lerobot``, main branch of
-2026: ``datasets/utils.py`` (path templates, default features), ``dataset_writer.py`` (offset
-columns, one row group per episode), ``dataset_metadata.py`` (episode columns, info).
-"""
+"""``export lerobot``: the layout the format's repository states, and what the numbers mean."""
 
 import json
 from collections.abc import Callable
@@ -13,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 
-import robot_gst
 from bridge.episode.reader import Episode
 from bridge.exchange.lerobot.writer import RunningStats
 
@@ -22,10 +17,6 @@ av = pytest.importorskip("av")
 pq = pytest.importorskip("pyarrow.parquet")
 
 START_NS = 1_700_000_000_123_456_789
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
@@ -14,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import robot_gst
 from bridge.episode import schema
-from bridge.episode.cdr.messages import DepthImage, JointSample, string_to_cdr
+from bridge.episode.cdr.messages import DepthImage, string_to_cdr
 from bridge.episode.check import check_episode
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -154,13 +155,7 @@ def write_episode(path: Path) -> list[Message]:
         writer.attach("robot.urdf", b"<robot/>", media_type="text/xml", log_time_ns=1)
         for number in range(30):
             at_ns = START_NS + number * 1_000_000
-            joints = JointSample(
-                stamp_ns=at_ns,
-                names=("a",),
-                position=np.array([float(number)]),
-                velocity=np.zeros(0),
-                effort=np.zeros(0),
-            )
+            joints = at_positions(at_ns, ("a",), np.array([float(number)]))
             pixels = np.full((4, 5), number, np.uint16)
             image = DepthImage(stamp_ns=at_ns, frame_id="eye", depth_mm=pixels)
             messages = [

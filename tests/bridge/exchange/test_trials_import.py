@@ -5,18 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import run
 
-import robot_gst
 from bridge.episode.run_folder import RunFolder
 from bridge.exchange.trials_csv import read_trials
 from evaluator.compare import compare_run
 
 HEAD = "trial_id,task,condition,start_id,recorded,sim_planned,stand_in\r\n"
 ROWS = "t1,cube,without_replanning,s1,success,success,false\r\nt2,cube,,,failure,success,false\r\n"
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def table(tmp_path: Path, text: str) -> Path:

@@ -1,27 +1,18 @@
 """``export tum`` and ``import rgbd``: what goes out comes back."""
 
 import json
-import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from PIL import Image
 
-import robot_gst
 from bridge.episode.cdr.messages import CompressedColor, DepthImage
 from bridge.episode.reader import Episode
-from bridge.episode.streams import rgbd_frames, transform_tree
+from bridge.episode.streams import rgbd_frames
 from bridge.geometry import se3
-
-BESIDE = Path(__file__).parents[4] / "shared" / "data"
-DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
-
-
-def run(*arguments: object) -> int:
-    return robot_gst.run([str(item) for item in arguments])
 
 
 def images(path: Path, camera: str, kind: str) -> list[tuple[int, object]]:
@@ -138,44 +129,6 @@ def test_a_failed_export_leaves_nothing(
     assert run("export", "tum", path, tmp_path / "out", "--camera", "nose") == 1
     assert "no camera 'nose'. Cameras here: wrist" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
-
-
-@pytest.mark.parity
-def test_poses_of_a_real_sequence_come_through_the_import(tmp_path: Path) -> None:
-    source = DATA / "trajectory_tum_fr1xyz" / "freiburg1_xyz-groundtruth.txt"
-    if not source.is_file():
-        pytest.skip(f"{source} is not on this machine (set GST_SHARED_DATA)")
-    rows = np.loadtxt(source)[:200]
-    folder = tmp_path / "tum"
-    for part in ("rgb", "depth"):
-        (folder / part).mkdir(parents=True)
-    shutil.copy(source, folder / "groundtruth.txt")
-    texts = [line.split()[0] for line in source.read_text().splitlines()[3:203]]
-    stamps = texts[10:190:20]
-    for stamp in stamps:
-        Image.new("RGB", (640, 480)).save(folder / "rgb" / f"{stamp}.png")
-        Image.fromarray(np.full((480, 640), 5000, np.uint16)).save(
-            folder / "depth" / f"{stamp}.png"
-        )
-    for part in ("rgb", "depth"):
-        lines = [f"{stamp} {part}/{stamp}.png" for stamp in stamps]
-        (folder / f"{part}.txt").write_text("# list\n" + "\n".join(lines))
-    assert run("import", "rgbd", folder, tmp_path / "run", "--max-frames", 5) == 0
-    episode = Episode.open(tmp_path / "run" / "episodes" / "scan.mcap")
-    tree = transform_tree(episode)
-    stamps_ns = {round(float(t) * 1e4) * 100_000: row for t, row in zip(texts, rows, strict=True)}
-    frames = list(rgbd_frames(episode, "kinect", tree))
-    assert len(frames) == 5
-    for frame in frames:
-        row = stamps_ns[frame.stamp_ns]
-        np.testing.assert_allclose(frame.T_base_color[:3, 3], row[1:4], atol=1e-12)
-        R = se3.rotation_from_quaternion(row[[7, 4, 5, 6]] / np.linalg.norm(row[4:]))
-        np.testing.assert_allclose(frame.T_base_color[:3, :3], R, atol=1e-9)
-        np.testing.assert_array_equal(frame.depth_m, np.float32(1.0))
-        assert frame.color_camera.to_ros() == (525.0, 525.0, 319.5, 239.5)
-    # All 100 Hz poses between the frames were kept, not one per frame.
-    sent = sum(1 for _ in episode.messages(["/tf"]))
-    assert 80 <= sent <= 85
 
 
 def test_names_from_a_recording_cannot_leave_the_folder_or_meet() -> None:

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from bridge.media.color import UnreadableImageError, decode_color, encode_jpeg
 from bridge.media.depth import decode_depth_png
-
-depths = hnp.arrays(np.uint16, (4, 5))
 
 
 def png(array: np.ndarray) -> bytes:

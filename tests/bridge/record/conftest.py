@@ -2,14 +2,13 @@
 
 import itertools
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.clock import AnchoredClock
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.run_folder import RunFolder
 from bridge.record.recorder import Recorder
 from bridge.wire.session import WireSample
@@ -24,13 +23,7 @@ def make_sample() -> MakeSample:
 
     def make(**changes: object) -> WireSample:
         number = next(counter)
-        joint = JointSample(
-            stamp_ns=number,
-            names=("a",),
-            position=np.array([float(number)]),
-            velocity=np.zeros(0),
-            effort=np.zeros(0),
-        )
+        joint = at_positions(number, ("a",), np.array([float(number)]))
         values: dict[str, object] = {
             "topic": "/cell/joint_states",
             "type_name": schema.JOINT_STATE,
@@ -44,11 +37,6 @@ def make_sample() -> MakeSample:
         return WireSample(**{**values, **changes})  # type: ignore[arg-type]
 
     return make
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 @pytest.fixture

@@ -1,8 +1,4 @@
-"""A cell in its own process with its own account of what it sent.
-
-Arguments: endpoint, account file, messages, seconds between messages, optional episode id. Each
-line of the account is written before the message leaves: topic, sequence, SHA-256.
-"""
+"""A cell in its own process with its own account of what it sent."""
 
 import hashlib
 import sys

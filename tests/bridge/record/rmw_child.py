@@ -1,12 +1,4 @@
-"""A ROS 2 node as rmw_zenoh makes one, without ROS 2: its keys, tokens, attachments and caches.
-
-Arguments: endpoint, attachment (33, 77 or 0 bytes), messages, and any of
-    latched     transient local: an AdvancedPublisher whose cache keeps them all
-    old-latched the same with the queryable that the first releases declared
-    other-hash  built from another definition than anybody knows
-    unknown     a type nobody knows
-Sends when a line arrives on stdin, prints "sent", and leaves at the end of stdin.
-"""
+"""A ROS 2 node as rmw_zenoh makes one, without ROS 2: its keys, tokens, attachments and caches."""
 
 import json
 import struct

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bridge.clock import AnchoredClock
@@ -25,7 +24,6 @@ from bridge.wire.session import WireSample
 MakeSample = Callable[..., WireSample]
 MakeRecorder = Callable[..., Recorder]
 INFO = EpisodeInfo(id="t1", kind="trial")
-RNG = np.random.default_rng(0)
 
 
 @pytest.fixture
@@ -56,16 +54,6 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("a file system cannot be mounted here (needs root)")
     yield place
     subprocess.run(["umount", "-l", str(place)], check=True)
-
-
-def fill(recorder: Recorder, make_sample: MakeSample) -> int:
-    """Send until the recorder has had enough; returns how many messages were sent."""
-    for sent in range(1000):
-        if recorder.status()["error"] is not None:
-            return sent
-        recorder.receive(make_sample(topic="/bulk", data=RNG.bytes(60_000), type_name="x"))
-        time.sleep(0.002)
-    raise AssertionError("the disk never filled")
 
 
 def test_a_start_without_space_is_refused(

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_recorder import LiveRecorder, open_recorder
-from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.clock import AnchoredClock
@@ -26,11 +25,6 @@ from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSample, WireSession, open_session
 
 WAIT_S = 10.0
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
 
 
 @pytest.fixture

@@ -147,16 +147,3 @@ def test_a_signal_finishes_the_open_episode(
     answer = json.loads(out)
     assert (answer["episode"], answer["messages"], answer["lost"]) == ("t1", 30, 0)
     assert recorded(cell.run_path / "episodes" / "t1.mcap") == sent(tmp_path / "account")
-
-
-def test_nobody_there_and_port_taken_are_one_sentence(cell: Cell) -> None:
-    alone = cell.command("ctl", "status")
-    assert alone.returncode == 1
-    assert alone.stderr.startswith(f"robot-gst: no zenoh peer at {cell.endpoint}; start")
-    assert alone.stderr.count("\n") == 1
-    cell.record()
-    cell.wait_until_ready()
-    second = cell.record()
-    _, err = second.communicate(timeout=WAIT_S)
-    assert second.returncode == 1
-    assert "in use by another process" in err

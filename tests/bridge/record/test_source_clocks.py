@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from live_recorder import LiveRecorder, open_recorder
 from loopback import free_endpoint
 
 from bridge.clock import NS_PER_S, AnchoredClock
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.clocks import Reading, clocks_of, open_episode
 from bridge.episode.reader import Episode
 from bridge.record import clocks as record_clocks
@@ -49,12 +49,9 @@ def _until(ask, seconds: float = 20.0) -> None:  # noqa: ANN001
 
 def _publish(session: WireSession, count: int) -> None:
     publisher = session.publisher("/lab/joint_states", schema.JOINT_STATE)
-    none = np.zeros(0)
     for _ in range(count):
         now_ns = session.now_ns()
-        sample = JointSample(
-            stamp_ns=now_ns, names=("a",), position=np.ones(1), velocity=none, effort=none
-        )
+        sample = at_positions(now_ns, ("a",), np.ones(1))
         publisher.put(sample.to_cdr(), source_ns=now_ns)
 
 

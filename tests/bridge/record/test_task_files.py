@@ -1,6 +1,5 @@
 """A task file travels with the command to start, into the episode and into the run."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,9 +18,7 @@ from bridge.record.recorder import Recorder
 from bridge.task.check import TaskFileError
 from bridge.task.find import ATTACHMENT, MissingTaskError
 from bridge.task.task_file import MAX_BYTES, TaskFile
-from bridge.wire.session import WireSample
 
-MakeSample = Callable[..., WireSample]
 TEXT = (datasets_folder() / "tasks" / "cube_into_box.toml").read_text()
 MINE = TaskFile(TEXT.replace("cube_into_box", "my_task").encode(), "my_task.toml")
 SCAN = EpisodeInfo(id="scan", kind="scan")

@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 import zenoh
-from loopback import free_endpoint
 from mcap.reader import make_reader
 
 from bridge.episode import schema
@@ -37,11 +36,6 @@ EXAMPLES = ROOT / "docs" / "examples" / "zenoh"
 PYTHON = EXAMPLES / "publish_joints.py"
 JOINTS = "/demo/joint_states"
 WAIT_S = 20.0
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
 
 
 @pytest.fixture

@@ -1,7 +1,4 @@
-"""A UR controller's RTDE interface, written from the vendor's public guide, for tests only.
-
-It knows as little of the code under test as a controller does: its own packing, its own types.
-"""
+"""A UR controller's RTDE interface, written from the vendor's public guide, for tests only."""
 
 import contextlib
 import socket

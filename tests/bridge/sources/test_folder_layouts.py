@@ -1,9 +1,6 @@
 """TUM and 7-Scenes folders: found by their files, read as their makers describe them."""
 
 import io
-import json
-import os
-import shutil
 import threading
 import time
 from itertools import pairwise
@@ -23,9 +20,6 @@ from bridge.sources.folder.messages import folder_messages, frame_times_ns, read
 from bridge.sources.folder.tum import StampedFile, associate
 from bridge.terminal import Output
 
-BESIDE = Path(__file__).parents[4] / "shared" / "data"
-DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
-KITCHEN = DATA / "rgbd_7scenes_redkitchen_a"
 SMALL = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0), color_intrinsics=(8.0, 8.5, 4.1, 3.1))
 TUM = FolderConfig(depth_intrinsics=(9.0, 9.5, 4.0, 3.0))
 STAMPS = ("1305031102.175304", "1305031102.211214", "1305031102.243211")
@@ -238,32 +232,6 @@ def test_options_that_a_scene_json_answers_itself_are_refused(tmp_path: Path) ->
         read_index(tmp_path, FolderConfig(depth_unit_m=0.001))
     with pytest.raises(UsageError, match="--depth-intrinsics"):
         FolderConfig(depth_intrinsics=(0.0, 1.0, 1.0, 1.0))
-
-
-@pytest.mark.slow
-def test_the_kitchen_reads_the_same_with_and_without_its_index(tmp_path: Path) -> None:
-    if not (KITCHEN / "scene.json").is_file():
-        pytest.skip(f"{KITCHEN} is not on this machine (set GST_SHARED_DATA)")
-    raw = tmp_path / "raw"
-    raw.mkdir()
-    for number in (250, 252, 254):
-        for ending in ("color.jpg", "depth.png", "pose.txt"):
-            shutil.copy(KITCHEN / f"frame-{number:06d}.{ending}", raw)
-    with_index, without = read_index(KITCHEN), read_index(raw)
-    assert without.layout == "7-Scenes"
-    assert without.depth_camera == with_index.depth_camera
-    for ours, theirs in zip(without.frames, with_index.frames, strict=False):
-        np.testing.assert_allclose(ours.T_world_depth, theirs.T_world_depth, atol=1e-6)
-    config = FolderConfig(max_frames=3)
-    both = [list(folder_messages(index, config, 0)) for index in (with_index, without)]
-    for a, b in zip(*both, strict=True):
-        for ending in ("color/image", "depth/image"):
-            (x,) = [m.data for m in a if m.topic.endswith(ending)]
-            (y,) = [m.data for m in b if m.topic.endswith(ending)]
-            assert x == y
-    record = json.loads((KITCHEN / "scene.json").read_text())
-    shutil.copy(KITCHEN / "camera-intrinsics.txt", raw)
-    assert read_index(raw).depth_camera.fx == record["depth_intrinsics"]["fx"]
 
 
 def test_a_published_tum_folder_keeps_the_distances_between_its_times(

@@ -23,7 +23,6 @@ from bridge.episode.cdr.messages import CompressedColor, DepthImage  # noqa: E40
 from bridge.episode.check import check_episode  # noqa: E402
 from bridge.episode.reader import Episode  # noqa: E402
 from bridge.media.color import decode_color  # noqa: E402
-from bridge.sources import device_samples  # noqa: E402
 from bridge.sources.realsense import publish  # noqa: E402
 from bridge.sources.realsense.config import (  # noqa: E402
     CameraNotFoundError,
@@ -353,25 +352,6 @@ def test_a_camera_that_was_unplugged_is_taken_up_again(
     said += capsys.readouterr().err
     assert said.count("no frames for 2 s, unplugged? Waiting for it to come back.") == 1
     assert said.count("streaming") == 2
-
-
-@pytest.mark.slow
-def test_a_recorder_that_comes_late_gets_the_calibration(
-    joined: Joined, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(device_samples, "REPEAT_S", 1.0)
-    camera = SoftwareCamera()
-    running = Running(joined, RealSenseConfig(cell="lab"), lambda: [camera.device])
-    running.wait("/lab/cam/camera/depth/info", 2)  # said again by itself
-    heard: list[str] = []
-    late = joined.client.subscribe("**", lambda sample: heard.append(sample.topic))
-    said = {"/tf_static", "/lab/cam/camera/color/info", "/lab/cam/camera/depth/info"}
-    end_s = time.monotonic() + ANSWER_S
-    while not said <= set(heard):
-        assert time.monotonic() < end_s, heard
-        time.sleep(0.05)
-    late.close()
-    running.end()
 
 
 def test_a_failure_at_the_start_ends_the_command(joined: Joined) -> None:

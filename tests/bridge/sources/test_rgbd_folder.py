@@ -3,7 +3,6 @@
 import copy
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,14 @@ from PIL import Image
 from bridge.episode import schema
 from bridge.episode.cdr.messages import CameraInfo, CompressedColor, DepthImage, transforms_from_cdr
 from bridge.episode.metadata import EpisodeInfo
-from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.schema import StampedMessage
-from bridge.episode.streams import rgbd_frames
 from bridge.episode.topics import type_of_topic
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.exchange.rgbd import write_scan
 from bridge.sources.folder.config import FolderConfig, FolderError
 from bridge.sources.folder.messages import folder_messages, read_index
 
-BESIDE = Path(__file__).parents[4] / "shared" / "data"
-DATA = Path(os.environ.get("GST_SHARED_DATA", BESIDE))
-KITCHEN = DATA / "rgbd_7scenes_redkitchen_a"
-SHELF = DATA / "rgbd_apc_shelf_wristcam"
 WIDTH, HEIGHT = 8, 6
 
 
@@ -298,29 +291,3 @@ def test_a_failed_import_leaves_no_episode(folder: Path, tmp_path: Path) -> None
     with pytest.raises(GstError, match="unreadable image"):
         write_scan(run, EpisodeInfo(id="scan", kind="scan"), messages, source={})
     assert list(run.episodes_dir.iterdir()) == []
-
-
-def need(folder: Path) -> Path:
-    if not (folder / "scene.json").is_file():
-        pytest.skip(f"{folder} is not on this machine (set GST_SHARED_DATA)")
-    return folder
-
-
-@pytest.mark.slow
-def test_the_kitchen_comes_back_from_an_episode_with_its_poses(tmp_path: Path) -> None:
-    index = read_index(need(KITCHEN))
-    config = FolderConfig(max_frames=4)
-    run = RunFolder.create(tmp_path / "run")
-    messages = (m for frame in folder_messages(index, config, 0) for m in frame)
-    path = write_scan(run, EpisodeInfo(id="scan", kind="scan"), messages, source={"a": 1})
-    record = json.loads(index.path.read_text())
-    frames = list(rgbd_frames(Episode.open(path), "kinect"))
-    assert len(frames) == 4
-    t_color_depth = record["color_camera_estimate"]["t_color_from_depth_m"]
-    for frame, entry in zip(frames, record["frames"], strict=False):
-        np.testing.assert_allclose(frame.T_base_depth, entry["T_world_cam"], atol=6e-4)
-        T_color_depth = np.linalg.inv(frame.T_base_color) @ frame.T_base_depth
-        np.testing.assert_allclose(T_color_depth[:3, 3], t_color_depth, atol=1e-9)
-        assert frame.image_u8.shape == (480, 640, 3)
-        assert frame.color_camera.fx == pytest.approx(526.2)
-        assert frame.depth_camera.fx == pytest.approx(585.0)

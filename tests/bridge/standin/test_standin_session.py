@@ -12,7 +12,6 @@ from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     DepthImage,
-    PoseSample,
     string_from_cdr,
     transforms_from_cdr,
 )
@@ -22,13 +21,10 @@ from bridge.sources.standin import decisions, operator
 from bridge.sources.standin.cell import StandinCell
 from bridge.sources.standin.kinematics import UnreachablePoseError
 from bridge.sources.standin.operator import Operator, Treatment
-from bridge.sources.standin.scan import ScanConfig
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig
 from bridge.sources.standin.streams import TRUTH_PARAMETERS
 from bridge.task.plan import Plan
-from bridge.task.predicate import Rollout, evaluate_success
-from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from bridge.terminal import Output
 
@@ -301,57 +297,6 @@ def test_a_stopped_session_finishes_its_episode(make_session: Callable[..., Any]
     assert summary["stopped"]
     assert [verb for verb, _ in session.control] == ["start", "stop"]
     assert session.control[-1][1]["outcome"]["result"] == "unknown"
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
-def test_a_whole_session_records_scan_and_trials_and_labels_by_the_predicate(
-    make_session: Callable[..., Any], task: Task, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rings = ((1.05, 0.46, 8), (0.58, 0.42, 8))
-    monkeypatch.setattr(operator, "ScanConfig", lambda: ScanConfig(rings=rings))
-    session = make_session(gate=lambda plan: verdict_record(plan, plan["round"] == 1))
-    summary = run_session(session, settings(scan=True), QUIET)
-    starts = [request for verb, request in session.control if verb == "start"]
-    assert [request["id"] for request in starts] == ["scan_0001", "trial_0001", "trial_0002"]
-    assert {request["info"]["stand_in"] for request in starts} == {True}
-    assert starts[1]["info"]["start_id"] == starts[2]["info"]["start_id"]
-    assert summary["scan"]
-    frames = [i for i in session.of("/cam/wrist/color/image") if i.episode == "scan_0001"]
-    assert len(frames) >= 12  # some viewpoints lie behind the reach of the arm
-    for episode, last_plan in (("trial_0001", 0), ("trial_0002", 1)):
-        mine = [item for item in session.sent if item.episode == episode]
-        order = [i.topic for i in mine if i.topic.endswith(("/plan", "/event"))]
-        assert order[0] == "/standin/plan", "the plan is published before motion"
-        events = [json.loads(i.data) for i in mine if i.topic.endswith("/event")]
-        started = next(event for event in events if event["type"] == "execution_started")
-        assert started["plan_id"] == f"{episode}.plan_{last_plan}"
-        kinds = [event["type"] for event in events]
-        assert kinds.count("stage_started") == kinds.count("stage_ended") == 2
-        assert kinds[-1] == "label"
-        rollout = truth_rollout(mine)
-        findings = evaluate_success(task, rollout)
-        inside = next(finding for finding in findings if finding.kind == "inside").value
-        assert (events[-1]["outcome"]["result"] == "success") == inside
-    # At rest at the end, so what the last second of joint states says is where the arm waits.
-    stamps = [item.source_ns for item in session.of("/joint_states")]
-    assert stamps == sorted(stamps)
-
-
-def truth_rollout(sent: list[Any]) -> Rollout:
-    poses: dict[str, list[np.ndarray]] = {}
-    stamps = []
-    for item in sent:
-        if is_truth(item.topic) and item.topic.endswith("/pose"):
-            object_id = item.topic.split("/")[-2]
-            poses.setdefault(object_id, []).append(PoseSample.from_cdr(item.data).T_frame_body)
-            if object_id == "cube":
-                stamps.append(item.source_ns)
-    return Rollout(
-        stamps_ns=np.array(stamps),
-        Ts_base_object={key: np.array(rows) for key, rows in poses.items()},
-        finger_contact={},
-    )
 
 
 def test_a_session_that_fails_leaves_no_half_episode(

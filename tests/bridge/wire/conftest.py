@@ -3,15 +3,9 @@
 from collections.abc import Iterator
 
 import pytest
-from loopback import free_endpoint
 
 from bridge.wire.config import WireConfig
 from bridge.wire.session import WireSession, open_session
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
 
 
 @pytest.fixture

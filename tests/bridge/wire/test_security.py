@@ -1,8 +1,4 @@
-"""The documented configuration files at work: what they forbid does not get through.
-
-The files are those of docs/examples/zenoh, with the folder of the certificates and the size limits
-put in their place. Accepting a setting is no proof that zenoh enforces it, so each is attacked.
-"""
+"""The documented configuration files at work: what they forbid does not get through."""
 
 import contextlib
 import ipaddress

@@ -84,16 +84,6 @@ def test_measurements_read_back_are_those_of_the_results_file(written: Written) 
     assert any(row["value"] is None and row["reason_if_undefined"] for row in rows)
 
 
-def test_groups_hold_the_numbers_of_the_success_table(written: Written) -> None:
-    folder = written.report.parent
-    table = next(t for t in load_results(written.results).tables if t.id == "success")
-    frame = pd.read_parquet(folder / "groups.parquet", dtype_backend="numpy_nullable")
-    assert tuple(frame.columns) == table.columns
-    assert [tuple(row.values()) for row in plain(frame)] == list(table.rows)
-    assert {"k", "n", "rate", "low", "high", "unit", "interval"} <= set(table.columns)
-    assert (frame["k"].dtype, frame["rate"].dtype) == ("Int64", "Float64")
-
-
 def test_every_field_has_a_column() -> None:
     assert list(OF_TRIALS) == [field.name for field in fields(TrialRecord)]
     assert len(OF_MEASUREMENTS) == 14

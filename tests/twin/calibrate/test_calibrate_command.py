@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 import robot_gst
 from bridge.episode import schema
@@ -13,7 +14,6 @@ from bridge.episode.cdr.messages import (
     CameraInfo,
     DepthImage,
     FrameTransform,
-    JointSample,
     PoseSample,
     string_to_cdr,
     transforms_to_cdr,
@@ -72,10 +72,7 @@ class Recording:
             ("/c/joint_states", ARM_JOINTS, joints),
             ("/c/gripper/state", ("gripper_width",), np.array([0.06])),
         ):
-            none = np.zeros(0)
-            sample = JointSample(
-                stamp_ns=stamp_ns, names=tuple(names), position=values, velocity=none, effort=none
-            )
+            sample = at_positions(stamp_ns, tuple(names), values)
             self.put(topic, sample.to_cdr(), schema.JOINT_STATE, stamp_ns)
 
     def target(self, camera_id: str, T_camera_target: np.ndarray, stamp_ns: int) -> None:
@@ -112,10 +109,7 @@ def some_postures(count: int) -> np.ndarray:
 
 
 def record_targets(run: RunFolder, count: int = 12, more: Sequence[np.ndarray] = ()) -> Path:
-    """A camera in the hand sees a target from several stops, and once on the move.
-
-    At the first stop also at ``more`` places.
-    """
+    """A camera in the hand sees a target from several stops, and once on the move."""
     robot, rng = load_robot(URDF), np.random.default_rng(1)
     recording = Recording(run.episodes_dir / "probe_1.mcap", some_postures(count))
     for index, joints in enumerate(recording.postures):
@@ -132,11 +126,6 @@ def record_targets(run: RunFolder, count: int = 12, more: Sequence[np.ndarray] =
     recording.target("wrist", np.eye(4), recording.stamp(0) + SECOND)
     recording.writer.close()
     return recording.path
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def calibrate(run: RunFolder, *arguments: str) -> int:

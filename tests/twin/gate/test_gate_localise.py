@@ -1,37 +1,22 @@
 """The gate says where the objects are: three values, bounded, and the same eyes as its verdicts."""
 
 import json
-import subprocess
-import sys
 import threading
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from gate_fakes import TASK, FakePerception, gate_with, raising
-from loopback import free_endpoint
-from own_process import ROOT
 
 from bridge.episode import schema
-from bridge.episode.run_folder import RunFolder
-from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.gate_sight import GateSight
-from bridge.sources.standin.streams import Streams
 from bridge.task.record import parse_record
-from bridge.task.task_file import load_task
 from bridge.terminal import Output
-from bridge.wire.config import WireConfig
-from bridge.wire.errors import RemoteError
-from bridge.wire.session import open_session
 from twin.errors import TwinError
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate
 from twin.gate.service import GateError, serve_localisation
 from twin.scene.localise.result import LocalisedObject, missing
-
-SEED = 9_000_001
 
 
 def localised(**lost: str) -> dict[str, LocalisedObject]:
@@ -143,56 +128,3 @@ def test_another_question_is_refused(payload: bytes) -> None:
     with pytest.raises(GateError, match="is JSON"):
         wire.services["standin/gate/localise"](payload)
     assert wire.published == []
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("unchecked")
-def test_a_real_gate_process_sees_the_laboratory_over_zenoh(tmp_path: Path) -> None:
-    """The planner gets what is published: near the truth, and not the truth."""
-    endpoint, task = free_endpoint(), load_task("push_cube_to_mark")
-    run = RunFolder.create(tmp_path / "run")
-    command = ["gate", str(run.path), "--cell", "lab", "--task", task.name, "--connect", endpoint]
-    heard: list[dict[str, Any]] = []
-    arrived = threading.Event()
-
-    def hear(sample: Any) -> None:
-        heard.append(dict(parse_record(sample.data, name="localisation")))
-        arrived.set()
-
-    with open_session(WireConfig(mode="router", connect=(), listen=(endpoint,))) as session:
-        session.subscribe("lab/localisation", hear)
-        with subprocess.Popen(
-            [sys.executable, "robot_gst.py", *command], cwd=ROOT, stderr=subprocess.PIPE, text=True
-        ) as process:
-            try:
-                assert process.stderr is not None
-                assert any("gate ready" in line for line in process.stderr)
-                threading.Thread(target=process.stderr.read, daemon=True).start()
-                file = load_cell("lab")
-                cell = StandinCell(
-                    file,
-                    task,
-                    draw_hidden(file, SEED, task),
-                    Streams(session, "lab"),
-                    config=CellConfig(rate_hz=5.0),
-                    seed=SEED,
-                    start_ns=10**18,
-                )
-                cell.announce()
-                cell.reset(task.draw_start(np.random.default_rng(SEED)))
-                cell.cameras_running = True
-                cell.wait(1.0)
-                asked = json.dumps({"task": task.name}).encode()
-                answer = session.query("lab/gate/localise", asked, timeout_s=120.0)
-                with pytest.raises(RemoteError, match="is JSON"):
-                    session.query("lab/gate/localise", b"?", timeout_s=30.0)
-                assert arrived.wait(20.0)
-            finally:
-                process.terminate()
-    sight = GateSight.from_json(answer, task)
-    assert sight.found is True, sight.reason
-    assert heard == json.loads(answer)["objects"]
-    off_m = np.linalg.norm(
-        sight.needed()["cube"][:2, 3] - cell.world.Ts_base_object()["cube"][:2, 3]
-    )
-    assert 1e-5 < off_m < 0.03

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from live_cell import CAMERA, IMAGE, S, calibrate, event, look, place, shoot
 
 from bridge.episode.cdr.messages import (
@@ -11,7 +12,6 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -45,14 +45,7 @@ def calibration_of(folder: Path, link: str, stream: str = "color") -> Calibratio
 
 
 def joints(view: LiveView, stamp_ns: int, position: np.ndarray = HOME) -> None:
-    none = np.zeros(0)
-    sample = JointSample(
-        stamp_ns=stamp_ns,
-        names=tuple(ARM_JOINTS),
-        position=position,
-        velocity=none,
-        effort=none,
-    )
+    sample = at_positions(stamp_ns, tuple(ARM_JOINTS), position)
     view.take("/standin/joint_states", sample.to_cdr(), stamp_ns)
 
 
@@ -66,13 +59,11 @@ class Recorder(LiveView):
         self.writer.describe(EpisodeInfo(id=path.stem, kind="trial", cell="standin"))
 
     def take(self, topic: str, data: bytes, received_ns: int, type_name: str = "") -> None:
-        """Show and write."""
         super().take(topic, data, received_ns, type_name)
         named = type_name or type_of_topic(topic) or ""
         self.writer.write(topic, data, type_name=named, log_time_ns=received_ns)
 
     def episode(self) -> Episode:
-        """What was recorded."""
         self.writer.close()
         return Episode.open(self.path)
 
@@ -174,10 +165,7 @@ def test_joints_count_as_life_and_say_where_the_arm_is() -> None:
 
 def test_a_gripper_that_publishes_beside_the_arm_does_not_take_its_place() -> None:
     view = LiveView("standin")
-    other = JointSample(
-        stamp_ns=8 * S, names=("finger",), position=np.zeros(1), velocity=np.zeros(0),
-        effort=np.zeros(0),
-    )  # fmt: skip
+    other = at_positions(8 * S, ("finger",), np.zeros(1))
     view.take("/standin/joint_states", other.to_cdr(), 8 * S)
     first = view.joints()
     assert first is not None

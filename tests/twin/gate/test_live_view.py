@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from live_cell import IMAGE, S, calibrate, event, look, place, shoot
 
 from bridge.episode import schema
@@ -10,7 +11,6 @@ from bridge.episode.cdr.images import depth_to_compact
 from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
-    JointSample,
     PoseSample,
     string_to_cdr,
 )
@@ -164,13 +164,7 @@ def test_stand_in_truth_is_passed_over() -> None:
 def feel(view: LiveView, stamp_ns: int, count: int = 1) -> None:
     """Joint states of an arm, 8 ms apart."""
     for k in range(count):
-        sample = JointSample(
-            stamp_ns=stamp_ns + k * S // 125,
-            names=("a", "b"),
-            position=np.array([0.0, 1.0]),
-            velocity=np.zeros(0),
-            effort=np.zeros(0),
-        )
+        sample = at_positions(stamp_ns + k * S // 125, ("a", "b"), np.array([0.0, 1.0]))
         view.take("/standin/joint_states", sample.to_cdr(), 0)
 
 

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bridge.robots.default import ROBOT
 from bridge.task.meshes.lattice import volumes_m3
 from twin.physics.soft import SoftModel
+from twin.robot.model import with_absolute_meshes
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -56,5 +58,9 @@ def soft_box(
 
 @pytest.fixture(scope="session")
 def box_of_cells() -> Callable[..., SoftModel]:
-    """Make soft boxes."""
     return soft_box
+
+
+@pytest.fixture(scope="module")
+def urdf() -> str:
+    return with_absolute_meshes(ROBOT.urdf_text())

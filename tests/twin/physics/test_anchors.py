@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.robots.default import ROBOT
 from twin.physics import world as world_module
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
@@ -19,11 +17,6 @@ STILL = np.zeros(6)
 G = 9.81
 WEAK = PhysicsConfig(object_friction=0.5, grip_force_N=2.0)
 CARRIED_KG = 2 * WEAK.object_friction * WEAK.finger_friction * WEAK.grip_force_N / G
-
-
-@pytest.fixture(scope="module")
-def urdf() -> str:
-    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def gripping(world: World, mass_kg: float) -> None:

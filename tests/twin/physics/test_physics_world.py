@@ -8,21 +8,14 @@ import pytest
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
-from bridge.robots.default import ROBOT
 from twin.physics import engine
 from twin.physics.arm import Arm, write_description
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
-
-
-@pytest.fixture(scope="module")
-def urdf() -> str:
-    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:
@@ -47,10 +40,7 @@ def dropped(urdf: str, steps: int = 120) -> tuple[np.ndarray, str]:
 
 
 def test_what_a_world_before_was_told_changes_nothing(urdf: str) -> None:
-    """Clients are used again: settings, bodies and constraints of one world end with it.
-
-    But for the contact breaking threshold, which PyBullet keeps for the whole process.
-    """
+    """Clients are used again: settings, bodies and constraints of one world end with it."""
     while engine._IDLE:
         pybullet.disconnect(physicsClientId=engine._IDLE.pop())
     first = dropped(urdf, 60)[1]

@@ -4,18 +4,11 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.robots.default import ROBOT
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
 
 SIZE = np.array([0.04, 0.04, 0.04])
-
-
-@pytest.fixture(scope="module")
-def urdf() -> str:
-    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,23 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bridge.robots.default import FINGER_JOINTS, ROBOT
+from bridge.robots.default import FINGER_JOINTS
 from twin.physics import arm
 from twin.physics.config import FINGER_SPEED_M_S, PhysicsConfig
 from twin.physics.engine import pybullet
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 SIZE = np.array([0.04, 0.04, 0.04])
 STILL = np.zeros(6)
 STRONG = PhysicsConfig(grip_force_N=30.0)
 OPEN_M, CLOSED_M = 0.06, 0.0
-
-
-@pytest.fixture(scope="module")
-def urdf() -> str:
-    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def fingers(world: World) -> np.ndarray:

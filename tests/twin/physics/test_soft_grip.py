@@ -101,13 +101,3 @@ def test_a_toy_that_slides_is_held_back_by_friction_alone(box_of_cells: Boxes) -
         model, friction=0.5, gravity=1.3 * most, squeeze_m=0.003, pad_m=TALL_M, hang_s=0.1
     )
     assert slides.carried_N == pytest.approx(2 * 0.5 * slides.pressed_N, rel=0.05)
-
-
-@pytest.mark.slow
-def test_smaller_cells_let_a_toy_slip_at_the_same_weight(box_of_cells: Boxes) -> None:
-    fine = box_of_cells((9, 5, 5), 0.0085, mass_kg=0.06)
-    how = {"friction": 0.5, "squeeze_m": 0.003}
-    light = let_hang(fine, gravity=1.0, **how)
-    most = 2 * 0.5 * light.pressed_N / fine.mass_kg
-    assert let_hang(fine, gravity=0.9 * most, **how).fell_m < 0.01
-    assert let_hang(fine, gravity=1.15 * most, **how).fell_m > 0.05

@@ -1,8 +1,5 @@
 """Soft bodies obey mechanics: momentum, gravity, stiffness, friction, volume, the same bits."""
 
-import hashlib
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -226,38 +223,6 @@ def test_a_soft_body_carries_a_rigid_one(box_of_cells: Boxes) -> None:
     assert abs(v) < 0.05
     assert 0.055 < z < 0.0635
     assert np.mean(weights[-120:]) == pytest.approx(mass * GRAVITY, rel=0.1)
-
-
-_SCRIPT = """
-import hashlib, sys
-sys.path.insert(0, {folder!r})
-import conftest, test_soft_laws as laws
-solver = laws.empty()
-laws.slab(solver, laws.pose(0, 0, -0.2), (2.0, 2.0, 0.4), 0.8)
-laws.put(solver, conftest.soft_box((3, 2, 2)), 0.0, 0.0, 0.03)
-laws.put(solver, conftest.soft_box((3, 2, 2)), 0.01, 0.0, 0.07)
-laws.run(solver, 60)
-print(hashlib.sha256(solver.nodes(0).tobytes() + solver.nodes(1).tobytes()).hexdigest())
-"""
-
-
-@pytest.mark.slow
-def test_every_process_gives_the_same_bits(box_of_cells: Boxes) -> None:
-    folder = __file__.rsplit("/", 1)[0]
-    script = _SCRIPT.format(folder=folder)
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", script], capture_output=True, text=True, check=True
-        ).stdout
-        for _ in range(2)
-    }
-    solver = empty()
-    slab(solver, pose(0, 0, -0.2), (2.0, 2.0, 0.4), 0.8)
-    put(solver, box_of_cells((3, 2, 2)), 0.0, 0.0, 0.03)
-    put(solver, box_of_cells((3, 2, 2)), 0.01, 0.0, 0.07)
-    run(solver, 60)
-    digest = hashlib.sha256(solver.nodes(0).tobytes() + solver.nodes(1).tobytes()).hexdigest()
-    assert found == {digest + "\n"}
 
 
 def test_a_body_that_burst_is_said_to_have_burst(box_of_cells: Boxes) -> None:

@@ -7,20 +7,13 @@ import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.robots.default import ROBOT
 from twin.physics.arm import PhysicsError
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
-from twin.robot.model import with_absolute_meshes
 
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 Boxes = Callable[..., SoftModel]
-
-
-@pytest.fixture(scope="module")
-def urdf() -> str:
-    return with_absolute_meshes(ROBOT.urdf_text())
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:

@@ -9,15 +9,10 @@ from bridge.robots.default import ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.follow import follow_poses
 from twin.robot.inverse import UrInverse, pose_error
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import RobotModel
 
 NEARLY_STRAIGHT = np.array([0.2, -1.4, 1.6, -0.9, 0.1, 0.3])
 """The fifth joint turns the wrist little: the fourth and the sixth nearly cancel each other."""
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
 
 
 def spinning(turn_rad: float, count: int = 60) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.streams import JointTrack
@@ -24,11 +24,6 @@ from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack, width_track
 
 POSTURE = np.array([0.3, -1.3, 1.5, -1.6, -1.4, 0.4])
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.mark.parametrize(
@@ -85,13 +80,7 @@ def test_the_width_follows_from_a_finger_among_the_joint_states(tmp_path: Path) 
     with EpisodeWriter(path) as writer:
         writer.describe(EpisodeInfo(id="trial_0001", kind="trial"))
         for index, half_m in enumerate((0.04, 0.01)):
-            sample = JointSample(
-                stamp_ns=index * 10**9,
-                names=names,
-                position=np.array([0.0] * 7 + [half_m]),
-                velocity=np.zeros(0),
-                effort=np.zeros(0),
-            )
+            sample = at_positions(index * 10**9, names, np.array([0.0] * 7 + [half_m]))
             writer.write(
                 "/cell/joint_states",
                 sample.to_cdr(),

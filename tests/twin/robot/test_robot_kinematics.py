@@ -9,14 +9,9 @@ from bridge.geometry import se3
 from bridge.robots.default import ARM_JOINTS, ROBOT
 from twin.robot.config import IkConfig
 from twin.robot.inverse import pose_error, solve_ik
-from twin.robot.model import RobotDescriptionError, RobotModel, load_robot
+from twin.robot.model import RobotDescriptionError, RobotModel
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.mark.parity

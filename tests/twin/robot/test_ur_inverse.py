@@ -7,14 +7,9 @@ import pytest
 
 from bridge.robots.default import ROBOT
 from twin.robot.inverse import UrInverse
-from twin.robot.model import RobotModel, load_robot
+from twin.robot.model import RobotModel
 
 HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotModel:
-    return load_robot(ROBOT.urdf_text())
 
 
 @pytest.fixture(scope="module")

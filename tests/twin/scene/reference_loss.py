@@ -12,13 +12,7 @@ L1_SHARE = 0.8
 
 
 class Loss:
-    """Photometric and depth loss of one drawn image.
-
-    ``paper`` is the paper's Eq. 3 without the feature term: mean squared error plus
-    ``depth_weight`` times the L1 depth error. ``3dgs`` replaces the squared error.
-    Depth counts only where it was measured, relative to the depth itself because a sensor's
-    error grows with distance: |sum w z - alpha d| / d.
-    """
+    """Photometric and depth loss of one drawn image."""
 
     def __init__(
         self, kind: Literal["3dgs", "paper"], *, depth_weight: float, threads: int = 0

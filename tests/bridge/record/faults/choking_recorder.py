@@ -1,7 +1,4 @@
-"""robot-gst, whose network thread fails: SIGUSR1 runs out of memory once, SIGUSR2 hangs for 2 s.
-
-Arguments: those of robot-gst.
-"""
+"""robot-gst, whose network thread fails: SIGUSR1 runs out of memory once, SIGUSR2 hangs for 2 s."""
 
 import signal
 import sys

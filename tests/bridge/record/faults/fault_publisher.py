@@ -1,11 +1,4 @@
-"""A publisher in its own process with its own account, doing what each line on stdin asks.
-
-Arguments: endpoint, account file. Each line of the account is written before the message leaves:
-time [ns], topic, sequence, publisher, SHA-256, as JSON. Requests and answers are lines of JSON:
-    {"puts": [{topic, key, encoding, data or zeros, note, sequence, gid}]}: exactly these bytes
-    {"ask": verb, "payload": ...}: a control request, in line behind everything put before
-    {"flow": seconds, "streams": [...], "qos": name, "period_s": ...}: a cell at work
-"""
+"""A publisher in its own process with its own account, doing what each line on stdin asks."""
 
 import base64
 import hashlib

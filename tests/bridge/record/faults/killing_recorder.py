@@ -1,8 +1,4 @@
-"""robot-gst, but it kills itself at a chosen system call of an episode's end.
-
-Arguments: PHASE:CALL:NUMBER:SIDE, then those of robot-gst. PHASE is finish (from the stop on) or
-start (recovery at start-up); CALL is pwritev, fdatasync, fsync or rename; SIDE is before or after.
-"""
+"""robot-gst, but it kills itself at a chosen system call of an episode's end."""
 
 import os
 import signal

@@ -1,7 +1,4 @@
-"""robot-gst on a slow disk: each write of an episode takes so long.
-
-Arguments: seconds per write, then those of robot-gst.
-"""
+"""robot-gst on a slow disk: each write of an episode takes so long."""
 
 import os
 import sys

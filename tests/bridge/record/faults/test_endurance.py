@@ -1,7 +1,4 @@
-"""A recorder that runs for long: many episodes, and a cell in full flow.
-
-`make soak` runs a thousand episodes; the number here fits into every test run.
-"""
+"""A recorder that runs for long: many episodes, and a cell in full flow."""
 
 import os
 import threading

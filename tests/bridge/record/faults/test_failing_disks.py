@@ -1,8 +1,4 @@
-"""Disks that are slow or break, and files that are taken away while they are written.
-
-The law: no small message is dropped, and none is missing that is older than half a second and one
-write; whatever happens is said within a second; and what can be kept is kept.
-"""
+"""Disks that are slow or break, and files that are taken away while they are written."""
 
 import os
 import random

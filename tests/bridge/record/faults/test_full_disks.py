@@ -1,9 +1,4 @@
-"""Disks that fill up and files that may not grow, under a cell in full flow.
-
-The law: the error is in the status and the exit code is 1 within a second; the file is finished
-and valid; and its accounts end at one instant: of everything sent until then, in the order it was
-sent, each message is in the file or counted as lost, those in the encoders included.
-"""
+"""Disks that fill up and files that may not grow, under a cell in full flow."""
 
 import resource
 import shutil

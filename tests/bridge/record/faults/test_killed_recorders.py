@@ -1,8 +1,4 @@
-"""SIGKILL: at random instants, and between the system calls that finish an episode.
-
-The law: whatever the instant, the next start recovers the file and lists what was lost. Of every
-topic it holds all that was sent until half a second before, byte for byte, and nothing else.
-"""
+"""SIGKILL: at random instants, and between the system calls that finish an episode."""
 
 import os
 import random

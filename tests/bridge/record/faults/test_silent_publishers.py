@@ -1,16 +1,10 @@
-"""Publishers that stop, hang, vanish or come late; and a recorder that hears nothing.
-
-The law: whoever falls silent is named while it happens and in the file, and nobody else is. A
-recorder that was stopped itself blames no publisher.
-"""
+"""Publishers that stop, hang, vanish or come late; and a recorder that hears nothing."""
 
 import base64
 import contextlib
 import io
 import json
 import signal
-import socket
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -102,72 +96,6 @@ def robot_gst_output(*words: str) -> str:
     return " ".join(stream.getvalue().split())
 
 
-class Cable:
-    """Carries one connection, until it is cut: then nothing moves and nothing closes."""
-
-    def __init__(self, endpoint: str) -> None:
-        """Wait for the connection on an endpoint of its own."""
-        self._target = ("127.0.0.1", int(endpoint.rpartition(":")[2]))
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
-        self.is_cut = threading.Event()
-        self._sockets: list[socket.socket] = []
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def _accept(self) -> None:
-        near, _ = self._listening.accept()
-        far = socket.create_connection(self._target)
-        self._sockets += [near, far]
-        for source, sink in ((near, far), (far, near)):
-            threading.Thread(target=self._carry, args=(source, sink), daemon=True).start()
-
-    def _carry(self, source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(1 << 16):
-                if self.is_cut.is_set():
-                    return
-                sink.sendall(data)
-
-    def close(self) -> None:
-        for each in (self._listening, *self._sockets):
-            each.close()
-
-
-def test_a_cable_that_is_pulled_is_named_as_a_silence(cell: FaultCell) -> None:
-    recorder = cell.record()
-    cable = Cable(cell.endpoint)
-    asker, far, near = cell.publisher(), cell.publisher(cable.endpoint), cell.publisher()
-    assert asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})["ok"]["ok"]
-    far.flow(60.0, "joints")
-    near.flow(60.0, "gripper")
-    wait_until(asker, lambda status: status["seen"].get(JOINTS, 0) > 600, "600 joints")
-    wait_until(asker, lambda status: status["seen"].get(GRIPPER, 0) > 100, "100 grips")
-    cable.is_cut.set()
-    assert silent(wait_until(asker, silent, "a silence")) == {JOINTS}
-    recorder.wait_for(f"{JOINTS} silent for ")
-    assert asker.ask("stop")["ok"]["lost"] == 0
-    assert [data["topic"] for data in notes(cell, "silent")] == [JOINTS]
-    cable.close()
-
-
-def test_a_recorder_that_was_stopped_blames_no_publisher(cell: FaultCell) -> None:
-    recorder = cell.record()
-    asker, flow = cell.publisher(), cell.publisher()
-    asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})
-    flow.flow(60.0, "joints", "gripper", "color", qos="own")
-    wait_until(asker, lambda status: status["seen"].get(JOINTS, 0) > 600, "600 joints")
-    recorder.send(signal.SIGSTOP)
-    time.sleep(2.0)  # the fault itself: nothing can be awaited from a stopped process
-    recorder.send(signal.SIGCONT)
-    before = wait_until(asker, lambda status: status["starved_s"] > 1.0, "its own standstill")
-    seen = before["seen"][JOINTS] + 500
-    after = wait_until(asker, lambda status: status["seen"][JOINTS] > seen, "more joints")
-    assert not silent(after)
-    asker.ask("stop")
-    assert not notes(cell, "silent")
-    assert len(notes(cell, "starved")) == 1
-
-
 def test_a_required_topic_that_is_missing_refuses_a_start(cell: FaultCell) -> None:
     cell.run.mkdir()
     (cell.run / "cell.toml").write_text(CONTRACT)
@@ -221,23 +149,6 @@ def test_a_message_that_cannot_be_taken_in_does_not_end_the_hearing(cell: FaultC
     answer = asker.ask("stop")["ok"]
     assert answer["lost"] == 1
     assert check_code(cell.path("t1")) == 3
-
-
-@pytest.mark.slow
-def test_a_deaf_recorder_says_so_and_blames_no_publisher(cell: FaultCell) -> None:
-    """Law: when the network thread hangs, it is the recorder that is deaf."""
-    deaf = str(__file__).replace("test_silent_publishers", "choking_recorder")
-    recorder = cell.record(program=deaf)
-    asker, flow = cell.publisher(), cell.publisher()
-    asker.ask("start", {"id": "t1", "info": {"cell": "cell"}})
-    flow.flow(60.0, "joints")
-    wait_until(asker, lambda status: status["seen"].get(JOINTS, 0) > 600, "joints")
-    recorder.send(signal.SIGUSR2)
-    recorder.wait_for("the recorder has heard nothing for ")
-    recorder.wait_for("the recorder hears again; it was deaf for ")
-    asker.ask("stop")
-    assert not notes(cell, "silent")
-    assert [len(notes(cell, kind)) for kind in ("deaf", "hears_again")] == [1, 1]
 
 
 def test_messages_without_numbers_are_said_to_hide_losses(cell: FaultCell) -> None:

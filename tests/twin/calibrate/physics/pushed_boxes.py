@@ -104,5 +104,4 @@ def write_recording(
 
 
 def turned_about_y(rad: float) -> Float[np.ndarray, "3 3"]:
-    """A rotation."""
     return np.asarray(se3.rotation_from_vector(np.array([0.0, rad, 0.0])))

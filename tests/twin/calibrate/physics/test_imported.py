@@ -1,13 +1,10 @@
 """Replays of imported recordings that have no plan: files, provenance, what is skipped."""
 
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from kinova_data import episodes
 
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -15,7 +12,7 @@ from bridge.episode.streams import pose_track
 from bridge.terminal import Output
 from evaluator.compare import compare_run
 from twin.calibrate.physics.imported import ENGINE, replay_imported
-from twin.calibrate.physics.push_fit import METHOD, end_point_error_m, frictions, load_push
+from twin.calibrate.physics.push_fit import METHOD, frictions, load_push
 from twin.physics.config import PhysicsConfig
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import replay_run
@@ -25,8 +22,6 @@ from twin.scene.store.calibration import write_physics
 sys.path.insert(0, str(Path(__file__).parent))
 import pushed_boxes
 
-BESIDE = Path(__file__).parents[5] / "shared" / "data"
-KINOVA = Path(os.environ.get("GST_SHARED_DATA", BESIDE)) / "robot_realitygap_kinova_real_vs_sim"
 QUIET = Output(quiet=True)
 
 
@@ -118,38 +113,3 @@ def test_a_robot_that_is_gone_is_named_and_the_rest_goes_on(run: RunFolder) -> N
     assert summary["imported"] == []
     assert set(summary["skipped_episodes"]) == {"push_0001", "push_0003"}
     assert "Import the data set again" in summary["skipped_episodes"]["push_0001"]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not KINOVA.is_dir(), reason="shared data not here (set GST_SHARED_DATA)")
-def test_a_real_push_ends_where_it_really_ended(tmp_path: Path) -> None:
-    few = tmp_path / "few"
-    for pattern in ("real/*/CubeExp000[37]_6D.tsv", "real/*/Single0001_6D.tsv"):
-        for path in KINOVA.glob(pattern):
-            place = few / path.relative_to(KINOVA)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_bytes(path.read_bytes())
-    (few / "robot").symlink_to(KINOVA / "robot")
-    run = RunFolder.create(tmp_path / "run")
-    for _ in episodes.import_runs(few, run):
-        pass
-    tool = pose_track(
-        Episode.open(Path(row_of(replay(run), "single_0001")["path"])), episodes.TCP_TOPIC
-    )
-    # The schedule ends at the hand link's (0.533, 0.067, 0.236) m, and the marker lies on the hand.
-    assert tool.p_m[-1] == pytest.approx([0.533, 0.067, 0.236], abs=0.012)
-    # What docs/real_number.md says was identified on other runs than these two.
-    for name in ("cubeexp_0003", "cubeexp_0007"):
-        push = load_push(run.path.resolve(), name)
-        assert push is not None
-        assert np.linalg.norm(push.T_hand_tool[:3, 3]) < 0.015
-        found, _ = end_point_error_m(push, frictions(0.183, 0.1, PhysicsConfig()), 0.1)
-        nominal, _ = end_point_error_m(push, PhysicsConfig(), 0.0)
-        assert found < 0.006
-        assert nominal > 0.010
-
-
-def row_of(summary: dict[str, Any], episode: str) -> dict[str, Any]:
-    """The only replay of an episode."""
-    [row] = [row for row in summary["imported"] if row["episode"] == episode]
-    return dict(row)

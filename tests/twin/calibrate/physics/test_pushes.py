@@ -36,7 +36,6 @@ GRAVITY_M_S2 = 9.81
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunFolder:
-    """A run with the made robot."""
     folder = RunFolder.create(tmp_path / "run")
     pushed_boxes.write_robot(folder)
     return folder

@@ -31,14 +31,6 @@ def test_the_distance_to_the_table_is_the_height_of_the_tips(script: SimpleNames
         assert monitor.measure(0, joints, WIDTH_M, {}) == pytest.approx(height - 0.01, abs=1e-6)
 
 
-def test_the_box_is_closer_than_the_table_above_its_wall(script: SimpleNamespace) -> None:
-    """Wall top at 0.056 m, finger tips at 0.075 m, right above the wall at x + 0.078 m."""
-    scene = script.scene()
-    joints = joints_over(scene, 0.5 + 0.078, 0.19, 0.085)
-    monitor = monitor_of(script, scene, allowed_contacts=())
-    assert monitor.measure(0, joints, 0.0, {}) == pytest.approx(0.075 - 0.056, abs=1e-5)
-
-
 def test_the_nearest_points_are_where_the_smallest_clearance_was(script: SimpleNamespace) -> None:
     scene = script.scene()
     monitor = monitor_of(script, scene)

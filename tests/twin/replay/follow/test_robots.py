@@ -28,7 +28,6 @@ HOME = np.array([0.2, -1.4, 1.6, -1.7, -1.5, 0.3])
 
 
 def plan_through(Ts: np.ndarray, step_s: float = 0.04) -> Plan:
-    """A plan of poses only."""
     tau = []
     for index, T in enumerate(Ts):
         q, p = se3.split(T)
@@ -214,33 +213,6 @@ def test_straight_motion_through_a_wrist_singularity_is_a_named_jump() -> None:
     for failure in failures:
         assert failure.detail
         assert 0 <= failure.t_ns <= plan.tau[-1].t_ns
-
-
-def test_a_plan_of_poses_keeps_its_branch_all_along() -> None:
-    robot = load_robot(ROBOT.urdf_text())
-    wanted = HOME + np.linspace(0, 1, 40)[:, None] * np.array([0.8, 0.2, -0.2, 0.1, 0.3, 0.5])
-    path, failures, _ = path_of_plan(plan_through(robot.Ts_base_tcp(wanted)), robot)
-    assert not failures
-    assert not check_path(path, robot, hulls_of(robot))
-    np.testing.assert_allclose(
-        robot.Ts_base_tcp(path.joints_rad), robot.Ts_base_tcp(wanted), atol=1e-7
-    )
-
-
-def test_a_branch_that_touches_is_not_taken_where_another_is_free() -> None:
-    """Somebody stands where the elbow would be."""
-    robot = load_robot(ROBOT.urdf_text())
-    wanted = HOME + np.linspace(0, 1, 10)[:, None] * np.array([0.3, 0.1, -0.1, 0.1, 0.1, 0.1])
-    plan = plan_through(robot.Ts_base_tcp(wanted))
-    up, _, _ = path_of_plan(plan, robot)
-    sign = np.sign(up.joints_rad[0, 2])
-    down, failures, _ = path_of_plan(
-        plan,
-        robot,
-        clearance=lambda q: np.where(np.sign(q[:, 2]) == sign, -0.01, 0.01),
-    )
-    assert not failures
-    assert np.all(np.sign(down.joints_rad[:, 2]) == -sign)
 
 
 def test_every_failure_along_a_path_names_its_first_instant() -> None:

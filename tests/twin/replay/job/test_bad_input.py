@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
@@ -47,10 +47,7 @@ def episode_with(path: Path, stamps_s: list[float]) -> Episode:
         writer.describe(EpisodeInfo(id=path.stem, kind="trial"))
         for index, stamp_s in enumerate(stamps_s):
             stamp_ns = T0 + round(stamp_s * 1e9)
-            sample = JointSample(
-                stamp_ns=stamp_ns, names=("a",), position=np.zeros(1),
-                velocity=np.zeros(0), effort=np.zeros(0),
-            )  # fmt: skip
+            sample = at_positions(stamp_ns, ("a",), np.zeros(1))
             writer.write(
                 "/cell/joint_states",
                 sample.to_cdr(),

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.writer import EpisodeWriter
@@ -22,10 +22,7 @@ def recorded(path: Path, names: Sequence[str], rows: Sequence[Sequence[float]]) 
     with EpisodeWriter(path / "trial.mcap") as writer:
         writer.describe(EpisodeInfo(id="trial", kind="trial"))
         for index, row in enumerate(rows):
-            sample = JointSample(
-                stamp_ns=(10 + index) * S, names=tuple(names), position=np.array(row),
-                velocity=np.zeros(0), effort=np.zeros(0),
-            )  # fmt: skip
+            sample = at_positions((10 + index) * S, tuple(names), np.array(row))
             writer.write(
                 "/lab/joint_states",
                 sample.to_cdr(),

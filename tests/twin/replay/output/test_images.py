@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -118,10 +118,7 @@ def write_recording(run: RunFolder, urdf: str) -> Episode:
                 ("joint_states", ARM_JOINTS, joints),
                 ("gripper/state", ("gripper_width",), np.array([0.05])),
             ):
-                sample = JointSample(
-                    stamp_ns=stamp, names=names, position=values,
-                    velocity=np.zeros(0), effort=np.zeros(0),
-                )  # fmt: skip
+                sample = at_positions(stamp, names, values)
                 say(f"/cell/{topic}", sample.to_cdr(), schema.JOINT_STATE, stamp)
             for name in poses if index % 5 == 0 else ():
                 image = CompressedColor(stamp_ns=stamp, frame_id=name, format="jpeg", data=b"-")
@@ -157,11 +154,6 @@ def result_of(scene: ReplayScene, movable: str, nodes_m: np.ndarray | None = Non
         if nodes_m is None
         else {movable: np.stack([se3.apply(T, nodes_m) for T in Ts]).astype(np.float32)},
     )  # fmt: skip
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def pictures(
@@ -321,27 +313,9 @@ def test_calibrated_cameras_see_from_where_the_calibration_has_them(
     assert checked >= 4
 
 
-def drawn(
-    run: RunFolder, episode: Episode, result: ReplayResult, scene: ReplayScene
-) -> list[tuple[str, int, bytes]]:
-    return [
-        (camera_id, image.stamp_ns, image.data)
-        for camera_id, image in render_replay(
-            run,
-            episode,
-            result,
-            scene,
-            start_ns=T0,
-            executed=True,
-            planned=True,
-        )
-    ]
-
-
 def test_a_trial_shows_the_recorded_arm_and_says_whom_nobody_found(
     run: RunFolder, script: SimpleNamespace, tmp_path: Path
 ) -> None:
-    """The arm moves as recorded."""
     scene = script.scene()
     write_scene(run, scene, "cube", block())
     write_recording(run, scene.urdf)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from joint_samples import at_positions
 
 import robot_gst
 from bridge.episode import schema, streams
@@ -14,7 +15,6 @@ from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -150,10 +150,7 @@ def record_trial(
             writer.write_json("/lab/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, track in zip(("joint_states", "gripper/state"), tracks, strict=False):
             for stamp, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
-                sample = JointSample(
-                    stamp_ns=stamp, names=track.names, position=row,
-                    velocity=np.zeros(0), effort=np.zeros(0),
-                )  # fmt: skip
+                sample = at_positions(stamp, track.names, row)
                 say(f"/lab/{topic}", sample.to_cdr(), schema.JOINT_STATE, stamp)
 
 

@@ -8,20 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from mcap.reader import make_reader
 
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import SAME_ENGINE_KEY, SECOND_ENGINE_KEY, EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.process_pool import ProcessPool, Serial
 from bridge.task.verdict import SAME_ENGINE, Factor, Verdict
 from bridge.terminal import Output
 from twin.replay import run_job as run_job_module
-from twin.replay import runner
 from twin.replay import runner as runner_module
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.job import ReplayJob
@@ -75,13 +74,7 @@ def run(
             writer.write_json("/standin/event", event, type_name=schema.EVENT, log_time_ns=stamp)
         for topic, recorded in (("joint_states", track), ("gripper/state", widths)):
             for stamp, position in zip(recorded.stamps_ns, recorded.position, strict=True):
-                sample = JointSample(
-                    stamp_ns=int(stamp),
-                    names=recorded.names,
-                    position=position,
-                    velocity=np.zeros(0),
-                    effort=np.zeros(0),
-                )
+                sample = at_positions(int(stamp), recorded.names, position)
                 writer.write(
                     f"/standin/{topic}",
                     sample.to_cdr(),
@@ -219,32 +212,6 @@ def test_both_engines_write_an_episode_each_and_the_first_decides(
     assert len(done) == 1, "an engine's episode that is missing is made again"
 
 
-class PoolForReplays(ProcessPool):
-    """Lists jobs in this process, where the fixture localises; replays in the others."""
-
-    def run(self, function: Any, items: Any, cost: Any) -> Any:
-        """See ``ProcessPool``."""
-        runner = Serial() if function is runner_module.jobs_of else super()
-        return runner.run(function, items, cost)
-
-
-@pytest.mark.slow
-def test_two_processes_say_what_one_process_says(
-    run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = ReplayRunConfig(replay=QUICK)
-    replay_run(run, config, QUIET)
-    before = {path.name: _messages(path) for path in run.derived("*.replay.*")}
-    monkeypatch.setattr(runner, "ProcessPool", PoolForReplays)
-    summary = replay_run(run, replace(config, workers=2, force=True), QUIET)
-    assert not any(row["skipped"] or row["error"] for row in summary["rows"])
-    assert {path.name: _messages(path) for path in run.derived("*.replay.*")} == before
-
-
-def _messages(path: Path) -> list[tuple[str, int, bytes]]:
-    return [(m.topic, m.publish_time_ns, m.data) for m in Episode.open(path).messages()]
-
-
 def test_an_unknown_episode_lists_those_that_exist(run: RunFolder) -> None:
     with pytest.raises(UsageError, match="trial_0001"):
         replay_run(run, ReplayRunConfig(episode=("trial_9",)), QUIET)
@@ -327,20 +294,3 @@ def test_a_recording_that_ends_while_the_robot_moves_says_so(
         assert row["accepted"] is None
     assert summary["counts"]["planned dynamic"]["n"] == 1
     assert summary["counts"]["planned dynamic, never executed"]["n"] == 1
-
-
-def test_a_plan_made_during_an_execution_has_no_known_start(script: SimpleNamespace) -> None:
-    task = script.scene().task
-    phases = [
-        Phase(name="start", plan_id=None, after_ns=None, before_ns=100),
-        Phase(name="end", plan_id="a", after_ns=200, before_ns=300),
-    ]
-    first = StartState(Ts_base_object={"cube": np.eye(4)})
-    second = StartState(Ts_base_object={"box": np.eye(4)})
-    starts = StartStates(task, phases, [first, second])
-    assert starts.at(100) is first
-    assert starts.at(250) is second
-    assert starts.at(300) is second
-    during = starts.at(150)
-    assert not during.Ts_base_object
-    assert "being executed" in during.reasons["cube"]

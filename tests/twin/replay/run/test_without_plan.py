@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.cli.episodes import label
 from bridge.episode import schema, streams
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -79,13 +80,7 @@ def write(folder: RunFolder, script: SimpleNamespace, good: ReplayResult) -> Wri
                     continue
                 names = tuple(f"{rename}{name}" for name in track.names)
                 for stamp_ns, row in zip(track.stamps_ns.tolist(), track.position, strict=True):
-                    sample = JointSample(
-                        stamp_ns=stamp_ns,
-                        names=names,
-                        position=track.position[0] if still else row,
-                        velocity=np.zeros(0),
-                        effort=np.zeros(0),
-                    )
+                    sample = at_positions(stamp_ns, names, track.position[0] if still else row)
                     writer.write(
                         f"/lab/{topic}",
                         sample.to_cdr(),
@@ -144,17 +139,6 @@ def test_what_was_executed_is_replayed_and_nothing_is_said_to_be_planned(
     assert abs(started - START) < 50_000_000
     cube = streams.pose_track(episode, streams.object_pose_topics(episode)["cube"])
     assert np.linalg.norm(cube.p_m[-1] - cube.p_m[0]) > 0.2
-
-
-@pytest.mark.slow
-def test_an_imported_episode_is_replayed_once_somebody_says_of_which_task(
-    folder: RunFolder, write: Write, seen: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-    write(EpisodeInfo(id="bag", kind="imported"))
-    assert cli.replay(folder.path, config=QUICK) == 2
-    assert "nobody said of which task it is a trial: robot-gst label" in capsys.readouterr().out
-    label(folder.path, "bag", task="cube_into_box", result="failure", output=QUIET)
-    assert cli.replay(folder.path, config=QUICK) == 0
 
 
 @pytest.mark.parametrize(

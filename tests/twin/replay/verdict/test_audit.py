@@ -100,7 +100,6 @@ def shifted(name: str) -> Callable[..., tuple[ReplayScene, RobotHulls]]:
 
 
 def forgotten(scene: ReplayScene, rng: np.random.Generator) -> tuple[ReplayScene, RobotHulls]:
-    """The box is not there at all."""
     there = {name: T for name, T in scene.Ts_base_object.items() if name != "box"}
     return replace(scene, Ts_base_object=there), hulls_of(load_robot(scene.urdf))
 

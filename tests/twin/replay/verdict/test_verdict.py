@@ -162,19 +162,6 @@ def test_an_object_that_was_not_localised_leaves_the_verdict_open(
     assert verdict.accepted is None
 
 
-@pytest.mark.slow
-def test_a_recorded_execution_ends_as_the_motion_it_recorded(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    track, widths = script.recorded_tracks(good, start_ns=1_700_000_000_000_000_000)
-    result = replay_joints(track, widths, scene, ReplayConfig(), plan=script.plan(scene))
-    assert result.verdict.trajectory == "executed"
-    assert result.verdict.accepted is True, result.verdict.reason
-    end = result.Ts_base_object["cube"][-1, :3, 3] - good.Ts_base_object["cube"][-1, :3, 3]
-    assert np.linalg.norm(end) < 0.01
-
-
 def test_a_kinematic_replay_follows_recorded_joints_exactly(
     script: SimpleNamespace, good: ReplayResult
 ) -> None:
@@ -237,38 +224,6 @@ def test_a_rigid_body_that_physics_lost_is_not_judged(
         NotEvaluatedError, match="not evaluated: physics lost cube: its place is no"
     ):
         replay_plan(replace(plan, tau=plan.tau[:1]), scene, ReplayConfig(settle_after_s=0.1))
-
-
-@pytest.mark.slow
-def test_two_replays_of_one_plan_are_the_same_bits(
-    script: SimpleNamespace, good: ReplayResult
-) -> None:
-    scene = script.scene()
-    again = replay_plan(script.plan(scene), scene, ReplayConfig())
-    assert np.array_equal(again.joints_rad, good.joints_rad)
-    assert np.array_equal(again.clearance_m, good.clearance_m)
-    for name, Ts in good.Ts_base_object.items():
-        assert Ts.tobytes() == again.Ts_base_object[name].tobytes()
-    assert again.verdict == good.verdict
-
-
-@pytest.mark.slow
-def test_twelve_seconds_take_so_many_steps_and_no_more(
-    script: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``make bench BENCH=replay_rigid`` measures how long they take."""
-    steps = [0]
-    step = World.step
-
-    def counted(self: World) -> None:
-        steps[0] += 1
-        step(self)
-
-    monkeypatch.setattr(World, "step", counted)
-    scene, config = script.scene(), ReplayConfig()
-    result = replay_plan(script.plan(scene, pace=1.0), scene, config)
-    assert result.stamps_ns[-1] == 12_000_000_000
-    assert steps[0] == (12.0 + config.settle_before_s) * config.physics.rate_hz
 
 
 def test_an_unreachable_first_waypoint_gives_a_verdict_too(script: SimpleNamespace) -> None:

@@ -48,7 +48,6 @@ def renderer() -> Renderer:
 
 
 def side_camera_pose() -> np.ndarray:
-    """``T_base_camera`` of the side camera."""
     return load_cell("standin").cameras["side"].T_parent_camera
 
 

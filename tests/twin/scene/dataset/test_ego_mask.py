@@ -1,25 +1,14 @@
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import textured_room
 
-from bridge.cli.exchange import import_rgbd
-from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
-from bridge.terminal import Output
 from twin.scene.dataset.masks import EgoMask, find_ego_mask
-from twin.scene.dataset.training_set import read_training_set
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
-from twin.scene.frames.selection import choose_frames, find_sources
-from twin.scene.settings import FrameConfig, RebuildConfig
 
-SHARED = Path(os.environ.get("GST_SHARED_DATA", Path(__file__).parents[5] / "shared" / "data"))
-SHELF = SHARED / "rgbd_apc_shelf_wristcam"
-QUIET = Output(quiet=True)
 FULL = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 HALF = FULL.scaled(0.5)
 FINGERS = (slice(0, 40), (slice(12, 42), slice(118, 148)))
@@ -161,23 +150,3 @@ def test_points_and_pixels_of_the_gripper_are_left_out(views: list[TrainingView]
     np.testing.assert_array_equal(masked.half.static_mask, ~mask.half)
     assert not masked.full.depth_m[~masked.full.static_mask].any()
     assert masked.full.static_mask.mean() == pytest.approx(1 - mask.share)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not SHELF.is_dir(), reason="shared data is not here (GST_SHARED_DATA)")
-def test_the_fingers_before_a_real_wrist_camera_are_found_and_the_shelf_is_not(
-    tmp_path: Path,
-) -> None:
-    import_rgbd(SHELF, tmp_path / "run", output=QUIET)
-    choices = choose_frames(
-        find_sources(RunFolder.open(tmp_path / "run")), FrameConfig(), QUIET
-    ).choices
-    training = read_training_set(choices, RebuildConfig(), QUIET)
-    mask = training.ego_masks[0]
-    for columns in (slice(18, 60), slice(258, 300)):
-        assert mask.half[4:76, columns].mean() > 0.95
-    assert mask.half[110:230, 70:250].mean() < 0.01
-    assert f"{100 * mask.share:.0f} % of the image of camera" in " ".join(training.report.remarks())
-    assert not any(view.half.static_mask[mask.half].any() for view in training.views)
-    near = [(view.half.depth_m > 0) & (view.half.depth_m < 0.2) for view in training.views]
-    assert np.mean(near) < 1e-4  # suction cups wobble; the shelf begins farther away

@@ -1,7 +1,4 @@
-"""SAM 3, DINOv3 and CLIP from folders that hold tiny networks with random weights.
-
-What they see is meaningless; that everything goes in and comes out as agreed is not.
-"""
+"""SAM 3, DINOv3 and CLIP from folders that hold tiny networks with random weights."""
 
 import contextlib
 from collections.abc import Callable

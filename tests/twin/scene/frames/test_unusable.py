@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,6 @@ from twin.scene.settings import FrameConfig
 SECOND = 1_000_000_000
 QUIET = Output(quiet=True)
 Change = Callable[[list[FrameTransform]], list[FrameTransform]]
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def write(

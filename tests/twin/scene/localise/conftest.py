@@ -1,7 +1,4 @@
-"""Ray-cast frames of a cube, an open box and a table; nothing of the stand-in cell.
-
-Lets the tests of this folder import the module ``toy_frames`` that lies beside them.
-"""
+"""Ray-cast frames of a cube, an open box and a table; nothing of the stand-in cell."""
 
 import sys
 from collections.abc import Callable

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -88,11 +87,6 @@ def put_camera(writer: EpisodeWriter, frame: RgbdFrame, root: str | None, num: i
         )
         put(writer, f"{topic}/color/image", color, schema.COMPRESSED_IMAGE, stamp)
         put(writer, f"{topic}/depth/image", depth, schema.IMAGE, stamp)
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def write(run: RunFolder, *cameras: tuple[RgbdFrame, str | None], num: int = 4) -> Episode:

@@ -1,6 +1,5 @@
 """Localisation of recorded episodes: which frames count, what is written, what is never read."""
 
-import ast
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -108,10 +107,7 @@ def frames() -> dict[str, RgbdFrame]:
 def episode(
     tmp_path: Path, stage: Callable[..., Any], task: Task, frames: dict[str, RgbdFrame]
 ) -> Episode:
-    """Start at 1, 2, 3 s; execution from 4 to 6 s; the cube is in the box at 7 and 8 s.
-
-    A truth camera and a truth pose beside them lie: they show the cube elsewhere.
-    """
+    """Start at 1, 2, 3 s; execution from 4 to 6 s; the cube is in the box at 7 and 8 s."""
     if not frames:
         rng = np.random.default_rng(0)
         for name, poses in (("start", START), ("end", END)):
@@ -192,30 +188,3 @@ def test_a_derived_episode_is_kept_until_its_settings_change(episode: Episode, t
     content = path.read_bytes()
     assert write_localised(run, episode, task, force=True).stat().st_mtime_ns > first
     assert path.read_bytes() == content  # same input, same bytes
-
-
-TWIN = Path(__file__).resolve().parents[4] / "twin"
-
-
-def test_the_twin_names_neither_the_stand_in_code_nor_its_truth() -> None:
-    """Reads the syntax tree of every module: imports, and text outside docstrings."""
-    files = sorted(TWIN.rglob("*.py"))
-    assert len(files) > 5
-    for path in files:
-        tree = ast.parse(path.read_text())
-        docstrings = {
-            id(node.body[0].value)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-            and node.body
-            and isinstance(node.body[0], ast.Expr)
-        }
-        for node in ast.walk(tree):
-            names = [alias.name for alias in getattr(node, "names", []) if hasattr(alias, "name")]
-            names.append(str(getattr(node, "module", "")))
-            assert not any(name.startswith("bridge.sources") for name in names), path
-            if isinstance(node, ast.Constant) and id(node) not in docstrings:
-                assert "truth" not in str(node.value), f"{path}:{node.lineno}"
-            if isinstance(node, ast.Attribute | ast.Name):
-                name = node.attr if isinstance(node, ast.Attribute) else node.id
-                assert name != "TRUTH", f"{path}:{node.lineno}"

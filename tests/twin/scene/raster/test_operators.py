@@ -45,20 +45,6 @@ def test_lifting_is_the_adjoint_of_drawing(isa: str, channels: int) -> None:
     assert abs(left - right) < 1e-6 * size
 
 
-def test_the_label_with_most_weight_wins() -> None:
-    cloud = shiny_cloud(600)
-    rasteriser = drawn(cloud, RasterConfig(threads=1))
-    known = np.array([0, 3, 7, 65535], dtype=np.uint16)
-    labels = known[np.random.default_rng(3).integers(0, 4, size=600)]
-    ids, weight = rasteriser.label_map(labels)
-    sums = rasteriser.draw_features(as_float32(labels[:, None] == known))
-    np.testing.assert_allclose(weight, sums.max(axis=0), atol=1e-5)
-    ordered = np.sort(sums, axis=0)
-    clear = ordered[-1] - ordered[-2] > 1e-5
-    np.testing.assert_array_equal(ids[clear], known[sums.argmax(axis=0)][clear])
-    assert set(np.unique(ids)) == set(known.tolist())
-
-
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     cloud = shiny_cloud(9000, seed=4)  # enough for several stretches of the depth order
     rng = np.random.default_rng(5)

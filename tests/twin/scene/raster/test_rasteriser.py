@@ -74,28 +74,6 @@ def test_alpha_of_a_single_gaussian_is_the_closed_form() -> None:
     )
 
 
-def test_colour_and_depth_are_weighted_by_alpha() -> None:
-    planes = draw(one_gaussian(x_px=20.0, y_px=16.5, depth_m=1.5))
-    alpha = planes[4, 16, 20]
-    assert alpha > 0.3
-    np.testing.assert_allclose(planes[:3, 16, 20], alpha * np.array([0.2, 0.5, 0.9]), rtol=1e-5)
-    assert planes[3, 16, 20] == pytest.approx(1.5 * alpha, rel=1e-5)
-
-
-def test_the_nearer_gaussian_hides_the_farther_whatever_their_order() -> None:
-    near = one_gaussian(x_px=20.5, y_px=16.5, depth_m=1.0, sigma_m=0.1, opacity_logit=8.0)
-    far = one_gaussian(x_px=20.5, y_px=16.5, depth_m=2.0, sigma_m=0.2, opacity_logit=8.0)
-    images = []
-    for order in ([near, far], [far, near]):
-        stacked = {
-            name: as_float32(np.concatenate([getattr(cloud, name) for cloud in order]))
-            for name, _ in arrays(near)
-        }
-        images.append(draw(GaussianCloud(**stacked)))
-    np.testing.assert_array_equal(images[0], images[1])
-    assert images[0][3, 16, 20] / images[0][4, 16, 20] == pytest.approx(1.0, abs=0.02)
-
-
 @pytest.mark.parametrize("broken", ["means_m", "scales_log", "opacities_logit", "colors"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_a_broken_gaussian_does_not_spoil_the_others(broken: str, value: float) -> None:

@@ -16,7 +16,6 @@ from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.task.task_file import Task, TaskFile, load_task
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import replay_run
 from twin.scene.fit.initialise import fuse
@@ -24,7 +23,7 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects import decompose as parts_module
-from twin.scene.objects.decompose import ScannedTasks, decompose, read_objects
+from twin.scene.objects.decompose import decompose, read_objects
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import (
@@ -143,53 +142,6 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     decompose(sources, cloud, choices)
     assert len(choices[0].holdout_ns) == 3
     assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
-
-
-def test_each_scan_is_searched_for_the_objects_of_its_own_task(
-    room: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An object of two tasks is where it was seen first, and is lost only when none shows it."""
-    asked: list[list[str]] = []
-    cube, sloth = (load_task(name) for name in ("cube_into_box", "sloth_into_basket"))
-    both = replace(sloth, objects=sloth.objects | {"box": cube.objects["box"]})
-    seen = {"box": [False, True], "cube": [True], "sloth": [True], "basket": [False]}
-
-    def localise(episode: Episode, task: Task, **given: Any) -> dict[str, LocalisedObject]:
-        asked.append(list(task.objects))
-        return {
-            key: LocalisedObject(
-                object_id=key,
-                found=seen[key].pop(0),
-                stamp_ns=len(asked),
-                reason="no view",
-                T_base_object=None,
-                covariance=None,
-                confidence=0.0,
-                method="test",
-            )
-            for key in task.objects
-        }
-
-    sources = find_sources(room)
-    (episode,) = sources.episodes
-    texts = {"first": cube, "second": both}
-    monkeypatch.setattr(TaskFile, "task", lambda self: texts[self.origin])
-    files = [(episode, TaskFile(b"", origin)) for origin in texts]
-    found = ScannedTasks(files=files, missing=("no task named 'gone'",))
-    monkeypatch.setattr(parts_module, "scanned_tasks", lambda sources: found)
-    monkeypatch.setattr(parts_module, "localise_episode", localise)
-    cloud = fuse(
-        [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
-    )
-    apart = decompose(sources, cloud, choose_frames(sources, FrameConfig()).choices)
-    assert asked == [["cube", "box"], ["sloth", "basket", "box"]]
-    assert apart.localised is not None
-    assert {key: item.stamp_ns for key, item in apart.localised.items()} == {
-        "cube": 1, "box": 2, "sloth": 2, "basket": 2,
-    }  # fmt: skip
-    assert apart.task is not None
-    assert set(apart.task.objects) == {"cube", "box", "sloth", "basket"}
-    assert apart.remark == "no task named 'gone'; basket not found: no view"
 
 
 def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 from scipy.spatial import cKDTree
 
 from bridge.episode import schema
-from bridge.episode.cdr.messages import JointSample, string_to_cdr
+from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -160,13 +161,7 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> Episode:
                 ("/c/joint_states", ARM_JOINTS, HOME + share * (AWAY - HOME)),
                 ("/c/gripper/state", ("gripper_width",), np.array([WIDTH_M])),
             ):
-                sample = JointSample(
-                    stamp_ns=tenth * SECOND // 10,
-                    names=tuple(names),
-                    position=values,
-                    velocity=np.zeros(0),
-                    effort=np.zeros(0),
-                )
+                sample = at_positions(tenth * SECOND // 10, tuple(names), values)
                 writer.write(
                     topic,
                     sample.to_cdr(),

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joint_samples import at_positions
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import (
@@ -12,7 +13,6 @@ from bridge.episode.cdr.messages import (
     CompressedColor,
     DepthImage,
     FrameTransform,
-    JointSample,
     string_to_cdr,
     transforms_to_cdr,
 )
@@ -59,12 +59,8 @@ def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: b
         for index, joints in enumerate(cell_views.POSTURES):
             stamp = 2 * (index + 1) * SECOND
             for part in (-0.4, 0.0, 0.4) if with_joints else ():
-                sample = JointSample(
-                    stamp_ns=stamp + round(part * SECOND),
-                    names=tuple(ARM_JOINTS),
-                    position=np.array(joints),
-                    velocity=np.zeros(0),
-                    effort=np.zeros(0),
+                sample = at_positions(
+                    stamp + round(part * SECOND), tuple(ARM_JOINTS), np.array(joints)
                 )
                 put("/c/joint_states", sample.to_cdr(), schema.JOINT_STATE, sample.stamp_ns)
             depth_m = cell_views.take(joints, cell_views.CellErrors(), seed=index, width_m=0.0)
@@ -78,11 +74,6 @@ def write_scan(path: Path, root: str, T_root_base: np.ndarray, *, with_joints: b
             )
             put("/c/cam/side/color/image", color.to_cdr(), schema.COMPRESSED_IMAGE, stamp)
             put("/c/cam/side/depth/image", depth.to_cdr(), schema.IMAGE, stamp)
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run")
 
 
 def test_in_the_robots_own_frame_its_links_are_collected(run: RunFolder) -> None:

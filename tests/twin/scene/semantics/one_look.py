@@ -8,14 +8,7 @@ def segment_points(
     points: SurfacePoints,
     config: SegmentConfig,
 ) -> Segmentation:
-    """Find the things that stand on the plane.
-
-    Args:
-        points: What was seen, in a frame whose z points up.
-
-    Raises:
-        NoSupportError: When there is no level plane to stand on, and nothing stands out.
-    """
+    """Find the things that stand on the plane."""
     ground = ground_of(points, config)
     look = ground.look(1.0)
     numbers = range(1, int(look.labels.max(initial=0)) + 1)

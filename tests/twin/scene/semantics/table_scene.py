@@ -1,7 +1,4 @@
-"""Things on a table made of primitives, ray-cast by Open3D: the truth for semantics.
-
-Every pixel knows its instance and its part, because each primitive is a body of its own.
-"""
+"""Things on a table made of primitives, ray-cast by Open3D: the truth for semantics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

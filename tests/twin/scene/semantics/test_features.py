@@ -49,24 +49,6 @@ def test_a_basis_of_the_true_rank_loses_nothing() -> None:
     np.testing.assert_allclose(back, maps[0].values.reshape(12, -1), atol=1e-4)
 
 
-@pytest.mark.parity
-def test_the_basis_is_that_of_a_singular_value_decomposition() -> None:
-    rng = np.random.default_rng(2)
-    values = rng.normal(size=(6, 10, 12)) * np.arange(1, 7)[:, None, None]
-    basis = fit_basis([FeatureMap(values=values.astype(np.float32), stride=1)], 2)
-    rows = values.reshape(6, -1).T
-    _, singular, axes = np.linalg.svd(rows - rows.mean(axis=0), full_matrices=False)
-    np.testing.assert_allclose(np.abs(basis.components @ axes[:2].T), np.eye(2), atol=1e-4)
-    explained = float((singular[:2] ** 2).sum() / (singular**2).sum())
-    assert basis.explained_fraction == pytest.approx(explained, abs=1e-4)
-
-
-def test_the_order_of_maps_does_not_change_the_basis() -> None:
-    maps = low_rank_maps()
-    first, second = fit_basis(maps, 3), fit_basis(maps[::-1], 3)
-    np.testing.assert_allclose(first.components, second.components, atol=1e-4)
-
-
 def test_the_file_holds_what_was_saved(tmp_path: Path) -> None:
     features = some_features()
     with np.load(save_features(tmp_path, features), allow_pickle=False) as stored:

@@ -6,18 +6,11 @@ import numpy as np
 import pytest
 from table_scene import World
 
-from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.task_file import load_task
 from twin.naming.things import SemanticScene
 from twin.naming.words import kind_of, label_of, names_of
-from twin.scene.gaussians import as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.language import MIN_SPLATS, NAMED, numbered, query
-
-
-def masks(labels: np.ndarray, **keys: tuple[int, ...]) -> dict[str, np.ndarray]:
-    return {key: np.isin(np.arange(len(labels)), ids) for key, ids in keys.items()}
 
 
 def test_a_known_object_takes_what_the_segmenter_joined_with_it_and_no_more() -> None:
@@ -128,26 +121,3 @@ def test_a_known_thing_without_a_table_is_named_all_the_same(tabletop: World) ->
 
 def test_a_container_has_its_parts_under_any_name(scene: SemanticScene) -> None:
     assert {"rim", "floor", "walls"} <= set(scene.instances[0].parts)
-
-
-def test_parts_are_told_apart_on_the_surface_and_carried_to_the_gaussians(
-    tabletop: World,
-) -> None:
-    """A basket as a coat of Gaussians 8 mm thick, and its thin surface beside it."""
-    model = load_task("five_ducks_into_basket").objects["basket"]
-    surface = object_mesh(model).vertices_m
-    surface = surface - [0, 0, surface[:, 2].min()]
-    rng = np.random.default_rng(0)
-    thick = surface + rng.normal(0.0, 0.004, surface.shape)
-    some = tabletop.cloud.take(np.zeros(len(thick), dtype=np.int64))
-    coat = replace(some, means_m=as_float32(thick))
-    scene = scene_by_default(
-        coat,
-        [],
-        Rasteriser(RasterConfig(threads=1)),
-        known={"basket": np.ones(len(thick), dtype=bool)},
-        surfaces_m={"basket": surface},
-    )
-    (item,) = scene.instances
-    assert {"rim", "walls"} <= set(item.parts)
-    assert thick[item.parts["rim"]][:, 2].mean() > thick[item.parts["walls"]][:, 2].mean() + 0.01

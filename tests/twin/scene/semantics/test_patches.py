@@ -50,7 +50,6 @@ POSTER = face([0.0015, 0.05, 0.15], [0, 0.2, 0], [0, 0, 0.15], BLUE)
 
 
 def share(labels: np.ndarray, mine: np.ndarray) -> float:
-    """IoU of the best label."""
     best = [((labels == k) & mine).sum() / ((labels == k) | mine).sum() for k in np.unique(labels)]
     return float(max(best[1:], default=0.0))
 

@@ -1,6 +1,6 @@
 """Ideal or noisy depth views of known shapes on a table, by ray casting (Open3D)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import open3d as o3d
@@ -11,7 +11,6 @@ from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.isosurface import isosurface
 from twin.scene.shape.known import pose_of
 
 CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
@@ -32,30 +31,6 @@ def cube_mesh() -> Mesh:
 
 def open_box_mesh() -> Mesh:
     return shape_mesh(TASK.objects["box"])
-
-
-def solid_mesh(
-    distance: Callable[[np.ndarray], np.ndarray],
-    low: Sequence[float],
-    high: Sequence[float],
-    step: float,
-) -> Mesh:
-    """Mesh of a signed distance function."""
-    axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    values = distance(points.reshape(-1, 3)).reshape(points.shape[:3])
-    return isosurface(values.astype(np.float32), np.array(low, dtype=np.float64), step)
-
-
-def figure_distance(p: np.ndarray) -> np.ndarray:
-    """A figure with a body, a head and a flat underside on z = 0: not convex."""
-    body = np.linalg.norm((p - [0, 0, 0.025]) / [0.035, 0.026, 0.030], axis=1) - 1
-    head = np.linalg.norm(p - [0.026, 0, 0.062], axis=1) - 0.017
-    return np.maximum(np.minimum(body * 0.026, head), -p[:, 2])
-
-
-def figure_mesh() -> Mesh:
-    return solid_mesh(figure_distance, (-0.045, -0.035, -0.005), (0.055, 0.035, 0.09), 0.001)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

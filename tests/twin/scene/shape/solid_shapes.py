@@ -11,7 +11,6 @@ from twin.scene.shape.sdf import SdfGrid, distances_of_solid, smoothed
 
 
 def shape_of(solid: np.ndarray, voxel_m: float) -> ObjectShape:
-    """A shape straight from voxels."""
     origin_m = np.array([0.1, 0.2, 0.3])
     values = smoothed(distances_of_solid(solid, voxel_m), voxel_m, 0.5)
     vertices, faces = isosurface(values, origin_m, voxel_m)

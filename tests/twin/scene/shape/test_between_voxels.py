@@ -13,10 +13,7 @@ BOX = VoxelBox(origin_m=np.zeros(3), voxel_m=VOXEL, counts=COUNTS)
 
 
 def wall(low: float, high: float, *, stretch: float = 1.0) -> tuple[np.ndarray, Evidence]:
-    """A plate across x between two places in voxels, measured from both sides.
-
-    ``stretch`` says by how much more than the distance a slanting ray measures.
-    """
+    """A plate across x between two places in voxels, measured from both sides."""
     x = np.arange(COUNTS[0], dtype=np.float64)
     distance = np.maximum(low - x, x - high)
     solid = np.zeros(COUNTS, dtype=bool)

@@ -34,23 +34,6 @@ def known_volume(key: str) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["cube", "box"])
-def test_objects_are_reconstructed_in_their_own_frame(
-    shapes: dict[str, ObjectShape | str], key: str
-) -> None:
-    shape = shapes[key]
-    assert isinstance(shape, ObjectShape), shape
-    assert shape.is_watertight
-    assert shape.volume_m3 == pytest.approx(known_volume(key), rel=0.1)
-    known = cast_views.shape_mesh(TASK.objects[key])
-    mean, _ = cast_views.mean_error_m((shape.vertices_m, shape.faces), known)
-    assert mean < 0.002
-    if key == "box":  # it is open
-        inside = np.array([0.0, 0.0, TASK.objects[key].size_m[2] / 2])
-        assert shape.sdf.distance(inside) > 0.01
-
-
-@pytest.mark.slow
 def test_an_object_whose_frame_leans_is_reconstructed_all_the_same(
     views: list[TrainingView],
 ) -> None:
