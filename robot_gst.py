@@ -49,96 +49,96 @@ CORE: tuple[Command, ...] = (
         START,
         "bridge.cli.episodes",
         """
-        doctor | doctor | Show what is installed, what is missing and how to get it. | --json
+        doctor | Show what is installed, what is missing and how to get it. | --json
         """,
     ),
     *commands_of(
         RECORD,
         "bridge.cli.recording",
         """
-        record | record | Record episodes live over zenoh. | runs/monday
-        ctl | ctl | Start, stop, mark or label from another terminal. | start --id trial_1
+        record | Record episodes live over zenoh. | runs/monday
+        ctl | Start, stop, mark or label from another terminal. | start --id trial_1
         """,
     ),
     *commands_of(
         RECORD,
         "bridge.cli.publish",
         """
-        publish folder | publish_folder | Play an RGB-D folder as a live camera. | DIR --episode scan
-        publish episode | publish_episode | Play an episode back with its own timing. | FILE --rate 2 --topics 'lab/**'
+        publish folder | Play an RGB-D folder as a live camera. | DIR --episode scan
+        publish episode | Play an episode back with its own timing. | FILE --rate 2
         """,
     ),
     *commands_of(
         RECORD,
         "bridge.cli.tasks",
         """
-        task check | check | Say what is wrong with task files, or what they ask for. | my_task.toml
-        task new | new | Write a task file to start from. | cube_onto_block
+        task check | Say what is wrong with task files, or what they ask for. | my_task.toml
+        task new | Write a task file to start from. | cube_onto_block
         """,
     ),
     *commands_of(
         RECORD,
         "twin.cli",
         """
-        robot check | robot_check | Joints, limits, frames, gripper; what is refused. | mine.toml
+        robot check | Joints, limits, frames, gripper; what is refused. | mine.toml
         """,
     ),
     *commands_of(
         REVIEW,
         "bridge.cli.episodes",
         """
-        info | info | Show what an episode holds. | runs/demo/episodes/scan.mcap
-        check | check | Verify an episode and list dropped messages. | runs/demo
-        recover | recover | Repair what a killed recorder left; report what is lost. | runs/demo
-        ls | ls | List the episodes of a run. | runs/demo --outcome failure
-        label | label | Set the outcome of a recorded episode. | runs/demo trial_1 --result failure
+        info | Show what an episode holds. | runs/demo/episodes/scan.mcap
+        check | Verify an episode and list dropped messages. | runs/demo
+        recover | Repair what a killed recorder left; report what is lost. | runs/demo
+        ls | List the episodes of a run. | runs/demo --outcome failure
+        label | Set the outcome of a recorded episode. | runs/demo trial_1 --result failure
         """,
     ),
     *commands_of(
         REVIEW,
         "dashboards.cli",
         """
-        dashboard | dashboard | Serve review pages on the loopback address. | runs/monday
-        view | view | Open an episode and its replays in Rerun's 3D viewer. | runs/monday
-        share | share | Write trials with their clips into one file to send. | runs/monday --trials trial_0003
+        dashboard | Serve review pages on the loopback address. | runs/monday
+        view | Open an episode and its replays in Rerun's 3D viewer. | runs/monday
+        share | Write trials with clips into one file to send. | runs/monday --trials trial_1
         """,
     ),
     *commands_of(
         REBUILD,
         "twin.cli",
         """
-        rebuild | rebuild | Fit a Gaussian-splat scene; render held-out views. | runs/monday --budget 60s
-        render | render | Render the rebuilt scene to PNG. | runs/monday
-        calibrate | calibrate | Calibrate cameras or physics from recorded episodes. | runs/monday --cameras
-        replay | replay | Replay every planned and executed trajectory in the twin. | runs/monday --workers 2
+        rebuild | Fit a Gaussian-splat scene; render held-out views. | runs/monday --budget 60s
+        render | Render the rebuilt scene to PNG. | runs/monday
+        calibrate | Calibrate cameras or physics from recorded episodes. | runs/monday --cameras
+        replay | Replay every planned and executed trajectory in the twin. | runs/monday --workers 2
         """,
     ),
     *commands_of(
         PLAN,
         "twin.cli",
         """
-        gate | gate | Judge plans over zenoh before the robot moves. | runs/monday
+        gate | Judge plans over zenoh before the robot moves. | runs/monday
         """,
     ),
     *commands_of(
         EVALUATE,
         "evaluator.cli",
         """
-        evaluate | evaluate | Compute success rates and agreement; write a report. | runs/monday
-        design | design | Size a study before its first trial, and lock its protocol. | runs/study --rate 0.5 --gain 0.3 --width 0.4
+        evaluate | Compute success rates and agreement; write a report. | runs/monday
+        design | Size a study, and lock its protocol. | runs/study --rate 0.5 --gain 0.3 --width 0.4
         """,
     ),
     *commands_of(
         EXCHANGE_USE,
         "bridge.cli.exchange",
         """
-        import rgbd | import_rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
-        import images | import_images | Posed images without depth: COLMAP, transforms.json. | DIR runs/x
-        import rosbag2 | import_rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
-        import trials | import_trials | A trials CSV, for evaluate. | trials.csv runs/x
-        export tum | export_tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
-        export rosbag2 | export_rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR
-        export csv | export_csv | Joints, poses, events ... as tidy CSV files. | runs/x DIR
+        import rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
+        import images | Posed images without depth: COLMAP, transforms.json. | DIR runs/x
+        import rosbag2 | A rosbag2 recording, byte for byte. | BAG runs/x
+        import trials | A trials CSV, for evaluate. | trials.csv runs/x
+        export tum | Cameras as folders of the TUM RGB-D layout. | EPISODE DIR
+        export rosbag2 | An episode as a rosbag2 folder. | EPISODE DIR
+        export csv | Joints, poses, events ... as tidy CSV files. | runs/x DIR
         """,
     ),
 )

@@ -42,11 +42,11 @@ class Leaf:
 
 
 def commands_of(use: str, module: str, table: str) -> tuple[Command, ...]:
-    """Read a table: name, function of the module, what it does, what may follow its name."""
+    """Read a table: a command, what it does, what may follow it; its function is named like it."""
     rows = [[cell.strip() for cell in line.split("|")] for line in table.strip().splitlines()]
     return tuple(
-        Command(name, f"{module}:{function}", text, example, use)
-        for name, function, text, example in rows
+        Command(name, f"{module}:{name.replace(' ', '_')}", text, example, use)
+        for name, text, example in rows
     )
 
 
@@ -60,7 +60,7 @@ LEAVES: dict[str, Leaf] = {
                 "Plan and gate",
                 "twin.plan.cli",
                 """
-                plan | plan | Plan from words, or for a cell that asks over zenoh. | runs/monday --task 'put the cube into the box' --dry
+                plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'
                 """,
             ),
         ),
@@ -104,15 +104,15 @@ LEAVES: dict[str, Leaf] = {
                 "Start here",
                 "dashboards.standin_cli",
                 """
-                demo | demo | Run the whole loop on the stand-in cell, in minutes. | runs/demo
-                trials | trials | Try policies without and with replanning on the same starts. | runs/study --trials 20
+                demo | Run the whole loop on the stand-in cell, in minutes. | runs/demo
+                trials | Try policies without and with replanning. | runs/study --trials 20
                 """,
             ),
             *commands_of(
                 "Record",
                 "bridge.sources.standin.cli",
                 """
-                publish standin | publish_standin | The stand-in cell: a simulated laboratory. | --trials 3 --seed 1
+                publish standin | The stand-in cell: a simulated laboratory. | --trials 3 --seed 1
                 """,
             ),
         ),
@@ -132,7 +132,7 @@ LEAVES: dict[str, Leaf] = {
                 "Record",
                 "bridge.sources.ur.cli",
                 """
-                publish ur | publish_ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
+                publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
                 """,
             ),
         ),
@@ -146,7 +146,7 @@ LEAVES: dict[str, Leaf] = {
                 "Record",
                 "bridge.sources.realsense.cli",
                 """
-                publish realsense | publish_realsense | RealSense cameras: colour, depth, calibration. | --cell lab --camera side=123622270224
+                publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224
                 """,
             ),
         ),
@@ -160,8 +160,8 @@ LEAVES: dict[str, Leaf] = {
                 "Exchange",
                 "bridge.exchange.lerobot.cli",
                 """
-                import lerobot | import_lerobot | A LeRobotDataset v3.0, one episode file each. | DIR runs/x --episodes 0-9
-                export lerobot | export_lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
+                import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
+                export lerobot | Trials as a LeRobotDataset v3.0. | runs/x DIR
                 """,
             ),
         ),

@@ -11,7 +11,7 @@ from bridge.terminal import Output
 OUTPUT = Output()
 
 
-def check(*files: str, output: Output = OUTPUT) -> int:
+def task_check(*files: str, output: Output = OUTPUT) -> int:
     """Say what is wrong with task files, or in words what they ask for.
 
     Example: robot-gst task check my_task.toml
@@ -46,7 +46,9 @@ def check(*files: str, output: Output = OUTPUT) -> int:
     return 0 if all(item["ok"] for item in found) else 2
 
 
-def new(name: str, /, *, like: str = "", folder: Path = Path(), output: Output = OUTPUT) -> int:
+def task_new(
+    name: str, /, *, like: str = "", folder: Path = Path(), output: Output = OUTPUT
+) -> int:
     """Write a complete task file with comments, to start from; never overwrites one.
 
     Example: robot-gst task new cube_onto_block
