@@ -1,9 +1,4 @@
-"""A planner on the wire: a cell asks how a task is done from here, a plan or a reason is answered.
-
-It remembers nothing between two requests: the same request has the same answer. What a model said
-is kept by what it was asked, so that this holds of policy ``model`` too. It moves nothing and
-publishes nothing; the cell that asks publishes the plan, asks the gate, and executes it or not.
-"""
+"""A planner on the wire: a cell asks how a task is done from here; it remembers nothing."""
 
 import traceback
 from collections.abc import Callable, Mapping
@@ -37,7 +32,7 @@ from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.robot.model import load_robot
 
 PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
-    name: partial(PlanProposer, policy) for name, policy in POLICIES.items()
+    policy: partial(PlanProposer, policy) for policy in POLICIES
 }
 GROUNDING = "gst localisation v1 of the request"
 MOST_CANDIDATES = 5
@@ -73,11 +68,7 @@ class LivePlanner:
         self._words = words if words is not None and words.model else None
 
     def answer(self, payload: bytes) -> PlanAnswer:
-        """Plan as asked, or say why not.
-
-        Raises:
-            InvalidRecordError: When the payload is no gst plan request; nothing else is an error.
-        """
+        """Plan as asked, or say why not."""
         request = PlanRequest.from_json(payload)
         try:
             return self._planned(request)
@@ -138,27 +129,14 @@ class LivePlanner:
     def _chosen_with_model(
         self, request: PlanRequest, problem: Problem, words: PlanConfig
     ) -> tuple[Candidate, Asked]:
-        """The same, and what the model said; without it where not even one plan keeps it."""
+        """The same, and what the model said; without it where not even a first plan keeps it."""
         asked = ask_about(self._run, problem, words, keep_refused=True)
-        try:
-            return self._chosen(request, asked.problem), asked
-        except NoPlanError as error:
-            why = None if asked.problem is problem else self._why_none(request, asked, error)
-            if why is None:
-                raise
-        return self._chosen(request, problem), asked.left_out(problem, why)
-
-    def _why_none(
-        self, request: PlanRequest, asked: Asked, error: NoPlanError
-    ) -> NoPlanError | None:
-        """Why what the model added leaves not even a first plan; None: it leaves one."""
-        if request.round == 0 and not request.refused:
-            return error
-        try:
-            self._chosen(replace(request, round=0, refused=()), asked.problem)
-        except NoPlanError as first:
-            return first
-        return None
+        if asked.problem is not problem:
+            try:
+                self._chosen(replace(request, round=0, refused=()), asked.problem)
+            except NoPlanError as error:
+                asked = asked.left_out(problem, error)
+        return self._chosen(request, asked.problem), asked
 
     def _problem(self, request: PlanRequest, task: Task) -> Problem:
         urdf = self._urdf()

@@ -106,8 +106,6 @@ class Release:
     """Least signed distance of the object's points to what stands still, allowed pairs left out."""
     cost: float
     """J of Eq. 7, and what ranks those with enough clearance."""
-    checked_against: tuple[str, ...] = ()
-    """What distances were asked, with each one's own error, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)

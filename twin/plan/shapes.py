@@ -1,11 +1,4 @@
-"""The surfaces of a task's objects, and all that the planner knows of one start.
-
-A rebuilt scene gives the surface it reconstructed, where it did; the task file stands in for the
-rest. Two things are corrected on the way. A reconstruction is laid where the scan saw the object,
-millimetres from where later localisations, which lay the task's shape onto the points, have it: for
-objects of a known shape its middle is put back. And no camera saw the underside: from its lower rim
-up the surface is trusted, which is as high as the depth of the table still reached into it.
-"""
+"""The surfaces of a task's objects, and all that the planner knows of one start."""
 
 import json
 from collections.abc import Mapping
@@ -46,11 +39,7 @@ def problem_of(
 
 
 def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
-    """The surface of every object of a task, in its own frame.
-
-    Args:
-        scene_dir: The rebuilt scene; None, or no such folder: there is none.
-    """
+    """The surface of every object of a task, in its own frame."""
     if scene_dir is None or not scene_dir.is_dir():
         return {
             key: _task_shape(model, "task file: there is no scene")

@@ -44,20 +44,13 @@ def refuse_unusable(problem: Problem) -> None:
                 f"{MOST_UNCERTAIN_M * 1e3:.0f} mm are good enough",
                 "Localise it again, nearer or with more frames.",
             )
-    for name in _handled(problem):
-        _refuse_far(problem, name)
-    for name in scene.task.manipulated:
-        _refuse_far_mark(problem, name)
+    _refuse_far(problem)
 
 
 def start_posture(
     episode: Episode, stamp_ns: int, joints: Sequence[str]
 ) -> tuple[Float[np.ndarray, " num_joints"] | None, str]:
-    """Where the arm was recorded to stand at the start [rad], or why nobody knows.
-
-    Returns:
-        None with the reason in words, or the joints and nothing.
-    """
+    """Where the arm was recorded to stand at the start [rad], or why nobody knows."""
     found = recorded_start(episode, stamp_ns, joints)
     if found is not None:
         return found, ""
@@ -112,27 +105,21 @@ def _refuse_posture(problem: Problem) -> None:
         )
 
 
-def _handled(problem: Problem) -> list[str]:
-    """What is moved, and what it is put into or onto."""
-    task = problem.scene.task
+def _refuse_far(problem: Problem) -> None:
+    """Refuse what is moved, what it is put into or onto, and marks, where the arm cannot be."""
+    scene, task = problem.scene, problem.scene.task
     goals = (task.goal_of(key) for key in task.manipulated)
     targets = [goal[1] for goal in goals if goal is not None and goal[1] != TABLE]
-    return list(dict.fromkeys([*task.manipulated, *targets]))
-
-
-def _refuse_far(problem: Problem, name: str) -> None:
-    T = problem.scene.Ts_base_object.get(name)
-    if T is not None:
-        _refuse_far_place(problem, name, name, T[:3, 3], f"Move it nearer. {_AGAIN}")
-
-
-def _refuse_far_mark(problem: Problem, name: str) -> None:
-    task = problem.scene.task
-    mark = task.mark_of(name)
-    if mark is not None:
-        p = np.array([*mark, problem.scene.table_height_m])
-        hint = f"Give task {task.name} another target_m."
-        _refuse_far_place(problem, f"the mark of {name}", name, p, hint)
+    for name in dict.fromkeys([*task.manipulated, *targets]):
+        T = scene.Ts_base_object.get(name)
+        if T is not None:
+            _refuse_far_place(problem, name, name, T[:3, 3], f"Move it nearer. {_AGAIN}")
+    for name in task.manipulated:
+        mark = task.mark_of(name)
+        if mark is not None:
+            p = np.array([*mark, scene.table_height_m])
+            hint = f"Give task {task.name} another target_m."
+            _refuse_far_place(problem, f"the mark of {name}", name, p, hint)
 
 
 def _refuse_far_place(

@@ -1,6 +1,6 @@
-"""Lets the tests of the planner use the scenes of the replay's tests."""
+"""Lets the tests of the planner use their own start, and the scenes of the replay's tests."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "replay"))
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "replay")]

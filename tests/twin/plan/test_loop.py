@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scripted_plans import pick_and_place, scene_of_test
+from planned_start import problem_of_test
+from scripted_plans import pick_and_place
 
 from bridge.geometry import se3
 from bridge.task.plan import Plan
@@ -14,12 +15,9 @@ from twin.plan.loop.nominal import PlanProposer
 from twin.plan.loop.propose import Candidate, choose, plan_and_verify
 from twin.plan.loop.steer import Steer, tried_in
 from twin.plan.problem import Problem
-from twin.plan.shapes import shapes_of
 from twin.replay.scene import ReplayScene
-from twin.robot.model import load_robot
 
 YES = Factor(value=True)
-HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 
 
 class Listed:
@@ -45,12 +43,7 @@ class Listed:
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    scene = scene_of_test()
-    return Problem(
-        scene=replace(scene, start_rad=HOME),
-        robot=load_robot(scene.urdf),
-        shapes=shapes_of(None, scene.task),
-    )
+    return problem_of_test()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scripted_plans import scene_of_test
+from planned_start import HOME, problem_of_test
 
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
@@ -18,32 +18,20 @@ from twin.plan.loop.places import places_on_table
 from twin.plan.loop.propose import NoPlanError, choose
 from twin.plan.loop.steer import tried_in
 from twin.plan.problem import Problem, State
-from twin.plan.shapes import shapes_of
 from twin.replay.config import ReplayConfig
 from twin.replay.scene import ReplayScene
 from twin.replay.verdict import replay_plan
-from twin.robot.model import load_robot
-
-HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
-
-
-def problem_in(scene: ReplayScene) -> Problem:
-    return Problem(
-        scene=replace(scene, start_rad=HOME),
-        robot=load_robot(scene.urdf),
-        shapes=shapes_of(None, scene.task),
-    )
 
 
 def drawn(task_name: str, seed: int) -> Problem:
     task = load_task(task_name)
     Ts = task.draw_start(np.random.default_rng(seed))
-    return problem_in(ReplayScene(task=task, Ts_base_object=Ts, urdf=ROBOT.urdf_text()))
+    return problem_of_test(ReplayScene(task=task, Ts_base_object=Ts, urdf=ROBOT.urdf_text()))
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return problem_in(scene_of_test())
+    return problem_of_test()
 
 
 def chosen(problem: Problem, round_: int, refused: tuple[Refusal, ...] = ()) -> Plan:

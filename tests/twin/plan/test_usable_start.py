@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_scene import write_scan
-from scripted_plans import scene_of_test
+from planned_start import HOME, problem_of_test
 
 from bridge.episode.cdr.messages import JointSample
 from bridge.episode.metadata import EpisodeInfo
@@ -25,10 +25,8 @@ from twin.plan.loop.propose import NoPlanError
 from twin.plan.problem import Problem
 from twin.plan.shapes import shapes_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable, start_posture
-from twin.robot.model import load_robot
 from twin.scene.store.folder import NEEDED, SCENE_FILE, SCENE_VERSION
 
-HOME = np.array([-0.263, -1.709, 1.365, -1.227, -1.571, 1.308])
 SURE = np.eye(6) * 1e-6
 S = 1_000_000_000
 Change = Callable[[Problem], Problem]
@@ -68,12 +66,7 @@ def sized(name: str, x_m: float, y_m: float, z_m: float) -> Change:
 
 @pytest.fixture
 def problem() -> Problem:
-    scene = scene_of_test()
-    return Problem(
-        scene=replace(scene, start_rad=HOME),
-        robot=load_robot(scene.urdf),
-        shapes=shapes_of(None, scene.task),
-    )
+    return problem_of_test()
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,4 @@
-"""The open hand on its straight way to a grasp: convex pieces in the tool's frame.
-
-Each piece is swept back along the approach, which keeps it convex: whatever is outside all swept
-pieces is not touched on the way. The last piece of the way counts like the first.
-"""
+"""The open hand on its straight way to a grasp: convex pieces in the tool's frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,9 +1,4 @@
-"""All grasps of one object that the hand can reach, the surest first, and why others are none.
-
-Antipodal pairs of the surface, hands on them from several directions, the open hand's straight way
-past table, object and neighbours, the arm on every branch of its inverse kinematics; then by how
-many standard deviations of the localised pose each bears. What is rejected counts under a cause.
-"""
+"""All grasps of one object that the hand can reach, the surest first, and why others are none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,13 +1,7 @@
-"""The planner: grasps by margin, final states of each, collision-free timed ways between them.
-
-Objects are moved in the task's order, each from where those before it have left the arm, with what
-was placed before lying where it is predicted to. The order of candidates does not depend on how
-many are asked for: the surest grasps with their cheapest final state first, then the next final
-states. What a refusal asks to change is left out, or tried first.
-"""
+"""The planner: grasps by margin, final states of each, collision-free timed ways between them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from math import erfc, sqrt
 from typing import Any
@@ -27,7 +21,7 @@ from twin.plan.constrain.constraint import (
     worst_along,
 )
 from twin.plan.constrain.kinds import compile_constraint
-from twin.plan.grasp.search import GraspConfig, GraspSearcher, NoGraspError, turned
+from twin.plan.grasp.search import GraspSearcher, NoGraspError, turned
 from twin.plan.loop.places import lying_there, places_on_table
 from twin.plan.loop.propose import Candidate, NoPlanError, refuse_lost
 from twin.plan.loop.push import push_choices, pushed
@@ -78,7 +72,7 @@ class Way:
     more_seed: int = 0
 
 
-_WAYS = (
+_WAYS: tuple[Way, ...] = (
     Way(),
     Way(straight=True),
     Way(lift_m=0.10, more_seed=1),
@@ -88,22 +82,9 @@ _WAYS = (
 """In which order ways are tried where the first does not keep what holds on the way."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Policy:
-    """What is optimised, under the name that plans carry."""
-
-    name: str
-    grasp: GraspConfig = field(default_factory=GraspConfig)
-    release: ReleaseConfig = field(default_factory=ReleaseConfig)
-    path: PathConfig = field(default_factory=PathConfig)
-    grasps: int = GRASPS
-    ways: tuple[Way, ...] = _WAYS
-
-
-NOMINAL = Policy(name="nominal")
-MODEL = replace(NOMINAL, name=MODEL_POLICY)
-"""As nominal, of a problem to whose stages a model added constraints."""
-POLICIES = {policy.name: policy for policy in (NOMINAL, MODEL)}
+NOMINAL = "nominal"
+POLICIES = (NOMINAL, MODEL_POLICY)
+"""Planned alike; the second of a problem to whose stages a model added constraints."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +109,7 @@ class Transfer:
 class PlanProposer:
     """Offers plans of one policy; see ``Proposer``."""
 
-    def __init__(self, policy: Policy = NOMINAL) -> None:
+    def __init__(self, policy: str = NOMINAL) -> None:
         """Remember what is optimised."""
         self._policy = policy
 
@@ -141,7 +122,7 @@ class PlanProposer:
         refuse_without_stages(task)
         if any(table.get("push") for table in task.stages):
             return self._pushed(problem, plan_id, count)
-        search = _Search(problem, self._policy, seed, steer)
+        search = _Search(problem, seed, steer)
         found: list[Candidate] = []
         for transfers in search.sequences():
             try:
@@ -178,8 +159,8 @@ class PlanProposer:
 class _Search:
     """Ways to move all objects, the best first."""
 
-    def __init__(self, problem: Problem, policy: Policy, seed: int, steer: Steer | None) -> None:
-        self._problem, self._policy, self._seed, self._steer = problem, policy, seed, steer
+    def __init__(self, problem: Problem, seed: int, steer: Steer | None) -> None:
+        self._problem, self._seed, self._steer = problem, seed, steer
         self._known: dict[tuple[int, ...], tuple[Iterator[Transfer], list[Transfer]]] = {}
         """By what was moved before: transfers of the next object as they are asked for."""
         self.why = "no candidate is left that was not refused"
@@ -214,7 +195,7 @@ class _Search:
         start = problem.scene.start_rad
         start_rad = problem.robot.home_rad if start is None else start
         try:
-            options = _Options(problem, key, self._policy, self._seed, self._mine(key))
+            options = _Options(problem, key, self._seed, self._mine(key))
             pairs = options.pairs()
             found = False
             for tried, (grasp, release) in enumerate(pairs):
@@ -249,11 +230,10 @@ class _Search:
     ) -> Transfer:
         """The first way that keeps what holds on the way."""
         kept = _kept_on_the_way(problem, grasp)
-        ways = self._policy.ways
-        base = self._policy.path
+        ways, base = _WAYS, PathConfig()
         steer = self._mine(grasp.object_id)
         if steer is not None and steer.change == "path":
-            ways = ways[2:] or ways
+            ways = ways[2:]
             eps_m = base.replay.eps_col_m + WIDER_M
             base = replace(base, replay=replace(base.replay, eps_col_m=eps_m))
             base = replace(base, seed=len(steer.refused))
@@ -319,18 +299,14 @@ def _after(problem: Problem, moved: Transfer) -> Problem:
 
 
 class _Options:
-    """Grasps of one object with their final states, as the policy and a refusal want them."""
+    """Grasps of one object with their final states, as a refusal wants them."""
 
-    def __init__(
-        self, problem: Problem, key: str, policy: Policy, seed: int, steer: Steer | None
-    ) -> None:
-        self._problem, self._key, self._policy = problem, key, policy
-        self._seed, self._steer = seed, steer
-        searcher = GraspSearcher(problem, policy.grasp)
-        found = searcher.search(key)
+    def __init__(self, problem: Problem, key: str, seed: int, steer: Steer | None) -> None:
+        self._problem, self._key, self._seed, self._steer = problem, key, seed, steer
+        found = GraspSearcher(problem).search(key)
         self._remarks = found.remarks
         kept = _kept_at_the_grasp(problem, found.grasps)
-        self.grasps = self._ordered(kept)[: policy.grasps]
+        self.grasps = self._ordered(kept)[:GRASPS]
         self.num_grasps = len(found.grasps)
         records = goals_of(problem.scene.task, key)
         self._relation = problem.scene.task.goal_of(key)
@@ -383,7 +359,7 @@ class _Options:
     def pairs(self) -> Iterator[tuple[Grasp, Release]]:
         """Every grasp with its cheapest final state, then every grasp with the next, and so on."""
         states: dict[int, tuple[Release, ...]] = {}
-        for rank in range(self._policy.release.max_releases):
+        for rank in range(ReleaseConfig().max_releases):
             for number, grasp in enumerate(self.grasps):
                 if any(grasp is each for each in self._given_up):
                     continue
@@ -410,15 +386,13 @@ class _Options:
         return releases
 
     def _final_states(self, grasp: Grasp) -> tuple[Release, ...]:
-        problem, config = self._problem, self._policy.release
+        problem = self._problem
         relation = self._relation
         placed = relation is None or (relation[0] in _PLACED and relation[1] != TABLE)
         near = None
         if not placed or (relation is None and problem.scene.task.mark_of(self._key) is None):
             near = places_on_table(problem, self._key, self._goals, seed=self._seed)
-        return final_states(
-            problem, grasp, constraints=self._goals, near=near, config=config, seed=self._seed
-        )
+        return final_states(problem, grasp, constraints=self._goals, near=near, seed=self._seed)
 
     def remarks_of(self, grasp: Grasp, release: Release, legs: tuple[Leg, ...]) -> tuple[str, ...]:
         """Where the numbers of a transfer come from, in words."""
@@ -429,8 +403,7 @@ class _Options:
             f"{self._key}: grasp of {self.num_grasps}, {grasp.width_m * 1e3:.0f} mm wide, bears "
             f"{grasp.margin:.1f} standard deviations",
             *(f"{self._key}: {text}" for text in self._remarks),
-            f"{self._key}: final state of J {release.cost:.4f}{nearest}; asked were "
-            + "; ".join(release.checked_against),
+            f"{self._key}: final state of J {release.cost:.4f}{nearest}",
             f"{self._key}: {postures:.0f} postures looked at on the way",
         )
 
@@ -519,7 +492,7 @@ def _states_along(problem: Problem, grasp: Grasp, leg: Leg) -> State:
 
 
 def _plan_of(
-    problem: Problem, transfers: list[Transfer], policy: Policy, plan_id: str, seed: int
+    problem: Problem, transfers: list[Transfer], policy: str, plan_id: str, seed: int
 ) -> tuple[Plan, tuple[str, ...]]:
     """Write transfers as a plan; at the end the arm goes back to where it stood."""
     task = problem.scene.task
@@ -534,7 +507,7 @@ def _plan_of(
     start = problem.scene.start_rad
     home_rad = problem.robot.home_rad if start is None else start
     open_m = transfers[-1].grasp.open_m
-    config = replace(policy.path, seed=seed % 2**31)
+    config = PathConfig(seed=seed % 2**31)
     try:
         home = plan_move(last, transfers[-1].end_rad, home_rad[None], config, width_m=open_m)
     except NoPathError as error:
@@ -548,7 +521,7 @@ def _plan_of(
 
 def _written(
     problem: Problem,
-    policy: Policy,
+    policy: str,
     plan_id: str,
     tau: tuple[Waypoint, ...],
     bounds: Bounds,
@@ -559,7 +532,7 @@ def _written(
     return Plan(
         id=plan_id,
         planner=PLANNER,
-        policy=policy.name,
+        policy=policy,
         condition="without_replanning",
         robot=record.name,
         frame=record.base_frame,

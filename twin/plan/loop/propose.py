@@ -34,13 +34,7 @@ class Proposer(Protocol):
     def propose(
         self, problem: Problem, *, plan_id: str, seed: int, count: int, steer: Steer | None
     ) -> list[Candidate]:
-        """Offer plans, the best first; the same arguments give the same plans.
-
-        Asked for fewer, it offers the first of them.
-
-        Args:
-            plan_id: Name of the plans; whoever publishes one gives it its own.
-        """
+        """Offer plans, the best first; the same arguments give the same plans."""
 
 
 def refuse_lost(scene: ReplayScene) -> None:
@@ -64,12 +58,7 @@ def choose(
     refused: Sequence[Refusal],
     most: int,
 ) -> Candidate:
-    """Return the candidate of a round: by rank, or steered by what was refused.
-
-    Args:
-        seed: Of the start; rounds that are steered draw from their own.
-        most: Candidates that are asked for at once where the first was refused before.
-    """
+    """Return the candidate of a round: by rank, or steered by what was refused."""
     if not refused:
         ranked = proposer.propose(problem, plan_id=plan_id, seed=seed, count=round_ + 1, steer=None)
         if round_ >= len(ranked):
@@ -150,10 +139,6 @@ def plan_and_verify(
 
     Ends at the first yes, at the first verdict that is neither yes nor no, when no candidate is
     left, or after so many rounds.
-
-    Args:
-        task_sha256: Of the task file; empty: not known.
-        grounding_source: Who said what is to be kept; empty: the task file alone.
     """
     attempts: list[Attempt] = []
     refused: list[Refusal] = []

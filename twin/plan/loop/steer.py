@@ -82,12 +82,7 @@ def alike(T_first: Float[np.ndarray, "4 4"], T_second: Float[np.ndarray, "4 4"])
 
 
 def steer_by(refusals: Sequence[Refusal], task: Task, fingers: Collection[str]) -> Steer:
-    """Let the first failing clause of the newest refusal choose what changes.
-
-    Args:
-        refusals: Refused plans with their verdicts, oldest first; at least one.
-        fingers: Names by which failures call the hand: the gripper's and those of its links.
-    """
+    """Let the first failing clause of the newest refusal choose what changes."""
     verdict = refusals[-1].verdict
     name = verdict.first_failing
     factor = Factor(value=None) if name is None else verdict.factors()[name]

@@ -35,12 +35,7 @@ class Trajectory:
     def add_transfer(
         self, legs: Sequence[Leg], grasp: Grasp, stages: Mapping[str, str], closed_m: float
     ) -> None:
-        """Append a pick and place.
-
-        Args:
-            stages: Ids of the stages that grasp, carry and release; the last may cover the carry.
-            closed_m: Commanded width while it holds; the force of the gripper limits how hard.
-        """
+        """Append a pick and place."""
         pick, place = stages["grasp"], stages["release"]
         of = {"around": pick, "approach": pick, "lift": pick, "carry": stages.get("carry", place)}
         for leg in legs:
@@ -96,7 +91,12 @@ def stages_of(task: Task, key: str) -> dict[str, str]:
 
 
 def refuse_without_stages(task: Task) -> None:
-    """Refuse a task that moves something without saying in which stages, or takes it by a part."""
+    """Refuse a task without the stages that are needed, or that asks what no plan keeps."""
+    if any(spec["kind"] == "between" for spec in task.success):
+        raise NoPlanError(
+            f"task {task.name} wants something between others, and the planner knows no such goal. "
+            "Ask for it beside one of them."
+        )
     for table in task.stages:
         if "part" in table:
             raise NoPlanError(

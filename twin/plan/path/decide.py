@@ -1,9 +1,4 @@
-"""The last word on a movement: the monitor's exact clearance.
-
-What is asked is the movement as it will be followed, straight in joints between its knots. The
-monitor looks at as many postures in between as its bound wants; links are asked against each other
-at every knot. What they refuse comes back as pairs of bodies, for the search to keep farther apart.
-"""
+"""The last word on a movement: the monitor's exact clearance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

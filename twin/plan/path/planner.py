@@ -1,10 +1,4 @@
-"""Plan one movement: around what is in the way, made short, timed, and checked exactly.
-
-The search (RRT-Connect and shortcuts, native) knows spheres and hulls and misses nothing between
-two postures; what it finds is timed, and the exact clearance decides. What that refuses is searched
-again with the refused pair kept farther apart. Everything follows from the seed; work is counted,
-never timed.
-"""
+"""Plan one movement: around what is in the way, made short, timed, and checked exactly."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -74,11 +68,7 @@ class NoPathError(TwinError):
     def __init__(
         self, *, reason: str, bodies: tuple[str, ...] = (), detail: str = "", work: int = 0
     ) -> None:
-        """Remember what is in the way.
-
-        Args:
-            reason: One of ``REASONS``, unreachable, branch, refused, or not a posture.
-        """
+        """Remember what is in the way."""
         self.reason, self.bodies, self.detail, self.work = reason, bodies, detail, work
         self.leg = ""
         """Which movement of several it was; whoever plans several says so."""
@@ -149,11 +139,7 @@ def plan_move(
     carried: Carried | None = None,
     allowed: Allowed = frozenset(),
 ) -> Movement:
-    """Find a collision-free, short, timed movement to one of some postures.
-
-    Args:
-        goals_rad: Where it may end; the nearest on the way is taken.
-    """
+    """Find a collision-free, short, timed movement to one of some postures."""
     check_numbers(start_rad, goals_rad)
     asked = _Asked(
         problem=problem, config=config, width_m=width_m, carried=carried, allowed=allowed
@@ -241,11 +227,7 @@ def timed_path(
     *,
     tool_m_s: float | None = None,
 ) -> TimedPath:
-    """Give a path of straight lines its times: corners rounded where that is free.
-
-    What is handed out is followed straight between its own knots, so it is that which is looked at
-    again; where a chord is not free the corners stay sharp and the arm stops at them.
-    """
+    """Give a path of straight lines its times: corners rounded where that is free."""
     speed, acceleration, limit_m_s = limits_of(world.robot, config)
     wanted = [value for value in (limit_m_s, tool_m_s) if value]
     rows = np.ascontiguousarray(knots_rad, dtype=np.float64)
@@ -358,11 +340,7 @@ def reversed_path(path: TimedPath) -> TimedPath:
 def waypoints_of(
     robot: RobotModel, path: TimedPath, *, g: int, width_m: float, begin_s: float = 0.0
 ) -> tuple[Waypoint, ...]:
-    """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints.
-
-    Args:
-        g: Gripper all the way: 1 closed, 0 open.
-    """
+    """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints."""
     found = []
     for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True):
         q, p = se3.split(robot.T_base_tcp(joints))

@@ -1,9 +1,4 @@
-"""Spheres that together hold a convex piece: what the path search asks before it asks hulls.
-
-A piece is cut in two by a plane across its longest axis, and the part whose sphere wastes most is
-cut again, until there are as many as wanted. Each part is convex, so a sphere around its corners
-holds all of it, and the spheres hold the piece: no distance that they give is too large.
-"""
+"""Spheres that together hold a convex piece: what the path search asks before it asks hulls."""
 
 import heapq
 from functools import lru_cache
@@ -40,11 +35,7 @@ def enclosing_sphere(
 def covering_spheres(
     corners_m: Float[np.ndarray, "num_points 3"], count: int = SPHERES
 ) -> Float[np.ndarray, "num_spheres 4"]:
-    """Cover the convex hull of points by spheres.
-
-    Returns:
-        Centre and radius of each [m].
-    """
+    """Cover the convex hull of points by spheres."""
     heap = [_part(corners_m, 0)]
     done: list[_Part] = []
     number = 1

@@ -1,9 +1,4 @@
-"""Pick and place as movements: around, straight down, straight up, around, straight down, away.
-
-Straight lines are planned from the contact outwards and followed the other way where the arm goes
-in: the branch of the inverse kinematics is then that of the grasp. Where nothing may touch, the
-search plans; it ends and begins a short way above each contact.
-"""
+"""Pick and place as movements: around, straight down, straight up, around, straight down, away."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,9 +1,4 @@
-"""The arm, what it carries and what stands around it, as the native search wants them.
-
-Hulls, pairs and limits are those of ``twin.replay.clearance``: what a path keeps here is what the
-monitor asks for there, and the planner's own are two pairs more, links against each other all the
-way, and what is carried against other objects.
-"""
+"""The arm, what it carries and what stands around it, as the native search wants them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,14 +1,4 @@
-"""Final states of a carried object: solved for, perturbed, checked, ranked.
-
-Around each way the object may come to rest the stage problem (Eq. 7) is solved: inside of the area
-with a margin for how sure its place is, level, at a small height, the object and the open hand
-clear of everything around. The cheapest answers are the nominal end-effector poses of Eq. 8 and 9,
-around which poses are drawn. All feasible ones are ranked by J; its regulariser is the deviation
-from the resting pose, which is the paper's heuristic of stability.
-
-A pair that the stage allows to touch does not count for the clearance and may come to 0; all
-others keep eps_col.
-"""
+"""Final states of a carried object: solved for, perturbed, checked, ranked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -288,7 +278,6 @@ class ReleaseSearch:
         Ts_object = Ts[chosen] @ self._T_tcp_object
         distances = self._obstacles.distances(self._points_m, Ts_object)
         counted = np.where(self._allowed > 0, np.inf, distances).min(axis=1, initial=np.inf)
-        about = (*self._obstacles.describe(), *(f"{n}: may be touched" for n in self._may_touch()))
         return tuple(
             Release(
                 object_id=self._grasp.object_id,
@@ -296,14 +285,9 @@ class ReleaseSearch:
                 T_base_tcp=Ts[index],
                 clearance_m=float(clearance),
                 cost=float(costs[index]),
-                checked_against=about,
             )
             for index, T_object, clearance in zip(chosen, Ts_object, counted, strict=True)
         )
-
-    def _may_touch(self) -> list[str]:
-        flags = zip(self._obstacles.names, self._allowed, strict=True)
-        return [name for name, allowed in flags if allowed]
 
     def _nothing(self, stage: StageProblem, nearest: StageCandidate) -> NoFinalStateError:
         """Say what was in the way where the least was."""

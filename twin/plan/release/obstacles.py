@@ -1,9 +1,4 @@
-"""What a carried object and the hand must stay away from, measured for many poses at once.
-
-Near receptacles their panels decide, which are right to a millimetre or two. The static grid of a
-rebuilt scene has voxels of about 10 mm: it is made thicker by its own error, half the diagonal of a
-voxel, and what has a name is taken out of it first.
-"""
+"""What a carried object and the hand must stay away from, measured for many poses at once."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -34,14 +29,8 @@ class Obstacle:
     name: str
     error_m: float
     """How far its surface may be off: distances are smaller by this."""
-    source: str
     boxes: tuple[PanelBox, ...] = ()
     grid: GridLookup | None = None
-
-    def describe(self) -> str:
-        """Name it with its source and its error."""
-        thicker = f", made thicker by {self.error_m * 1e3:.1f} mm" if self.error_m else ""
-        return f"{self.name}: {self.source}{thicker}"
 
 
 class Obstacles:
@@ -56,10 +45,6 @@ class Obstacles:
         self._first = np.cumsum([0, *num_boxes])
         self._owner = np.repeat(np.arange(len(self.all)), num_boxes)
         self._error_m = np.array([obstacle.error_m for obstacle in self.all])
-
-    def describe(self) -> tuple[str, ...]:
-        """Say of each what its distances are made of, with its error."""
-        return tuple(obstacle.describe() for obstacle in self.all)
 
     def distances(
         self,
@@ -107,9 +92,7 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
         boxes = tuple(placed_panels(problem.model(name), T))
         if name in stationary:
             panels += boxes
-        what = "panels" if name in stationary else "its box"
-        source = f"{what} of the task file's size"
-        found.append(Obstacle(name=name, error_m=0.0, source=source, boxes=boxes))
+        found.append(Obstacle(name=name, error_m=0.0, boxes=boxes))
     if scene.static_sdf is not None:
         foot = stationary_links(hulls)[1]
         grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
@@ -118,7 +101,6 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
                 Obstacle(
                     name=SCENE,
                     error_m=float(np.sqrt(3) / 2 * grid.voxel_m),
-                    source=f"static grid of {grid.voxel_m * 1e3:.1f} mm voxels",
                     grid=GridLookup(grid),
                 )
             )
@@ -129,7 +111,7 @@ def _table(height_m: float) -> Obstacle:
     T = np.eye(4)
     T[2, 3] = height_m - TABLE_SIDE_M / 2
     boxes = ((T, np.full(3, TABLE_SIDE_M)),)
-    return Obstacle(name=TABLE, error_m=0.0, source="its plane", boxes=boxes)
+    return Obstacle(name=TABLE, error_m=0.0, boxes=boxes)
 
 
 def allowed_with(
@@ -166,11 +148,7 @@ def _dense(corners_m: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num_poin
 def spread_points(
     points_m: Float[np.ndarray, "num 3"], num_points: int
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Choose points that are far from each other, each the farthest from those before it.
-
-    Args:
-        points_m: To choose from (Gonzalez 1985: at most twice as far as the best choice).
-    """
+    """Choose points that are far from each other, each the farthest from those before it."""
     centre = points_m.mean(axis=0)
     index = int(np.argmax(np.linalg.norm(points_m - centre, axis=1)))
     away = np.full(len(points_m), np.inf)

@@ -1,8 +1,4 @@
-"""Where an object would come to rest: the poses that final states are looked for around.
-
-An object keeps the way up it has now, or another one that its symmetry makes the same, and its
-sides are turned along those of what it is put into or onto.
-"""
+"""Where an object would come to rest: the poses that final states are looked for around."""
 
 from dataclasses import dataclass
 from itertools import permutations, product

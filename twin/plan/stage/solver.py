@@ -189,11 +189,7 @@ class _Ends:
 
 
 class _Descent:
-    """All starts on their way down.
-
-    A start first goes the short way to what the constraints allow; only from there does the
-    regulariser draw it. So starts that are far apart arrive far apart, and come together later.
-    """
+    """All starts on their way down."""
 
     def __init__(self, problem: StageProblem, zeta: Zeta) -> None:
         self.iterations = 0

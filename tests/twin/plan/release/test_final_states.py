@@ -143,14 +143,13 @@ def wall_behind(voxel_m: float) -> StaticSdf:
     )
 
 
-def test_the_static_grid_is_made_thicker_by_its_own_error_and_says_so() -> None:
+def test_the_static_grid_is_made_thicker_by_its_own_error() -> None:
     voxel_m = 0.0107
     problem = cube_problem(static_sdf=wall_behind(voxel_m))
     obstacles = obstacles_of(problem, hulls_of(problem.robot), {"cube"})
     assert obstacles.names == (TABLE, "box", SCENE)
     scene = obstacles.all[2]
     assert scene.error_m == pytest.approx(np.sqrt(3) / 2 * voxel_m)
-    assert "10.7 mm voxels, made thicker by 9.3 mm" in obstacles.describe()[2]
     T = upright(0.5, 0.25, 0.2)[None]
     point = np.zeros((1, 3))
     distance = obstacles.distances(point, T)[0, 2]
@@ -194,12 +193,6 @@ def test_a_cube_is_let_go_inside_of_the_box_and_touches_nothing(found: tuple[Rel
     best = found[0].T_base_object
     np.testing.assert_allclose(best[:2, 3], (0.5, 0.19), atol=1e-3)
     assert best[2, 3] == pytest.approx(0.006 + 0.02 + 0.004, abs=1e-3)
-
-
-def test_a_release_says_what_was_asked(found: tuple[Release, ...]) -> None:
-    asked = found[0].checked_against
-    assert "panels of the task file's size" in asked[1]
-    assert "box: may be touched" in asked
 
 
 def test_the_same_seed_gives_the_same_bytes(found: tuple[Release, ...]) -> None:
