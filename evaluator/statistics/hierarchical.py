@@ -168,11 +168,6 @@ class AgreementModel:
         """Whether groups share tasks, so that correlations within and between them differ."""
         return self.likelihood.in_tasks
 
-    @property
-    def counting(self) -> float:
-        """How many equally weighted nodes would carry as much (Kish's effective number)."""
-        return float(1 / (self.weights**2).sum())
-
     def _enough(self) -> int:
         """As many as take some seconds."""
         count = len(self.groups)

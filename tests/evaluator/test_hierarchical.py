@@ -93,7 +93,6 @@ def test_equal_counts_give_equal_numbers_and_another_seed_hardly_moves_them(
         (eight.bias_others, other.bias_others),
     ):
         assert abs(first.mean - second.mean) < 0.05 * first.sd
-    assert eight.counting > 500
 
 
 def test_sides_change_places(eight: AgreementModel) -> None:

@@ -195,7 +195,6 @@ PLACES = (
     {"kind": "outside", "obj": "cube", "container": "box"},
     {"kind": "beside", "obj": "cube", "reference": "box", "min_gap": 0.01, "max_gap": 0.02},
     {"kind": "beside", "obj": "cube", "reference": "box", "direction": "left"},
-    {"kind": "between", "obj": "cube", "first": "box", "second": "lid", "tol": 0.02},
     {"kind": "moved", "obj": "cube", "by": 0.1, "way": "left", "tol": 0.02},
     {"kind": "moved", "obj": "cube", "at_least": 0.1, "vector": [1.0, 0.0, 0.0]},
 )

@@ -45,7 +45,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
     return _KINDS[record["kind"]](record, problem)
 
 
-_ID_KEYS = ("obj", "container", "support", "reference", "against", "first", "second", "over")
+_ID_KEYS = ("obj", "container", "support", "reference", "against", "over")
 
 
 def _named(record: Record) -> Iterator[str]:

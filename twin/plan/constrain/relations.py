@@ -15,7 +15,6 @@ from bridge.task.check import TABLE
 from bridge.task.predicate import MOVED_TOLERANCE_M
 from bridge.task.relations import (
     BESIDE_GAP_M,
-    BETWEEN_TOLERANCE_M,
     ON_TOLERANCE_M,
     SECTOR_RAD,
     SIDES,
@@ -170,52 +169,6 @@ def _common_height(a: str, b: str, problem: Problem) -> Callable[[State], Array]
     return measure
 
 
-def _between(record: Record, problem: Problem) -> Constraint:
-    obj, first, second = (record[key] for key in ("obj", "first", "second"))
-
-    def line(state: State) -> tuple[Array, Array, Array]:
-        """Way between the two, its length, and the object's place from the first, from above."""
-        p, p_first, p_second = (
-            box_pose(state, name, problem)[:, :2, 3] for name in (obj, first, second)
-        )
-        way = p_second - p_first
-        length = norm(way)
-        return way / length[:, None], length, p - p_first
-
-    def reach(state: State, name: str, along: Array) -> Array:
-        """How far a box extends along a horizontal unit vector."""
-        T = box_pose(state, name, problem)
-        shares = (along[:, None] @ T[:, :2, :3])[:, 0]
-        return (abs(shares) * half_extents_m(problem.model(name))).sum(-1)
-
-    def before(state: State) -> Array:
-        along, _, offset = line(state)
-        at = (along * offset).sum(-1)
-        return at - reach(state, obj, along) - reach(state, first, along)
-
-    def after(state: State) -> Array:
-        along, length, offset = line(state)
-        at = (along * offset).sum(-1)
-        return length - at - reach(state, obj, along) - reach(state, second, along)
-
-    def aside(state: State) -> Array:
-        along, _, offset = line(state)
-        return norm((along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0])[:, None])
-
-    return Constraint.of(
-        record,
-        Term(what=f"the gap between {first} and {obj}", measure=before, low=0.0),
-        Term(what=f"the gap between {obj} and {second}", measure=after, low=0.0),
-        Term(
-            what=f"the middle of {obj} off the line between them",
-            measure=aside,
-            high=record.get("tol", BETWEEN_TOLERANCE_M),
-        ),
-        _level(obj, first, problem),
-        _level(obj, second, problem),
-    )
-
-
 def _upright(record: Record, problem: Problem) -> Constraint:
     obj = record["obj"]
     is_cube = problem.model(obj).symmetry == "cube"
@@ -284,12 +237,11 @@ RELATIONS: dict[str, Callable[[Record, Problem], Constraint]] = {
     "inside": _inside,
     "outside": _outside,
     "beside": _beside,
-    "between": _between,
     "upright": _upright,
     "moved": _moved,
 }
 
-PLACES = ("inside", "on", "outside", "beside", "between", "moved")
+PLACES = ("inside", "on", "outside", "beside", "moved")
 _KEYS = {
     "object": "obj",
     "margin_m": "margin",

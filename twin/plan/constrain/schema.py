@@ -233,7 +233,7 @@ class Repeated(dict[str, Any]):
 # What a schema cannot say of one constraint
 
 _ORDERED = (("min", "max"), ("min_gap", "max_gap"), ("at_least", "at_most"))
-_OTHERS = ("support", "container", "reference", "against", "first", "second")
+_OTHERS = ("support", "container", "reference", "against")
 
 
 def meaning_problems(record: Mapping[str, Any], where: Where) -> Problems:
@@ -253,8 +253,6 @@ def _alike(record: Mapping[str, Any], where: Where) -> Problems:
             yield (*where, key), f"{record['obj']} cannot be related to itself"
     if "obj" in record and record.get("region", {}).get("over") == record["obj"]:
         yield (*where, "region", "over"), f"{record['obj']} is always over itself"
-    if record["kind"] == "between" and record["first"] == record["second"]:
-        yield (*where, "second"), f"{record['second']} is named twice"
     if record["kind"] in ("distance", "above", "align") and record["a"] == record["b"]:
         yield (*where, "b"), "is the same as a"
     for key in ("a", "b"):

@@ -158,8 +158,6 @@ def _where(goals: Sequence[Mapping[str, Any]]) -> str:
                 told.append(f"out of {goal['container']}")
             case "beside":
                 told.append(f"next to {goal['reference']}{f' ({side.strip()})' if side else ''}")
-            case "between":
-                told.append(f"between {goal['first']} and {goal['second']}")
             case "upright":
                 told.append("upright")
             case "moved":

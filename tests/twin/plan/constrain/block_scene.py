@@ -183,11 +183,6 @@ EXAMPLES: dict[str, tuple[dict[str, Any], State, State]] = {
         BESIDE,
         state(cube=pose(0.45, -0.07, 0.02, 0.2)),
     ),
-    "between": (
-        {"kind": "between", "obj": "cube", "first": "brick", "second": "post"},
-        BETWEEN,
-        START,
-    ),
     "align": (
         {"kind": "align", "a": {"ee": "approach"}, "b": {"world": "-z"}, "max_deg": 10},
         START,

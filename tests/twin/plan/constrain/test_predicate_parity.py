@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block_scene import BESIDE, BETWEEN, IN_BOX, ON_BRICK, OUT, START, around, blocks, blocks_task
+from block_scene import BESIDE, IN_BOX, ON_BRICK, OUT, START, around, blocks, blocks_task
 
 from bridge.task.predicate import Rollout, evaluate_success
 from bridge.task.relations import RELATIONS, Box
@@ -41,10 +41,6 @@ PREDICATES: dict[str, tuple[dict[str, Any], State]] = {
             "gap_m": [0.005, 0.05],
         },
         BESIDE,
-    ),
-    "between": (
-        {"kind": "between", "object": "cube", "first": "brick", "second": "post"},
-        BETWEEN,
     ),
     "upright": ({"kind": "upright", "object": "brick"}, START),
     "upright cube": ({"kind": "upright", "object": "cube", "tolerance_rad": 0.3}, START),

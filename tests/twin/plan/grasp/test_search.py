@@ -312,24 +312,6 @@ def test_what_is_flat_on_the_table_cannot_be_taken() -> None:
     assert refusal(given, "cube").cause in ("table", "tilt")
 
 
-def test_what_can_be_held_only_deeper_than_the_hand_is_not_grasped(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A part 75 mm under the top: the palm meets the top first."""
-    monkeypatch.setattr("twin.plan.grasp.search.APPROACHES_RAD", (0.0,))
-    task = load_task("cube_into_box")
-    cube = replace(task.objects["cube"], size_m=(0.05, 0.05, 0.2))
-    given = problem(
-        replace(task, objects=task.objects | {"cube": cube}), {"cube": standing(0.48, 0.0, 0.1)}
-    )
-    low = np.array([[x, y, 0.0] for x in np.linspace(-0.02, 0.02, 5) for y in (-0.025, 0.025)])
-    config = replace(FEW, samples=400)
-    with pytest.raises(NoGraspError) as caught:
-        GraspSearcher(given, config).search("cube", low)
-    assert caught.value.cause == "palm"
-    assert "60 mm" in str(caught.value)
-
-
 def test_what_is_too_heavy_for_the_pads_is_not_grasped() -> None:
     assert refusal(cube_problem(mass_kg=3.0), "cube").cause == "weight"
 
