@@ -1,7 +1,9 @@
 """Starts of the stand-in cell as its cameras see them, in process: no recorder, no trial."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -9,11 +11,14 @@ from bridge.episode.streams import RgbdFrame
 from bridge.geometry.camera import Camera
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import draw_hidden, load_cell, nominal_hidden
+from bridge.sources.standin.cell_file import draw_hidden, load_cell
 from bridge.sources.standin.operator import STILL_S
 from bridge.sources.standin.scan import ScanConfig, joint_move, scan_joints
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from standin_hidden import nominal_hidden
 
 
 class _Nowhere:

@@ -1,15 +1,17 @@
 """Pick-and-place of soft toys in the twin's world and in MuJoCo, from the same scripted plan."""
 
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from bridge.robots.default import ROBOT
 from bridge.sources.standin.cell import HOME_SEED_RAD
-from bridge.sources.standin.cell_file import load_cell, nominal_hidden
+from bridge.sources.standin.cell_file import load_cell
 from bridge.sources.standin.kinematics import arm_kinematics, tool_down
 from bridge.sources.standin.planner import GraspError, plan_pick_and_place
 from bridge.sources.standin.world import World as MujocoWorld
@@ -29,6 +31,9 @@ LIFTED_M = 0.08
 GRIP_N = (6.0, 12.0)
 """What the toys' cell file draws the gripper from: a stronger one crushes the softest toys."""
 JOINT_SPEED_RAD_S = 1.6
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from standin_hidden import nominal_hidden  # noqa: E402
 
 
 @dataclass(frozen=True, kw_only=True)

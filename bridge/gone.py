@@ -21,10 +21,10 @@ GONE: dict[str, str] = {
         "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
         'open_episode(path, clock="corrected").'
     ),
-    "label --flag": "Flag trials for others in the dashboard, on the page label (key f).",
-    "label --unflag": "Flag trials for others in the dashboard, on the page label (key f).",
-    "ls --flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
-    "ls --no-flagged": "The dashboard's queue shows flagged trials (/queue?show=flagged).",
+    **dict.fromkeys(
+        ("label --flag", "label --unflag", "ls --flagged", "ls --no-flagged"),
+        "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them.",
+    ),
     "dashboard --console": "Use robot-gst ctl start and stop, and the dashboard's page label.",
     "prune": (
         "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
@@ -47,9 +47,7 @@ GONE: dict[str, str] = {
         ("record --split-mb", "record --split-s"),
         "Stop and start another episode; episodes of several parts are read as before.",
     ),
-    "record --triggers": (
-        "Record with --preroll-s 5; whoever sees what happened sends robot-gst ctl snapshot."
-    ),
+    "record --triggers": "Record with --preroll-s 5, and send robot-gst ctl snapshot.",
     **dict.fromkeys(
         ("publish episode --loop", "publish episode --paused", "publish episode --name"),
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
@@ -59,9 +57,7 @@ GONE: dict[str, str] = {
         "Free some space, or move the file to another disk: a copy is made beside it."
     ),
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
-    "import splats": (
-        "robot-gst rebuild makes scenes; scene/background.ply opens in any splat viewer."
-    ),
+    "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
     **dict.fromkeys(
         ("rebuild --align-poses", "rebuild --refine-poses", "rebuild --align-holdout"),
         "Poses stay as recorded; --poses odometry or robot-gst calibrate RUN --cameras finds them.",

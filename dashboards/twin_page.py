@@ -65,7 +65,7 @@ def build_twin(run: RunFolder, judgement: Judgement) -> TwinPage:
             views += _views(path, _scores(judgement, path.stem))
         except GstError as error:
             problems.append(str(error))
-    views.sort(key=_badness)
+    views.sort(key=lambda v: (v.psnr_db is None, v.psnr_db or 0.0, v.stamp_ns))
     numbers = [m for m in judgement.measurements if m.id.startswith("views.")]
     return TwinPage(
         files=tuple(path.name for path in paths),
@@ -126,10 +126,6 @@ def _scores(judgement: Judgement, stem: str) -> dict[tuple[Cell, Cell], dict[str
 
 def _number(value: Cell) -> float | None:
     return float(value) if isinstance(value, int | float) else None
-
-
-def _badness(view: HeldOutView) -> tuple[bool, float, int]:
-    return view.psnr_db is None, view.psnr_db or 0.0, view.stamp_ns
 
 
 def view_image(

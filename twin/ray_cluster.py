@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from bridge.episode import provenance
-from bridge.errors import GstError, MissingDependencyError, UsageError
+from bridge.errors import MissingDependencyError, UsageError
 from bridge.process_pool import (
     ATTEMPTS,
     Answer,
@@ -52,14 +52,6 @@ TOKEN_FILE = Path(".ray") / "auth_token"
 
 class RayClusterError(TwinError):
     """The cluster cannot be reached or used."""
-
-
-@runtime_checkable
-class NeedsPaths(Protocol):
-    """Work that reads and writes files by their path."""
-
-    def needed_paths(self) -> tuple[Path, ...]:
-        """What must be there."""
 
 
 class RayRunner:
@@ -259,8 +251,7 @@ def _out_of_place(item: Any, version: str) -> str | None:
             f"node {node} runs robot-gst {code_version()}, not {version} as here: install the same "
             "version on every node"
         )
-    paths = item.needed_paths() if isinstance(item, NeedsPaths) else ()
-    for path in paths:
+    for path in getattr(item, "needed_paths", tuple)():
         if not path.exists():
             return (
                 f"node {node} does not see {path}: every node reads and writes the run folder "
@@ -270,7 +261,5 @@ def _out_of_place(item: Any, version: str) -> str | None:
 
 
 def _first_line(error: BaseException) -> str:
-    if isinstance(error, GstError):
-        return str(error)
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return (lines[0] if lines else type(error).__name__).rstrip(".")

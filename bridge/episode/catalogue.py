@@ -35,10 +35,13 @@ _known: dict[Path, tuple[str, Entry]] = {}
 """What this process read of a file, and what the disk said of it then."""
 
 
+EVERYTHING = CatalogueQuery()
+
+
 def find_episodes(
-    run: RunFolder, query: CatalogueQuery, *, advance: Advance | None = None
+    run: RunFolder, query: CatalogueQuery = EVERYTHING, *, advance: Advance | None = None
 ) -> list[Entry]:
-    """Return the episodes that pass all filters."""
+    """Return the episodes that pass all filters; a broken one is listed with its error."""
     found = []
     episodes = run.episode_parts()
     for done, (name, parts) in enumerate(episodes.items(), start=1):
@@ -162,8 +165,6 @@ def _declared_lost(drops: dict[str, Any] | None) -> int | None:
     return sum(found) if len(found) == 3 else None
 
 
-EVERYTHING = CatalogueQuery()
-
 RUNS_DEEP = 3
 """How far below a folder its runs are looked for."""
 
@@ -194,11 +195,6 @@ def find_in_runs(
         key = query.sort_key
         found.sort(key=lambda pair: (*key(pair[1]), str(pair[0].path)), reverse=query.reverse)
     return found[: query.limit]
-
-
-def list_episodes(run: RunFolder) -> list[Entry]:
-    """Return an entry for every recorded episode; a broken one is listed with its error."""
-    return find_episodes(run, EVERYTHING)
 
 
 def assign_trial(

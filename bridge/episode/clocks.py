@@ -318,16 +318,12 @@ class StampCorrection:
                 return 0
             best = min((line for _, line in holding), key=lambda line: line.uncertainty_ns)
             return -round(best.offset_at(log_ns))
-        away = [_away_ns(line, log_ns) for _, line in known]
+        away = [max(line.start_ns - log_ns, log_ns - line.end_ns) for _, line in known]
         near = [line for (_, line), far in zip(known, away, strict=True) if far <= _next(away)]
         return min(
             (-round(line.offset_at(log_ns)) for line in near),
             key=lambda shift_ns: abs(log_ns - (publish_ns + shift_ns)),
         )
-
-
-def _away_ns(line: ClockLine, at_ns: int) -> int:
-    return max(line.start_ns - at_ns, at_ns - line.end_ns)
 
 
 def _next(away: Sequence[int]) -> int:

@@ -243,7 +243,10 @@ def _task_from(table: dict[str, Any]) -> Task:
         objects={key: _object_from(key, value) for key, value in table["objects"].items()},
         manipulated=tuple(table["manipulated"]),
         containers=tuple(table.get("containers", ())),
-        start={key: _start_from(value) for key, value in table["start"].items()},
+        start={
+            key: StartRange(**{name: _floats(values) for name, values in each.items()})
+            for key, each in table["start"].items()
+        },
         stages=tuple(table["stages"]),
         success=tuple(table["success"]),
         cell=table.get("cell", "standin"),
@@ -280,10 +283,6 @@ def _soft_from(table: dict[str, float] | None) -> SoftMaterial | None:
     if table is None:
         return None
     return SoftMaterial(**{key: float(value) for key, value in table.items()})
-
-
-def _start_from(table: dict[str, Any]) -> StartRange:
-    return StartRange(**{key: _floats(values) for key, values in table.items()})
 
 
 def _floats(values: Any) -> tuple[Any, ...]:

@@ -10,6 +10,7 @@ Definitions of types come with rosbags. A type may differ between ROS 2 releases
 says which definition a publisher was built with. Releases are searched newest first.
 """
 
+import re
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -137,7 +138,7 @@ TOKENS = "@ros2_lv/**"
 _PREFIX = "@ros2_lv"
 _NODE_PARTS, _TOPIC_PARTS = 9, 13
 _QOS_FIELDS = 3
-_MAX_DIGITS = 9
+_NUMBER = "[0-9]{0,9}"
 
 
 class EntityKind(Enum):
@@ -237,10 +238,6 @@ def parse_qos(text: str) -> RosQos | None:
         return None
     history, _, depth = fields[2].partition(",")
     numbers = [fields[0], fields[1], history, depth]
-    if any(each and not _is_number(each) for each in numbers):
+    if not all(re.fullmatch(_NUMBER, each) for each in numbers):
         return None
     return RosQos(fields[1] == "1", int(depth) if depth else DEFAULT_QOS.depth)
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -199,16 +199,15 @@ def _outdated(results: Results | None, comparison: Comparison | None) -> list[An
     """
     if results is None or comparison is None:
         return None
-    stored, now = (_from_trials(side) for side in (results, comparison))
+    stored, now = (
+        {m.id: m for m in side.measurements if m.id.startswith(FROM_TRIALS)}
+        for side in (results, comparison)
+    )
     for name in dict.fromkeys((*stored, *now)):
         if _counts(stored.get(name)) != _counts(now.get(name)):
             pair = (stored.get(name), now.get(name))
             return [None if side is None else plain_record(side) for side in pair]
     return None
-
-
-def _from_trials(side: Results | Comparison) -> Mapping[str, Measurement]:
-    return {m.id: m for m in side.measurements if m.id.startswith(FROM_TRIALS)}
 
 
 def _counts(measurement: Measurement | None) -> tuple[float | None, int | None, int | None]:

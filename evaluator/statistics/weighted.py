@@ -61,10 +61,6 @@ def _pearson(counts: Counts, recorded: Side, sim: Side) -> Values:
     return ratio(shared, first, second)
 
 
-def _spearman(counts: Counts, recorded: Side, sim: Side) -> Values:
-    return _pearson(counts, _ranks(counts, recorded), _ranks(counts, sim))
-
-
 def _ranks(counts: Counts, side: Side) -> Counts:
     """Average ranks in each set; a group that is there three times takes three ranks."""
     if side.ndim == 2:
@@ -125,7 +121,9 @@ def _weighted_mean(counts: Counts, values: Side) -> Values:
 
 STATISTICS: dict[str, Statistic] = {
     "pearson": _pearson,
-    "spearman": _spearman,
+    "spearman": lambda counts, recorded, sim: _pearson(
+        counts, _ranks(counts, recorded), _ranks(counts, sim)
+    ),
     "bias": lambda counts, recorded, sim: _weighted_mean(counts, sim - recorded),
     "mae": lambda counts, recorded, sim: _weighted_mean(counts, np.abs(sim - recorded)),
     "order": _order,

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import robot_gst
-from bridge.episode.catalogue import list_episodes
+from bridge.episode.catalogue import find_episodes
 from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
@@ -62,7 +62,7 @@ def test_a_clean_run_passes_the_check(run_path: Path) -> None:
 
 def test_a_broken_episode_is_listed_with_its_error(run_path: Path) -> None:
     (run_path / "episodes" / "bad.mcap").write_bytes(b"nothing")
-    entries = {entry.id: entry for entry in list_episodes(RunFolder.open(run_path))}
+    entries = {entry.id: entry for entry in find_episodes(RunFolder.open(run_path))}
     assert "not a finished MCAP file" in entries["bad"].error
     assert entries["t1"].error == ""
 
@@ -114,7 +114,7 @@ def test_a_label_given_later_wins_and_leaves_the_episode_untouched(run_path: Pat
     run = RunFolder.open(run_path)
     before = (run.episodes_dir / "t1.mcap").read_bytes()
     assert robot_gst.run(["label", str(run_path), "t1", "--result", "failure"]) == 0
-    assert list_episodes(run)[0].outcome == "failure"
+    assert find_episodes(run)[0].outcome == "failure"
     assert (run.episodes_dir / "t1.mcap").read_bytes() == before
 
 

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 import robot_gst
 from bridge.episode import schema, streams
-from bridge.episode.catalogue import list_episodes
+from bridge.episode.catalogue import find_episodes
 from bridge.episode.cdr.codec import MalformedMessageError
 from bridge.episode.cdr.messages import (
     FrameTransform,
@@ -74,7 +74,7 @@ def test_metadata_of_another_program_is_one_sentence(
     assert robot_gst.run(["info", str(path)]) == 1
     assert "cannot be read" in capsys.readouterr().err
     if name != "derived":
-        assert list_episodes(RunFolder.open(tmp_path / "run"))[0].error
+        assert find_episodes(RunFolder.open(tmp_path / "run"))[0].error
 
 
 @pytest.mark.parametrize(

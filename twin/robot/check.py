@@ -92,7 +92,8 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
         found.append(f"the URDF lacks the finger joints {', '.join(lost)}: no dynamic replay")
     if not record.gripper.fingers:
         found.append("a fixed tool: plans that grasp are refused")
-    bare = [link for link in record.gripper.finger_links if link not in _linked(hulls)]
+    linked = {hull.link for hull in hulls.hulls}
+    bare = [link for link in record.gripper.finger_links if link not in linked]
     if bare:
         found.append(f"{', '.join(bare)} have no collision shapes: they touch nothing")
     if record.acceleration_rad_s2 is None:
@@ -103,10 +104,6 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
     if hulls.self_distance().distance_m <= 0:
         found.append(f"links touch at home: {' and '.join(hulls.self_distance().links)}")
     return found
-
-
-def _linked(hulls: RobotHulls) -> set[str]:
-    return {hull.link for hull in hulls.hulls}
 
 
 def describe_robot(found: dict[str, Any]) -> str:

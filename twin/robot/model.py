@@ -153,7 +153,8 @@ def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:
     """Put a root above a description where its base is, so that every engine counts from there."""
     root = parse_description(urdf)
     children = {child.get("link") for child in root.findall("joint/child")}
-    old = next(link.get("name", "") for link in root if _is_root(link, children))
+    links = (link.get("name", "") for link in root if link.tag == "link")
+    old = next(name for name in links if name not in children)
     ET.SubElement(root, "link", name=_ROOT)
     joint = ET.SubElement(root, "joint", name=f"{_ROOT}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=_ROOT)
@@ -162,10 +163,6 @@ def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:
     texts = [repr(float(value)) for value in numbers]
     ET.SubElement(joint, "origin", xyz=" ".join(texts[:3]), rpy=" ".join(texts[3:]))
     return ET.tostring(root, encoding="unicode")
-
-
-def _is_root(element: ET.Element, children: set[str | None]) -> bool:
-    return element.tag == "link" and element.get("name") not in children
 
 
 _OTHER_ROBOT = "Another robot's file is named by --robot FILE.toml."

@@ -148,7 +148,8 @@ def frames_of(
 
 
 def _stamps(episode: EpisodeInScene, camera_id: str) -> np.ndarray:
-    recorded = np.array(_recorded_stamps(episode.recorded, camera_id), dtype=np.int64)
+    images = _recorded_images(episode.recorded, camera_id)
+    recorded = np.array([message.stamp_ns for message in images], dtype=np.int64)
     first_ns, last_ns = episode.recorded.start_ns, episode.recorded.end_ns
     if episode.postures is not None:
         first_ns, last_ns = (int(episode.postures.arm.stamps_ns[k]) for k in (0, -1))
@@ -157,10 +158,6 @@ def _stamps(episode: EpisodeInScene, camera_id: str) -> np.ndarray:
         message = f"camera {camera_id} recorded no image in episode {episode.recorded.info.id}."
         raise UsageError(message)
     return np.asarray(stamps)
-
-
-def _recorded_stamps(episode: Episode, camera_id: str) -> list[int]:
-    return [message.stamp_ns for message in _recorded_images(episode, camera_id)]
 
 
 def _recorded_images(episode: Episode, camera_id: str) -> Iterator[Any]:

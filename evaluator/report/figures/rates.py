@@ -110,7 +110,7 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
     if not drawn:
         return NotDrawn(id="scatter", reason="no group has both rates")
     series = list(dict.fromkeys((group.task, group.policy) for group in drawn))
-    legend_rows = _legend_rows(series)
+    legend_rows = min(len(series), MAX_GROUPS) + (len(series) > MAX_GROUPS)
     below = 0.55 + 0.17 * (legend_rows + 1)
     side = COLUMN_IN - 0.62
 
@@ -140,10 +140,6 @@ def scatter(groups: Sequence[RateGroup], word: str) -> Drawing | NotDrawn:
         height_in=below + side + 0.12,
         draw=draw,
     )
-
-
-def _legend_rows(series: Sequence[tuple[str, str]]) -> int:
-    return min(len(series), MAX_GROUPS) + (len(series) > MAX_GROUPS)
 
 
 def _point(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bridge.cli.episodes import label
-from bridge.episode.catalogue import list_episodes
+from bridge.episode.catalogue import find_episodes
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -31,7 +31,7 @@ def run_with(tmp_path: Path, info: EpisodeInfo, attached: str = "") -> tuple[Run
 def test_an_imported_episode_becomes_a_trial_of_a_task_from_a_start(tmp_path: Path) -> None:
     run, path = run_with(tmp_path, EpisodeInfo(id="bag", kind="imported"))
     before = path.read_bytes()
-    assert [(entry.kind, entry.outcome) for entry in list_episodes(run)] == [
+    assert [(entry.kind, entry.outcome) for entry in find_episodes(run)] == [
         ("imported", "unknown")
     ]
     arguments = {"task": "cube_into_box", "start": "s7", "policy": "act", "result": "success"}
@@ -43,7 +43,7 @@ def test_an_imported_episode_becomes_a_trial_of_a_task_from_a_start(tmp_path: Pa
         "s7",
         "act",
     )
-    (entry,) = list_episodes(run)
+    (entry,) = find_episodes(run)
     assert (entry.kind, entry.task, entry.outcome, entry.start_id) == (
         "trial", "cube_into_box", "success", "s7",
     )  # fmt: skip

@@ -13,7 +13,6 @@ from bridge.episode.catalogue import (
     Entry,
     find_episodes,
     label_episode,
-    list_episodes,
     read_entry,
 )
 from bridge.episode.catalogue_store import CatalogueQuery
@@ -87,14 +86,14 @@ def test_an_entry_says_what_the_episode_says(run: RunFolder) -> None:
         "tags": ("a", "b c"),
     }
     path = write(run, "t1", start_ns=5, messages=3, lost=2, outcome="success", **about)
-    (entry,) = list_episodes(run)
+    (entry,) = find_episodes(run)
     assert {name: getattr(entry, name) for name in about} == about
     assert (entry.file, entry.id, entry.outcome, entry.error) == ("t1.mcap", "t1", "success", "")
     assert (entry.start_ns, entry.duration_s, entry.messages) == (5, 2.0, 3)
     assert (entry.size_bytes, entry.parts, entry.lost) == (path.stat().st_size, 1, 2)
     assert not entry.recovered
     settle(run)
-    assert list_episodes(run) == list_episodes(run) == [entry]  # once read, once remembered
+    assert find_episodes(run) == find_episodes(run) == [entry]  # once read, once remembered
 
 
 def test_only_what_changed_is_opened_again(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,25 +101,25 @@ def test_only_what_changed_is_opened_again(run: RunFolder, monkeypatch: pytest.M
         write(run, name)
     settle(run)
     read = count_reads(monkeypatch)
-    list_episodes(run)
+    find_episodes(run)
     assert read == ["t1.mcap", "t2.mcap", "t3.mcap"]
     read.clear()
-    assert [entry.id for entry in list_episodes(run)] == ["t1", "t2", "t3"]
+    assert [entry.id for entry in find_episodes(run)] == ["t1", "t2", "t3"]
     assert read == []
     write(run, "t2", task="new")
     (run.episodes_dir / "t1.mcap").unlink()
-    assert [(entry.id, entry.task) for entry in list_episodes(run)] == [("t2", "new"), ("t3", "")]
+    assert [(entry.id, entry.task) for entry in find_episodes(run)] == [("t2", "new"), ("t3", "")]
     assert read == ["t2.mcap"]
 
 
 def test_a_label_given_later_changes_the_row_at_once(run: RunFolder) -> None:
     write(run, "t1", outcome="success")
     settle(run)
-    assert list_episodes(run)[0].outcome == "success"
+    assert find_episodes(run)[0].outcome == "success"
     sidecar = label_episode(run, "t1", Outcome(result="failure"))
-    assert list_episodes(run)[0].outcome == "failure"
+    assert find_episodes(run)[0].outcome == "failure"
     sidecar.unlink()
-    assert list_episodes(run)[0].outcome == "success"
+    assert find_episodes(run)[0].outcome == "success"
 
 
 def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder) -> None:
@@ -129,7 +128,7 @@ def test_an_episode_of_which_a_part_was_recovered_counts_as_lossy(run: RunFolder
         writer.describe(EpisodeInfo(id="t1", kind="trial"))
         writer.add_metadata("recovered", {"reason": '"killed"'})
     write(run, "t2", lost=0)
-    assert [entry.recovered for entry in list_episodes(run)] == [True, False]
+    assert [entry.recovered for entry in find_episodes(run)] == [True, False]
     assert ids(run, lost=True) == ["t1"]
 
 
@@ -150,7 +149,7 @@ def test_what_other_programs_wrote_is_listed(run: RunFolder) -> None:
     (run.episodes_dir / os.fsdecode(b"\xff.mcap")).write_bytes(b"")
     settle(run)
     for _ in range(2):
-        broken, one, two = list_episodes(run)
+        broken, one, two = find_episodes(run)
         assert one.error == ""
         assert one.tags == ("1", "\\ud800")
         assert (one.trial, one.start_ns, one.task) == (10**40, 2**64 - 1, "\0")

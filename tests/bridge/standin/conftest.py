@@ -8,15 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from standin_hidden import nominal_hidden
 
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import (
-    CellFile,
-    HiddenParameters,
-    draw_hidden,
-    load_cell,
-    nominal_hidden,
-)
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task
 from bridge.wire.errors import NoReplyError

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_hidden import nominal_hidden
 from standin_plans import planned
 
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile, nominal_hidden
+from bridge.sources.standin.cell_file import CellFile
 from bridge.sources.standin.operator import execute_plan, label_trial
 from bridge.sources.standin.streams import Streams
 from bridge.task.task_file import Task, load_task

@@ -5,15 +5,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from standin_hidden import nominal_hidden
 
 from bridge.sources.standin.cell import CellConfig, StandinCell, TruthLog
-from bridge.sources.standin.cell_file import (
-    CellFile,
-    HiddenParameters,
-    draw_hidden,
-    load_cell,
-    nominal_hidden,
-)
+from bridge.sources.standin.cell_file import CellFile, HiddenParameters, draw_hidden, load_cell
 from bridge.sources.standin.operator import Operator, label_trial, void_trial
 from bridge.sources.standin.session import describe, run_session
 from bridge.sources.standin.settings import SessionConfig

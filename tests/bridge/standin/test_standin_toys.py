@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from standin_hidden import nominal_hidden
 from standin_plans import planned
 
 from bridge.episode import schema
@@ -15,7 +16,7 @@ from bridge.episode.metadata import Outcome
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.sources.standin.cell import CellConfig, StandinCell
-from bridge.sources.standin.cell_file import CellFile, draw_hidden, nominal_hidden
+from bridge.sources.standin.cell_file import CellFile, draw_hidden
 from bridge.sources.standin.destination import release_slots
 from bridge.sources.standin.kinematics import yaw_of
 from bridge.sources.standin.operator import execute_plan, label_trial

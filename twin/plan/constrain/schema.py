@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from bridge.errors import UsageError
 from bridge.task.check import BODIES, CAVITIES, TABLE, nearest
-from bridge.task.task_file import ObjectModel, Task
+from bridge.task.task_file import Task
 
 if TYPE_CHECKING:
     import jsonschema_rs
@@ -52,11 +52,12 @@ class Vocabulary:
                 fixed may be moved, and contacts are not known yet.
         """
         pairs = (pair for stage in task.stages for pair in stage.get("allowed_contacts", ()))
+        hollow = (key for key, m in task.objects.items() if {m.shape, m.mesh} & set(CAVITIES))
         free = tuple(key for key, model in task.objects.items() if not model.fixed)
         return Vocabulary(
             objects=tuple(task.objects),
             movable=free if objects_alone else task.manipulated,
-            containers=tuple(key for key, model in task.objects.items() if _has_cavity(model)),
+            containers=tuple(hollow),
             allowed_contacts=None if objects_alone else frozenset(map(frozenset, pairs)),
         )
 
@@ -97,10 +98,6 @@ class Vocabulary:
             "then": {"allOf": ways},
         }
         return jsonschema_rs.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": defs})
-
-
-def _has_cavity(model: ObjectModel) -> bool:
-    return model.shape in CAVITIES or model.mesh in CAVITIES
 
 
 @cache

@@ -227,7 +227,7 @@ class Nouns:
         things = self.vocabulary.things
         for names in (_own, _own_or_shape, _any):
             pool = [key for key in things if set(phrase.nouns) <= names(things[key])]
-            fitting = [key for key in pool if _has_colours(things[key], phrase)]
+            fitting = [key for key in pool if set(phrase.colours) <= {things[key].colour}]
             fitting = [key for key in fitting if self._has_sizes(key, phrase, pool)]
             if fitting or (pool and names is _own_or_shape):
                 return tuple(fitting)
@@ -296,10 +296,6 @@ def _own_or_shape(thing: Thing) -> frozenset[str]:
 
 def _any(thing: Thing) -> frozenset[str]:
     return _own_or_shape(thing) | thing.names
-
-
-def _has_colours(thing: Thing, phrase: NounPhrase) -> bool:
-    return all(colour == thing.colour for colour in phrase.colours)
 
 
 def with_shared_noun(phrases: Sequence[NounPhrase]) -> Iterator[NounPhrase]:

@@ -257,7 +257,7 @@ class _Search:
                 release=release,
                 legs=legs,
                 T_base_lies=lying_there(problem, release),
-                cost=release.cost + _miss_probability(grasp.margin),
+                cost=release.cost + erfc(grasp.margin / sqrt(2.0)) / 2,
                 remarks=options.remarks_of(grasp, release, legs),
             )
         if failure is None:
@@ -284,11 +284,6 @@ def _why_not_moved(problem: Problem, key: str, error: NoPathError) -> str:
     else:
         hint = "Move apart what touches, or put the objects elsewhere."
     return f"{key}: {error}. {hint}"
-
-
-def _miss_probability(margin: float) -> float:
-    """Of a normal variable, beyond so many standard deviations."""
-    return erfc(margin / sqrt(2.0)) / 2
 
 
 def _after(problem: Problem, moved: Transfer) -> Problem:

@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from bridge.episode import streams
 from bridge.geometry import se3
-from bridge.geometry.camera import Camera
 from twin.errors import TwinError
 from twin.scene.dataset.scan_check import CLEARLY_BETTER, CameraCheck, ScanReport
 from twin.scene.frames.downscaled import DownscaledDepth, thinned_camera
@@ -130,7 +129,8 @@ class _Pair:
         self, T_second_first: Float[np.ndarray, "4 4"], depth: float, focal: float
     ) -> tuple[float, float]:
         """Share of the overlap that agrees, and the overlap."""
-        camera = _with_focal(self.first.camera, focal)
+        first = self.first.camera
+        camera = replace(first, fx=first.fx * focal, fy=first.fy * focal)
         z = depth * self.first.depth_m.astype(np.float64)
         p = se3.apply(T_second_first, camera.unproject(z)[z > 0])
         front = p[:, 2] > 0.02
@@ -278,10 +278,6 @@ def _thinned(image: DownscaledDepth) -> DownscaledDepth:
     return replace(
         image, camera=thinned_camera(image.camera, step), depth_m=image.depth_m[::step, ::step]
     )
-
-
-def _with_focal(camera: Camera, factor: float) -> Camera:
-    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 class WrongGeometryError(TwinError):

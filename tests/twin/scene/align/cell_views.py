@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from standin_hidden import nominal_hidden
 
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
-from bridge.sources.standin.cell_file import load_cell, nominal_hidden
+from bridge.sources.standin.cell_file import load_cell
 from bridge.sources.standin.render import Renderer, measure_depth
 from bridge.sources.standin.surfaces import lab_surfaces, object_surfaces, robot_surfaces
 from bridge.task.task_file import load_task
