@@ -17,19 +17,13 @@ GONE: dict[str, str] = {
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
-    "export corrected": (
-        "export csv, tum and lerobot take --clock corrected; Python reads an episode so with "
-        'open_episode(path, clock="corrected").'
-    ),
+    "export corrected": "export csv and tum take --clock corrected.",
     **dict.fromkeys(
         ("label --flag", "label --unflag", "ls --flagged", "ls --no-flagged"),
         "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them.",
     ),
     "dashboard --console": "Use robot-gst ctl start and stop, and the dashboard's page label.",
-    "prune": (
-        "robot-gst ls RUN --json lists age, size and outcome; remove episodes with a script of "
-        "your own, or age whole runs with logrotate."
-    ),
+    "prune": "robot-gst ls RUN --json lists age, size and outcome for a script of yours.",
     "export lerobot --depth": "Depth stays in the episodes; robot-gst export tum writes it.",
     "export rosbag2 --json-topics": "JSON records are left out; robot-gst export csv writes them.",
     "publish episode --remap": (
@@ -38,10 +32,7 @@ GONE: dict[str, str] = {
     ),
     "record --preview-video": "--preview-hz has small pictures sent to whoever watches.",
     "record --quota-mb": "--min-free-mb leaves space on the disk; logrotate removes old runs.",
-    "record --failover": (
-        "A failing disk ends the recording; start it again with a run folder on another disk. The "
-        "second part of an older episode (ID.2.mcap) is read once it lies beside ID.mcap."
-    ),
+    "record --failover": "A failing disk ends the recording; begin anew on another disk.",
     "record --hang-s": "robot-gst ctl status says for how long a disk has not answered.",
     **dict.fromkeys(
         ("record --split-mb", "record --split-s"),

@@ -14,17 +14,3 @@ def nominal_hidden(cell: CellFile) -> HiddenParameters:
         deviations=None,
         **uniform,
     )
-
-
-def small_transform(
-    shift_m: Float[np.ndarray, "3"], turn_rad: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """Build a transform from a translation and a rotation vector [rad].
-
-    Args:
-        turn_rad: Axis of the rotation times its angle; zeros for none.
-    """
-    angle = float(np.linalg.norm(turn_rad))
-    axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
-    q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-    return se3.transform_from(q, shift_m)

@@ -288,7 +288,7 @@ def _measure_depth(
     return [
         measured(
             quantity.of(part=part, after=after),
-            partial(float, np.mean([getattr(depth, name) for depth in depths])),
+            lambda name=name: float(np.mean([getattr(depth, name) for depth in depths])),  # type: ignore[misc]
             n=len(depths),
             counted="image",
             reason_without_interval="the per-image list is in the table",
