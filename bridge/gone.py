@@ -17,7 +17,7 @@ GONE: dict[str, str] = {
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
     "export rrd": "Write the file with robot-gst view EPISODE --out FILE.rrd.",
-    "export corrected": "export csv and tum take --clock corrected.",
+    "export corrected": "export csv, tum and lerobot take --clock corrected.",
     **dict.fromkeys(
         ("label --flag", "label --unflag", "ls --flagged", "ls --no-flagged"),
         "Flag trials in the dashboard, on the page label (key f); /queue?show=flagged lists them.",
