@@ -59,10 +59,9 @@ GONE: dict[str, str] = {
         "Shapes are carved from what the cameras saw.",
     ),
     **dict.fromkeys(
-        ("evaluate --live", "evaluate --recorder", "evaluate --connect"),
-        "robot-gst evaluate RUN says of all trials so far how many more would settle the ranking.",
+        ("evaluate --live", "evaluate --recorder", "evaluate --connect", "evaluate --goal"),
+        "evaluate says task by task how many more trials would settle the ranking.",
     ),
-    "evaluate --goal": "evaluate says task by task how many more trials would settle the ranking.",
     "design --past": "Say what is expected: --rate, --gain, --agreement.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",

@@ -93,6 +93,7 @@ LEAVES: dict[str, Leaf] = {
         modules=(
             "bridge.sources.standin",
             "dashboards.standin_cli",
+            "dashboards.standin_settings",
             "dashboards.demo",
             "dashboards.trials",
             "dashboards.learned",

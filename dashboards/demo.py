@@ -31,7 +31,7 @@ from bridge.task.find import chosen_task_file
 from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.terminal import Output, how_to_activate
 from dashboards.errors import DashboardError
-from dashboards.standin_cli import BUILT_IN_POLICY, DemoConfig
+from dashboards.standin_settings import BUILT_IN_POLICY, DemoConfig
 
 ENOUGH_TRIALS = 20
 """In a group, before the correlation over groups is believed; robot-gst trials makes so many."""

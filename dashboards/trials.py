@@ -50,7 +50,7 @@ from dashboards.demo import (
     step,
     stop_command,
 )
-from dashboards.standin_cli import BUILT_IN_POLICY, TrialsConfig
+from dashboards.standin_settings import BUILT_IN_POLICY, TrialsConfig
 
 EVERY_TASK = "all"
 POLL_S = 0.2

@@ -15,7 +15,7 @@ from bridge.terminal import Output
 from dashboards import demo
 from dashboards.demo import Trial, groups_of, look
 from dashboards.errors import DashboardError
-from dashboards.standin_cli import DemoConfig
+from dashboards.standin_settings import DemoConfig
 
 TASK = "cube_into_box"
 QUICK = DemoConfig(quick=True, serve=False)

@@ -13,7 +13,7 @@ from bridge.errors import UsageError
 from bridge.task.protocol import SEEDS_PER_SESSION, keep_protocol, read_protocol
 from bridge.terminal import Output
 from dashboards.learned import Learned, learned_in
-from dashboards.standin_cli import TrialsConfig
+from dashboards.standin_settings import TrialsConfig
 from dashboards.trials import jobs_of, protocol_of, run_trials
 from twin.scene.store.calibration import write_physics, write_posterior
 

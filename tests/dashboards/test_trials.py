@@ -16,7 +16,7 @@ from bridge.errors import UsageError
 from bridge.task.protocol import keep_protocol, read_protocol
 from bridge.terminal import Output
 from dashboards import trials
-from dashboards.standin_cli import TrialsConfig
+from dashboards.standin_settings import TrialsConfig
 from dashboards.trials import Job, command_of, jobs_of, protocol_of, run_trials
 
 QUIET = Output(quiet=True)

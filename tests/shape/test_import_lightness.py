@@ -27,6 +27,7 @@ LIGHT_ROOMS = (
     "evaluator.cli",
     "dashboards.cli",
     "dashboards.standin_cli",
+    "dashboards.standin_settings",
     "dashboards.scene_file",
     "evaluator.result",
     "robot_gst",

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot_dataset import CAMERA, LENGTHS, Dataset, png, run, shade, state
+from commands import run
+from lerobot_dataset import CAMERA, LENGTHS, Dataset, png, shade, state
 
 from bridge.episode.cdr.messages import CompressedColor, JointSample
 from bridge.episode.reader import Episode

@@ -37,11 +37,11 @@ def test_a_new_file_is_right_and_is_never_overwritten(capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_copy_differs_from_its_model_in_the_name_only(name: str) -> None:
-    assert tasks.new("mine", like=name) == 0
+    assert tasks.task_new("mine", like=name) == 0
     model = (datasets_folder() / "tasks" / f"{name}.toml").read_text()
     copy = Path("mine.toml").read_text()
     assert copy == model.replace(f'name = "{name}"', 'name = "mine"')
-    assert tasks.new("again", like="mine.toml") == 0
+    assert tasks.task_new("again", like="mine.toml") == 0
     assert load_task("again.toml").objects == load_task(name).objects
 
 
@@ -52,7 +52,7 @@ def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
 
 
 def test_every_problem_of_every_file_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    tasks.new("a")
+    tasks.task_new("a")
     text = Path("a.toml").read_text()
     Path("b.toml").write_text(text.replace("for_s", "for").replace('"block"', '"blok"'))
     capsys.readouterr()

@@ -138,7 +138,7 @@ def test_a_task_with_soft_objects_is_replayed_like_any_other() -> None:
         (
             {"perception": FakePerception(description=DAMAGED)},
             PLAN,
-            "carries a record that is not a robot: robot lacks name",
+            "carries a record that is not a robot: Object missing required field `name`",
         ),
         ({}, replace(PLAN, robot="panda"), "for robot 'panda'; the cell's robot is 'ur5"),
         ({}, replace(PLAN, task="fold_towel"), "task 'fold_towel' is asked for; this gate judges"),

@@ -153,7 +153,7 @@ def test_a_toy_whose_nodes_fly_apart_ends_the_replay_and_never_passes(
 
     def blown_up(self: World) -> None:
         if next(steps) == 100:
-            solver = self.soft._begun()
+            solver = self.soft_bodies()._begun()
             apart = np.random.default_rng(0).normal(0.0, 1e4, solver.velocities(0).shape)
             solver.set_velocities(0, apart)
         step(self)
