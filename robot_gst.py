@@ -16,10 +16,10 @@ from cyclopts import App, Group, Parameter
 from cyclopts.config import Toml
 from rich.console import Console
 
+from bridge import leaves
 from bridge.ending import end_with_starter
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.gone import refuse_gone
-from bridge.leaves import Command, commands_of, leaf_commands, refuse_missing_command
 
 HELP = (
     "Record a robot cell over zenoh, rebuild it as a Gaussian-splat twin, replay every plan and "
@@ -31,60 +31,47 @@ RESUMED = ("demo", "trials", "rebuild", "replay", "evaluate")
 LISTS = Parameter(consume_multiple=True, negative_iterable="")
 """``--policies nominal loose`` and ``--policies nominal --policies loose`` say the same."""
 
-USES = (
-    "Start here",
-    "Record",
-    "Review",
-    "Rebuild and replay",
-    "Plan and gate",
-    "Evaluate",
-    "Exchange",
-)
-"""What one does with the commands, in the order of the help."""
-
-START, RECORD, REVIEW, REBUILD, PLAN, EVALUATE, EXCHANGE_USE = USES
-
-CORE: tuple[Command, ...] = (
-    *commands_of(
-        START,
+CORE: tuple[leaves.Command, ...] = (
+    *leaves.commands_of(
+        leaves.START,
         "bridge.cli.episodes",
         """
         doctor | Show what is installed, what is missing and how to get it. | --json
         """,
     ),
-    *commands_of(
-        RECORD,
+    *leaves.commands_of(
+        leaves.RECORD,
         "bridge.cli.recording",
         """
         record | Record episodes live over zenoh. | runs/monday
         ctl | Start, stop, mark or label from another terminal. | start --id trial_1
         """,
     ),
-    *commands_of(
-        RECORD,
+    *leaves.commands_of(
+        leaves.RECORD,
         "bridge.cli.publish",
         """
         publish folder | Play an RGB-D folder as a live camera. | DIR --episode scan
         publish episode | Play an episode back with its own timing. | FILE --rate 2
         """,
     ),
-    *commands_of(
-        RECORD,
+    *leaves.commands_of(
+        leaves.RECORD,
         "bridge.cli.tasks",
         """
         task check | Say what is wrong with task files, or what they ask for. | my_task.toml
         task new | Write a task file to start from. | cube_onto_block
         """,
     ),
-    *commands_of(
-        RECORD,
+    *leaves.commands_of(
+        leaves.RECORD,
         "twin.cli",
         """
         robot check | Joints, limits, frames, gripper; what is refused. | mine.toml
         """,
     ),
-    *commands_of(
-        REVIEW,
+    *leaves.commands_of(
+        leaves.REVIEW,
         "bridge.cli.episodes",
         """
         info | Show what an episode holds. | runs/demo/episodes/scan.mcap
@@ -94,8 +81,8 @@ CORE: tuple[Command, ...] = (
         label | Set the outcome of a recorded episode. | runs/demo trial_1 --result failure
         """,
     ),
-    *commands_of(
-        REVIEW,
+    *leaves.commands_of(
+        leaves.REVIEW,
         "dashboards.cli",
         """
         dashboard | Serve review pages on the loopback address. | runs/monday
@@ -103,8 +90,8 @@ CORE: tuple[Command, ...] = (
         share | Write trials with clips into one file to send. | runs/monday --trials trial_1
         """,
     ),
-    *commands_of(
-        REBUILD,
+    *leaves.commands_of(
+        leaves.REBUILD,
         "twin.cli",
         """
         rebuild | Fit a Gaussian-splat scene; render held-out views. | runs/monday --budget 60s
@@ -113,23 +100,23 @@ CORE: tuple[Command, ...] = (
         replay | Replay every planned and executed trajectory in the twin. | runs/monday --workers 2
         """,
     ),
-    *commands_of(
-        PLAN,
+    *leaves.commands_of(
+        leaves.PLAN,
         "twin.cli",
         """
         gate | Judge plans over zenoh before the robot moves. | runs/monday
         """,
     ),
-    *commands_of(
-        EVALUATE,
+    *leaves.commands_of(
+        leaves.EVALUATE,
         "evaluator.cli",
         """
         evaluate | Compute success rates and agreement; write a report. | runs/monday
         design | Size a study, and lock its protocol. | runs/study --rate 0.5 --gain 0.3 --width 0.4
         """,
     ),
-    *commands_of(
-        EXCHANGE_USE,
+    *leaves.commands_of(
+        leaves.EXCHANGE,
         "bridge.cli.exchange",
         """
         import rgbd | An RGB-D folder: scene.json, TUM, 7-Scenes. | DIR runs/x
@@ -144,17 +131,17 @@ CORE: tuple[Command, ...] = (
 )
 
 GROUPS = {
-    "publish": ("Publish sensor and robot data over zenoh.", RECORD),
-    "task": ("Write and check task files.", RECORD),
-    "robot": ("Robot files: arms, grippers and tools.", RECORD),
-    "import": ("Import recordings of other programs into a run.", EXCHANGE_USE),
-    "export": ("Export episodes to formats of other programs.", EXCHANGE_USE),
+    "publish": ("Publish sensor and robot data over zenoh.", leaves.RECORD),
+    "task": ("Write and check task files.", leaves.RECORD),
+    "robot": ("Robot files: arms, grippers and tools.", leaves.RECORD),
+    "import": ("Import recordings of other programs into a run.", leaves.EXCHANGE),
+    "export": ("Export episodes to formats of other programs.", leaves.EXCHANGE),
 }
 
 
-def commands() -> tuple[Command, ...]:
+def commands() -> tuple[leaves.Command, ...]:
     """Every command: the core's, and those that leaves bring."""
-    return CORE + leaf_commands()
+    return CORE + leaves.leaf_commands()
 
 
 def build_app() -> App:
@@ -169,7 +156,7 @@ def build_app() -> App:
         error_console=Console(stderr=True),
         default_parameter=LISTS,
     )
-    headings = {use: Group(use, sort_key=place) for place, use in enumerate(USES)}
+    headings = {use: Group(use, sort_key=place) for place, use in enumerate(leaves.USES)}
     groups = {
         name: App(name=name, help=text, group=headings[use]) for name, (text, use) in GROUPS.items()
     }
@@ -183,7 +170,7 @@ def build_app() -> App:
     return app
 
 
-def _help(command: Command) -> str:
+def _help(command: leaves.Command) -> str:
     return f"{command.text}\n\nExample: robot-gst {command.name} {command.example}"
 
 
@@ -195,7 +182,7 @@ def run(arguments: Sequence[str]) -> int:
         if config is not None:
             app.config = Toml(config, must_exist=True)
         refuse_gone(tokens)
-        refuse_missing_command(tokens)
+        leaves.refuse_missing_command(tokens)
         code = app(tokens)
     except GstError as error:
         sys.stderr.write(f"robot-gst: {error}\n")

@@ -11,6 +11,17 @@ from typing import Any, NamedTuple
 
 from bridge.errors import MissingDependencyError
 
+USES = START, RECORD, REVIEW, REBUILD, PLAN, EVALUATE, EXCHANGE = (
+    "Start here",
+    "Record",
+    "Review",
+    "Rebuild and replay",
+    "Plan and gate",
+    "Evaluate",
+    "Exchange",
+)
+"""What one does with the commands, in the order of the help."""
+
 
 class Command(NamedTuple):
     """One command of the front door."""
@@ -57,7 +68,7 @@ LEAVES: dict[str, Leaf] = {
         purpose="planning",
         commands=(
             *commands_of(
-                "Plan and gate",
+                PLAN,
                 "twin.plan.cli",
                 """
                 plan | Plan from words, or for a cell. | runs/x --task 'put the cube into the box'
@@ -102,7 +113,7 @@ LEAVES: dict[str, Leaf] = {
         purpose="the stand-in cell",
         commands=(
             *commands_of(
-                "Start here",
+                START,
                 "dashboards.standin_cli",
                 """
                 demo | Run the whole loop on the stand-in cell, in minutes. | runs/demo
@@ -110,7 +121,7 @@ LEAVES: dict[str, Leaf] = {
                 """,
             ),
             *commands_of(
-                "Record",
+                RECORD,
                 "bridge.sources.standin.cli",
                 """
                 publish standin | The stand-in cell: a simulated laboratory. | --trials 3 --seed 1
@@ -130,7 +141,7 @@ LEAVES: dict[str, Leaf] = {
         purpose="publishing a UR arm",
         commands=(
             *commands_of(
-                "Record",
+                RECORD,
                 "bridge.sources.ur.cli",
                 """
                 publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
@@ -144,7 +155,7 @@ LEAVES: dict[str, Leaf] = {
         purpose="publishing RealSense cameras",
         commands=(
             *commands_of(
-                "Record",
+                RECORD,
                 "bridge.sources.realsense.cli",
                 """
                 publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224
@@ -158,7 +169,7 @@ LEAVES: dict[str, Leaf] = {
         purpose="exchange with LeRobot",
         commands=(
             *commands_of(
-                "Exchange",
+                EXCHANGE,
                 "bridge.exchange.lerobot.cli",
                 """
                 import lerobot | A LeRobotDataset v3.0. | DIR runs/x --episodes 0-9
@@ -194,8 +205,7 @@ def refuse_missing(name: str) -> None:
     if has_leaf(name):
         return
     leaf = LEAVES.get(name, Leaf(modules=(), extra="all", purpose=f"what is asked ({name})"))
-    missing = [module for module in leaf.modules if not _is_here(module)]
-    package = missing[0] if missing else name
+    package = next((module for module in leaf.modules if not _is_here(module)), name)
     raise MissingDependencyError(package=package, extra=leaf.extra, purpose=leaf.purpose)
 
 

@@ -480,6 +480,12 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
+def runner_of(workers: int | None) -> Runner:
+    """This process, or several: one for each core where nobody said a number."""
+    size = workers or default_size()
+    return ProcessPool(size) if size > 1 else Serial()
+
+
 def default_size() -> int:
     """One process for each core, and no more than ``MOST``, where nobody said a number."""
     return min(MOST, cores())

@@ -6,7 +6,7 @@ from pathlib import Path
 from cyclopts import Parameter
 
 from bridge.errors import refuse_outside
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 PORTS = {"port": (0, 65_535)}
 
@@ -21,7 +21,7 @@ class DashboardConfig:
     """Port to listen on; 0 takes any free one."""
     recorder: str = "main"
     """Name of the recorder that the page Live listens to."""
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = LOOPBACK
     """Where that recorder is; nothing is opened before somebody looks at the page."""
     live_config: Path | None = None
     """zenoh configuration (JSON5) for that, for example with access control."""

@@ -409,8 +409,7 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
     about = judgement.about
     numbers = judgement.measurements
     cards = headline_cards(judgement)
-    both = ((g, g.replayed.value, g.recorded.value) for g in rate_groups(numbers))
-    groups = [g for g, sim, seen in both if sim is not None and seen is not None]
+    groups = [g for g in rate_groups(numbers) if _is_drawable(g)]
     drawn = sorted(groups, key=lambda g: not _takes(selection, g))[:MOST_GROUPS]
     others, num_others, kinds = _others(judgement)
     broken, num_broken = _broken(judgement)
@@ -455,6 +454,10 @@ def build_overview(run: RunFolder, judgement: Judgement, selection: Selection) -
         is_old=judgement.is_old,
         is_being_read=judgement.is_being_updated,
     )
+
+
+def _is_drawable(group: RateGroup) -> bool:
+    return group.replayed.value is not None and group.recorded.value is not None
 
 
 def _takes(selection: Selection, group: RateGroup) -> bool:

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
 DEADLINE_S = 200.0
 """Below the time after which pytest ends itself, which would leave the process behind."""
 
@@ -21,3 +22,20 @@ def printed(code: str, *arguments: str, folder: Path = ROOT) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
+
+
+def imports_from(folder: Path) -> str:
+    """A ``sitecustomize`` that makes our packages' names mean those of a folder."""
+    return "\n".join(
+        (
+            "import sys",
+            "from importlib.machinery import PathFinder",
+            "class Finder:",
+            "    @staticmethod",
+            "    def find_spec(name, path=None, target=None):",
+            f"        if name in {(*PACKAGES, 'robot_gst')!r}:",
+            f"            return PathFinder.find_spec(name, [{str(folder)!r}])",
+            "sys.meta_path.insert(0, Finder)",
+            "",
+        )
+    )

@@ -165,12 +165,10 @@ def calibrate(
         )
         raise UsageError(message)
     if config.posterior:
-        from bridge.process_pool import default_size
         from twin.calibrate.posterior import calibrate_posterior, describe_posterior
 
-        workers = config.workers or default_size()
         posterior, calibration_id = calibrate_posterior(
-            run_folder, num_draws=config.draws, workers=workers, output=output
+            run_folder, num_draws=config.draws, workers=config.workers, output=output
         )
         output.result(
             {**posterior, "calibration_id": calibration_id},

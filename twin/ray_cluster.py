@@ -24,6 +24,7 @@ from bridge.process_pool import (
     Failed,
     Function,
     Item,
+    default_size,
     do,
     lost,
 )
@@ -57,9 +58,9 @@ class RayClusterError(TwinError):
 class RayRunner:
     """Does pieces of work as Ray tasks; see ``bridge.process_pool.Runner``."""
 
-    def __init__(self, address: str, workers: int) -> None:
+    def __init__(self, address: str, workers: int | None) -> None:
         """Connect later."""
-        self._address, self._workers = address, workers
+        self._address, self._workers = address, workers or default_size()
         self._ray: Any = None
         self._first: list[Any] = []
         self._before: dict[str, str | None] = {}

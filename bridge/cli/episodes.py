@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
 from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
     from bridge.episode.catalogue_store import Entry
@@ -32,7 +32,7 @@ class WireCheck:
     """How long to listen [s]."""
     rate_hz: float | None = None
     """What every topic should have [Hz]; 10 % off is wrong."""
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = LOOPBACK
     """Where the recorder, or another zenoh router, listens."""
     listen: tuple[str, ...] = ()
     """Be the router that the publisher connects to, instead."""

@@ -9,15 +9,15 @@ from cyclopts import Parameter
 
 from bridge.sources.folder.config import FolderConfig
 from bridge.sources.playback.config import PlaybackConfig
+from bridge.sources.source import Duration
 from bridge.terminal import Output, stop_signals
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
     from bridge.record.control import RecorderClient
 
 OUTPUT = Output()
 FOLDER = FolderConfig()
-LOOPBACK = (DEFAULT_ENDPOINT,)
 
 
 def publish_folder(
@@ -97,7 +97,6 @@ def _recorded(
 
 
 PLAYBACK = PlaybackConfig()
-Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
 
 
 def publish_episode(

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from bridge.record.config import EpisodeAbout, RecorderConfig
 from bridge.terminal import RARE, Output, stop_signals
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
     from bridge.task.task_file import TaskFile
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 OUTPUT = Output()
 ABOUT = EpisodeAbout()
 RECORDER = RecorderConfig()
-LOOPBACK = (DEFAULT_ENDPOINT,)
 Action = Literal["start", "stop", "mark", "label", "pause", "resume", "snapshot", "list", "status"]
 
 

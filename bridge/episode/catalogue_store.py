@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -136,12 +137,16 @@ class CatalogueQuery:
     def __post_init__(self) -> None:
         """Refuse what cannot be asked."""
         refuse_outside(self, {"limit": (0, float("inf"))})
-        for name in ("since", "until"):
-            _instant_ns(name, getattr(self, name))
+        _ = self._begun_ns
+
+    @cached_property
+    def _begun_ns(self) -> tuple[int | None, int | None]:
+        """Not before the first, and before the second."""
+        return _instant_ns("since", self.since), _instant_ns("until", self.until)
 
     def takes(self, entry: Entry) -> bool:
         """Whether an entry passes all filters."""
-        since_ns, until_ns = _instant_ns("since", self.since), _instant_ns("until", self.until)
+        since_ns, until_ns = self._begun_ns
         is_lossy = bool(entry.lost) or entry.recovered
         return (
             all(

@@ -7,13 +7,18 @@ counts what it sent.
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
+
+from cyclopts import Parameter
 
 from bridge.terminal import Output, stop_signals
 from bridge.wire.config import WireConfig
 
 if TYPE_CHECKING:
     from bridge.wire.session import WireSession
+
+Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
+"""How long a command publishes [s]; None: until it is told to stop."""
 
 
 @runtime_checkable

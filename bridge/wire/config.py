@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LOOPBACK = ("tcp/127.0.0.1:7447",)
 """The recorder listens here; loopback, so nobody outside this machine can reach it."""
 
 
@@ -13,7 +13,7 @@ class WireConfig:
 
     mode: str = "client"
     """client, peer or router; the recorder is the router, everyone else a client of it."""
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = LOOPBACK
     """Endpoints to connect to."""
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from loopback import free_endpoint
-from own_process import ROOT
+from own_process import PACKAGES, ROOT, imports_from
 from tracked_files import tracked
 
 from bridge.leaves import LEAVES
 
-PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
 COMMANDS = """
 import json, sys
 from pathlib import Path
@@ -57,8 +56,8 @@ def copy_without(leaf: str | None, to: Path) -> None:
             shutil.rmtree(path)
         else:
             path.with_suffix(".py").unlink()
-    registry = to / "bridge" / "leaves.py"
-    lines = registry.read_text().splitlines(keepends=True)
+    listing = to / "bridge" / "leaves.py"
+    lines = listing.read_text().splitlines(keepends=True)
     table = next(
         node.value
         for node in ast.walk(ast.parse("".join(lines)))
@@ -69,18 +68,14 @@ def copy_without(leaf: str | None, to: Path) -> None:
     key, value = next((k, v) for k, v in entries if ast.literal_eval(k or value) == leaf)
     assert key is not None
     del lines[key.lineno - 1 : value.end_lineno]
-    registry.write_text("".join(lines))
+    listing.write_text("".join(lines))
 
 
 def environment(copy: Path) -> dict[str, str]:
     """Have every process that is started import the copy, not the checkout."""
     start = copy / "start"
     start.mkdir()
-    (start / "sitecustomize.py").write_text(
-        "import sys\n"
-        "sys.meta_path[:] = [f for f in sys.meta_path if 'Checkout' not in str(f)]\n"
-        f"sys.path.append({str(copy)!r})\n"
-    )
+    (start / "sitecustomize.py").write_text(imports_from(copy))
     return {**os.environ, "PYTHONPATH": str(start), "PYTHONSAFEPATH": "1"}
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("bridge", "twin", "evaluator", "dashboards")
+from own_process import PACKAGES, ROOT
+
 SWAPPED = {
     ast.Lt: "<=",
     ast.LtE: "<",

@@ -22,7 +22,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from draw import PACKAGES, Mutant, draw, near_tests
+from own_process import imports_from
 
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = (*PACKAGES, "tests", "benchmarks", "datasets", "docs", "examples", "README.md")
@@ -60,7 +62,7 @@ class Copy:
         # Processes of the tests import from here too.
         site = folder / ".site"
         site.mkdir()
-        (site / "sitecustomize.py").write_text(finder(folder))
+        (site / "sitecustomize.py").write_text(imports_from(folder))
         self._env = os.environ | {
             "PYTHONPATH": str(site),
             "GST_CHECKOUT": str(folder),
@@ -108,23 +110,6 @@ class Copy:
             output, _ = process.communicate()
             return None, output
         return process.returncode, output
-
-
-def finder(folder: Path) -> str:
-    """A module that makes the packages' names mean those of a folder, before any other finder."""
-    return "\n".join(
-        (
-            "import sys",
-            "from importlib.machinery import PathFinder",
-            "class Finder:",
-            "    @staticmethod",
-            "    def find_spec(name, path=None, target=None):",
-            f"        if name in {(*PACKAGES, 'robot_gst')!r}:",
-            f"            return PathFinder.find_spec(name, [{str(folder)!r}])",
-            "sys.meta_path.insert(0, Finder)",
-            "",
-        )
-    )
 
 
 def judged(code: int | None, output: str) -> tuple[str, str]:

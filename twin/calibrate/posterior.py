@@ -23,7 +23,7 @@ from bridge.episode.catalogue import outcome_of
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError, UsageError
-from bridge.process_pool import Failed, ProcessPool
+from bridge.process_pool import Failed, ProcessPool, default_size
 from bridge.task.plan import Plan
 from bridge.task.predicate import Rollout, all_hold, evaluate_success
 from bridge.task.task_file import Task
@@ -302,12 +302,12 @@ def _ended(piece: Piece) -> Ended:
 
 
 def weighed(
-    draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int, output: Output
+    draws: Sequence[PosteriorDraw], trials: Sequence[Trial], *, workers: int | None, output: Output
 ) -> list[PosteriorDraw]:
     """Give each draw the weight that the trials leave it; in their order, weights sum to 1.
 
     Args:
-        workers: Processes that replay side by side; 1: this one alone.
+        workers: Processes that replay side by side, one for each core by default; 1: this alone.
     """
     pieces = [(number, trial, draw) for number, draw in enumerate(draws) for trial in trials]
     logs = np.log([draw.weight for draw in draws])
@@ -331,7 +331,8 @@ def weighed(
     ]
 
 
-def _answers(pieces: Sequence[Piece], workers: int) -> Any:
+def _answers(pieces: Sequence[Piece], workers: int | None) -> Any:
+    workers = workers or default_size()
     if workers == 1:
         yield from ((piece, _ended(piece)) for piece in pieces)
         return
@@ -348,7 +349,7 @@ def effective(draws: Sequence[PosteriorDraw]) -> float:
 
 
 def calibrate_posterior(
-    run: RunFolder, *, num_draws: int, workers: int, output: Output
+    run: RunFolder, *, num_draws: int, workers: int | None, output: Output
 ) -> tuple[dict[str, Any], str]:
     """Weigh draws by a run's trials, task by task, and write them to ``calibration.json``.
 

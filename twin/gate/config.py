@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from bridge.terminal import RARE
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 from twin.replay.config import ReplayConfig
 from twin.scene.settings import convert_duration
 
@@ -18,7 +18,7 @@ from twin.scene.settings import convert_duration
 class GateConfig:
     """What the gate judges, and how long it may take."""
 
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = LOOPBACK
     """Endpoints of the recorder."""
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
     """zenoh configuration (JSON5), for example with certificates."""

@@ -19,7 +19,7 @@ SHAPE_WORDS = {
 }  # fmt: skip
 """What a thing of a shape may be called."""
 ANY_THING = ("object", "thing", "item", "stuff")
-ANIMALS = ("toy", "animal", "plush", "figure", "duck", "sloth", "teddy", "bear", "doll")
+ANIMALS = SHAPE_WORDS["toy"]
 KIND_NAMES = {"container": ("container",), "animal": ("toy", "animal", "plush"), "other": ()}
 """What every thing of a kind may be called, see ``kind_of``."""
 TYPICAL_COLOURS = {

@@ -305,13 +305,14 @@ class World:
             soft: SoftBodies = begin(self._client, self.robot, *self._description, self.config)
             for add in self._solids:
                 add(soft)
-            self._soft = soft
+            self._soft, self._solids = soft, []
         return self._soft
 
     def _meet(self, add: Callable[[SoftBodies], None]) -> None:
-        """Let soft bodies meet a solid; those that come later meet it too."""
-        self._solids.append(add)
-        if self._soft is not None:
+        """Let soft bodies meet a solid, at once or when they begin."""
+        if self._soft is None:
+            self._solids.append(add)
+        else:
             add(self._soft)
 
     def _softly(self, object_id: str) -> SoftBodies | None:

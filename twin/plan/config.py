@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from bridge.task.model_policy import MODEL_POLICY
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 
 @Parameter(name="*")
@@ -16,7 +16,7 @@ from bridge.wire.config import DEFAULT_ENDPOINT
 class LivePlanConfig:
     """Whom a live planner answers."""
 
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = LOOPBACK
     """Endpoints of the recorder."""
     zenoh_config: Annotated[Path | None, Parameter(name="--config")] = None
     """zenoh configuration (JSON5), for example with certificates."""

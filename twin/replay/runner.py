@@ -15,7 +15,7 @@ from bridge.episode.streams import execution_ns
 from bridge.episode.topics import JOINT_STATES, ROBOT_DESCRIPTION
 from bridge.errors import GstError, PathNotFoundError, UsageError
 from bridge.leaves import load_leaf
-from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
+from bridge.process_pool import Failed, Runner, runner_of
 from bridge.robots.robot import read_robot, robot_of
 from bridge.task.scripted_motion import RECORD_NAME
 from bridge.task.task_file import Task
@@ -261,6 +261,14 @@ def _trajectory_of(name: str) -> str:
     return name.rsplit(".", 3)[0]
 
 
+def runner_for(config: ReplayRunConfig) -> Runner:
+    """What replays: this process, several, or a Ray cluster."""
+    if config.ray:
+        runner: Runner = load_leaf("cluster", "runner")(config.ray, config.workers)
+        return runner
+    return runner_of(config.workers)
+
+
 def replay_run(
     run: RunFolder,
     config: ReplayRunConfig,
@@ -278,12 +286,7 @@ def replay_run(
         recordings, what was said ``against_recorded`` labels, and the scene hash.
     """
     run.refuse_empty()
-    workers = config.workers or default_size()
-    if config.ray:
-        runner: Runner = load_leaf("cluster", "runner")(config.ray, workers)
-    else:
-        runner = ProcessPool(workers) if workers > 1 else Serial()
-    with runner:
+    with runner_for(config) as runner:
         return _replay_trajectories(run, config, output, runner, imported)
 
 

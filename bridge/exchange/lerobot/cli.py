@@ -44,8 +44,7 @@ def export_lerobot(
     label = "with success labels" if report.labelled else "not every episode is labelled"
     text = (
         f"{out}: {report.episodes} episodes, {report.frames} rows at {report.fps} Hz, "
-        f"actions: {report.action.replace('_', ' ')}, {label}; "
-        "depth left out"
+        f"actions: {report.action.replace('_', ' ')}, {label}; depth left out"
     )
     output.result({"out": str(out), **asdict(report)}, text)
     return 0

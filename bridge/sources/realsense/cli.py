@@ -6,13 +6,12 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bridge.sources.realsense.config import RealSenseConfig
+from bridge.sources.source import Duration
 from bridge.terminal import Output
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 OUTPUT = Output()
 REALSENSE = RealSenseConfig()
-LOOPBACK = (DEFAULT_ENDPOINT,)
-Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
 
 
 def publish_realsense(

@@ -7,11 +7,10 @@ from cyclopts import Parameter
 
 from bridge.sources.standin.settings import SessionConfig
 from bridge.terminal import Output
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 OUTPUT = Output()
 STANDIN = SessionConfig()
-LOOPBACK = (DEFAULT_ENDPOINT,)
 
 
 def publish_standin(

@@ -5,14 +5,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from bridge.sources.source import Duration
 from bridge.sources.ur.config import UrConfig
 from bridge.terminal import Output
-from bridge.wire.config import DEFAULT_ENDPOINT
+from bridge.wire.config import LOOPBACK
 
 OUTPUT = Output()
 UR = UrConfig()
-LOOPBACK = (DEFAULT_ENDPOINT,)
-Duration = Annotated[float | None, Parameter(name=("--duration", "--duration-s"))]
 
 
 def publish_ur(

@@ -6,6 +6,7 @@ episode are found, and their scores become measurements, each with its protocol.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -288,7 +289,7 @@ def _measure_depth(
     return [
         measured(
             quantity.of(part=part, after=after),
-            lambda name=name: float(np.mean([getattr(depth, name) for depth in depths])),  # type: ignore[misc]
+            partial(_mean_depth_m, depths, name),
             n=len(depths),
             counted="image",
             reason_without_interval="the per-image list is in the table",
@@ -322,3 +323,7 @@ def _described(settings: Sequence[Mapping[str, Any]]) -> str:
         if agreed := agreed_setting(settings, name):
             parts.append(text.format(agreed))
     return "; ".join(parts)
+
+
+def _mean_depth_m(depths: Sequence[DepthScore], name: str) -> float:
+    return float(np.mean([getattr(depth, name) for depth in depths]))

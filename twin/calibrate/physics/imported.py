@@ -18,7 +18,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.episode.topics import TCP_POSE, cell_topic, object_topic
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import GstError
-from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
+from bridge.process_pool import Failed
 from bridge.terminal import Output
 from twin.calibrate.physics.push_fit import METHOD, load_push
 from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
@@ -26,7 +26,7 @@ from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
 from twin.replay.config import ReplayConfig, ReplayRunConfig
 from twin.replay.rebuilt_scene import calibrated
-from twin.replay.runner import chosen_episodes
+from twin.replay.runner import chosen_episodes, runner_for
 from twin.scene.store.calibration import Calibration, read_calibration
 
 ENGINE = "twin-pybullet"
@@ -173,10 +173,8 @@ def replay_imported(
     items, skipped = motion_replays(run, names, config.replay, force=config.force)
     if not items:
         return [], skipped
-    workers = config.workers or default_size()
-    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
     rows = []
-    with runner, output.progress("imported", len(items)) as advance:
+    with runner_for(config) as runner, output.progress("imported", len(items)) as advance:
         for done, (item, answer) in enumerate(
             runner.run(run_motion_replay, items, MotionReplay.cost), start=1
         ):

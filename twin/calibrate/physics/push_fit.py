@@ -18,7 +18,7 @@ from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
-from bridge.process_pool import Failed, ProcessPool, Runner, Serial, default_size
+from bridge.process_pool import Failed, Runner, runner_of
 from bridge.terminal import Output
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.pushes import (
@@ -163,9 +163,7 @@ def calibrate_pushes(
         )
         raise UnusablePushError(message)
     output.say(f"{len(pushes)} pushes: {len(fitted)} identify, {len(held_out)} are held out")
-    workers = config.workers or default_size()
-    runner: Runner = ProcessPool(workers) if workers > 1 else Serial()
-    with runner:
+    with runner_of(config.workers) as runner:
         grid = _simulate(run, fitted, runner, output)
     best = least(grid, range(len(fitted)))
     straight = least(grid[:, :1], range(len(fitted)))

@@ -208,5 +208,4 @@ def _view_line(views: Mapping[str, Any]) -> str:
         return "no frame could be held out: too few frames"
     stationary = sum(bool(item["stationary_camera"]) for item in images)
     which = f", {stationary} of cameras that stand still" if stationary else ""
-    mean_db = sum(item["psnr_db"] for item in images) / len(images)
-    return f"held-out views ({len(images)}{which}): PSNR {mean_db:.2f} dB"
+    return f"held-out views ({len(images)}{which}): PSNR {views['psnr_db']:.2f} dB"

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from bridge import process_pool
 from bridge.episode import schema
 from bridge.episode.cdr.messages import string_to_cdr
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.writer import EpisodeWriter
 from bridge.task.task_file import load_task
-from twin.replay import runner
 from twin.replay.config import ReplayConfig
 from twin.replay.job import ReplayJob
 from twin.replay.scene import StartState
@@ -61,4 +61,4 @@ def jobs(tmp_path: Path, script: SimpleNamespace) -> list[ReplayJob]:
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test replaces is in this process: others start only where a test asks for them."""
-    monkeypatch.setattr(runner, "default_size", lambda: 1)
+    monkeypatch.setattr(process_pool, "default_size", lambda: 1)
