@@ -5,7 +5,7 @@
 # make bench   benchmarks against named references; BENCH=record picks those of the recorder
 # make sanitize  C++ under ASan and UBSan   make tidy  clang-tidy   make cross  C++ for aarch64
 # make wheel-test  sdist and wheel, the wheel installed and its demo run outside the checkout
-# Everything lives in .venv. make demo installs what the demo needs (3.3 GB); the others add the
+# Everything lives in .venv. make demo installs what the demo needs (3.0 GB); the others add the
 # rest, torch among it, and say first how large it is. make test TORCH=no leaves torch out.
 
 .DEFAULT_GOAL := help

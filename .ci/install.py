@@ -36,18 +36,28 @@ BUILD_TOOLS = ("scikit-build-core>=1.0", "nanobind>=2.4", "cmake", "ninja")
 SELDOM_IMPORTED = "/tests/|/transformers/models/"
 BYTECODE = ("-W", "ignore", "-m", "compileall", "-qq", "-j", "0", "-x", SELDOM_IMPORTED)
 """Compiles all packages but what is compiled when it is imported, a quarter of all lines."""
+UNUSED = (
+    "cmeel.prefix/include",
+    "open3d/open3d_tf_ops.so",
+    "open3d/open3d_torch_ops.so",
+    "pybullet_data/data",
+    "pybullet_data/policies",
+    "pybullet_data/random_urdfs",
+    "pyarrow/include",
+)
+"""C++ headers, operators for other versions of torch, and examples: 350 MB that nothing reads."""
 EXTRAS = {
     "demo": "demo",
     "test": "all,dev",
     "test no-torch": "demo,cluster,video,realsense,ur,dev",
 }
 DEMO = {
-    "open3d": (401, 903),
+    "open3d": (401, 823),
     "rerun-sdk": (171, 490),
     "example-robot-data": (131, 442),
-    "pin": (80, 377),
-    "pybullet": (103, 288),
-    "pyarrow": (55, 165),
+    "pin": (80, 219),
+    "pybullet": (103, 216),
+    "pyarrow": (55, 159),
     "scipy": (35, 118),
 }
 TEST = {
@@ -58,7 +68,7 @@ TEST = {
     "av": (36, 104),
 }
 TORCH = {"transformers": (13, 100)}
-OTHERS = {"demo": (177, 535), "test": (120, 700), "test no-torch": (105, 625)}
+OTHERS = {"demo": (177, 499), "test": (120, 700), "test no-torch": (105, 625)}
 TORCH_CPU, TORCH_CUDA = (192, 695), (2741, 4543)
 """Megabytes to download and installed, measured on Linux x86-64 with Python 3.11."""
 
@@ -190,8 +200,19 @@ def install(stage: str, megabytes: int) -> int:
         tail = LOG.read_text(encoding="utf-8").splitlines()[-25:]
         sys.stderr.write("\n".join([*tail, f"pip failed; all it said is in {LOG}.", ""]))
         return 1
+    remove_unused()
     say(f"Installed in {time.monotonic() - started:.0f} s; what pip said is in {LOG}")
     return 0
+
+
+def remove_unused() -> None:
+    """Delete the large parts of packages that nothing reads."""
+    for name in UNUSED:
+        place = SITE / name
+        if place.is_dir():
+            shutil.rmtree(place)
+        else:
+            place.unlink(missing_ok=True)
 
 
 def run(command: list[str], progress: "Progress", log: TextIO) -> int:
