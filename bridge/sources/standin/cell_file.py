@@ -1,6 +1,8 @@
 """The cell file: what the laboratory publishes of itself, and the ranges of what it hides."""
 
+import tomllib
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,9 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS
+from bridge.sources.standin.clutter import CLUTTER
 from bridge.sources.standin.deviations import RANGES, Deviations, draw_deviations
-from bridge.task.meshes.toys import DESIGNS
-from bridge.task.task_file import Task, read_tables
+from bridge.task.task_file import Task
 
 SCHEMA_VERSION = 1
 PERCEPTIONS = ("noise", "gate")
@@ -199,8 +201,8 @@ def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoi
 
 def _clutter_from(table: dict[str, Any]) -> Clutter:
     shape = table["shape"]
-    if shape != "box" and shape not in DESIGNS:
-        message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(DESIGNS))}"
+    if shape != "box" and shape not in CLUTTER:
+        message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(CLUTTER))}"
         raise ValueError(message)
     yaw = table["yaw_rad"]
     q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
@@ -326,3 +328,11 @@ def small_transform(
     axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
     q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
     return se3.transform_from(q, shift_m)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Parse a TOML file, with one clear sentence when it is broken."""
+    try:
+        return tomllib.loads(path.read_text())
+    except (ValueError, OSError) as error:  # not TOML, not text, not readable
+        raise UsageError(f"{path} cannot be read as TOML: {error}.") from error

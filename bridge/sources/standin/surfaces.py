@@ -18,9 +18,10 @@ from scipy.ndimage import gaussian_filter, zoom
 from bridge.geometry import se3
 from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
+from bridge.sources.standin.clutter import CLUTTER
 from bridge.sources.standin.deviations import Deviations, parts_of
 from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, true_links
-from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
+from bridge.task.meshes.catalogue import ToyMesh, object_mesh, scaled_mesh
 from bridge.task.meshes.toys import Paint
 from bridge.task.task_file import ObjectModel, Task
 
@@ -302,7 +303,7 @@ def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
             box = box_surface("", np.zeros(3), np.array(item.size_m), (red, green, blue))
             surfaces.append(_placed(box, item.T_base_clutter))
         else:
-            surface = _mesh_surface("", toy_mesh(item.shape, item.size_m))
+            surface = _mesh_surface("", scaled_mesh(CLUTTER[item.shape], item.size_m))
             surfaces.append(_placed(surface, item.T_base_clutter))
     return surfaces
 
