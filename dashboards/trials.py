@@ -91,11 +91,7 @@ class Job:
 
 
 def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
-    """Write the protocol, do every job that is not done, replay and evaluate.
-
-    Raises:
-        DashboardError: When a command failed.
-    """
+    """Write the protocol, do every job that is not done, replay and evaluate."""
     protocol, chosen = protocol_of(config)
     learned = None
     if config.calibration is not None:
@@ -120,12 +116,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
 
 
 def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
-    """What the study will do, and by name how each of its tasks was asked for.
-
-    Raises:
-        UsageError: When a task or an arm is unknown, the arm control has no coin, or a model's
-            address is none or holds a secret.
-    """
+    """What the study will do, and by name how each of its tasks was asked for."""
     names = list(config.task)
     if EVERY_TASK in names:
         names = sorted(each.stem for each in (datasets_folder() / "tasks").glob("*.toml"))
@@ -200,11 +191,7 @@ def yes_shares(run: RunFolder) -> dict[str, tuple[int, int]]:
 
 
 def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
-    """Every start under every policy, numbered in the protocol's order.
-
-    Args:
-        chosen: How each task was asked for, by its name.
-    """
+    """Every start under every policy, numbered in the protocol's order."""
     jobs: list[Job] = []
     for task in protocol.tasks:
         for policy in protocol.policies:

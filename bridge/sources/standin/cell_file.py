@@ -115,9 +115,6 @@ def load_cell(name: str) -> CellFile:
     """Load ``datasets/cells/<name>.toml`` or a TOML file by path.
 
     A file that says ``like = "other"`` holds what differs from that cell.
-
-    Raises:
-        UsageError: Unknown name (lists those that exist), or a file that is no cell.
     """
     path = dataset_file("cells", name)
     table = read_tables(path)
@@ -286,12 +283,7 @@ class HiddenParameters:
 
 
 def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one.
-
-    Args:
-        task: Whose objects are in it; a cell may have other ranges for a task. Not needed for a
-            cell without deviations.
-    """
+    """Draw one laboratory; the same cell file and seed give the same one."""
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     own = {} if task is None else cell.ranges_of.get(task.name, {})
     ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}
@@ -319,11 +311,7 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
 def small_transform(
     shift_m: Float[np.ndarray, "3"], turn_rad: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Build a transform from a translation and a rotation vector [rad].
-
-    Args:
-        turn_rad: Axis of the rotation times its angle; zeros for none.
-    """
+    """Build a transform from a translation and a rotation vector [rad]."""
     angle = float(np.linalg.norm(turn_rad))
     axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
     q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])

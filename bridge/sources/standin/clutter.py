@@ -1,7 +1,4 @@
-"""What stands about on the stand-in's table and is nobody's task: a mug and a can.
-
-Natural frames: z up, the origin somewhere inside.
-"""
+"""What stands about on the stand-in's table and is nobody's task: a mug and a can, z up."""
 
 import numpy as np
 from jaxtyping import Float

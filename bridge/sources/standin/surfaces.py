@@ -52,11 +52,7 @@ class Texture:
 
 
 def table_texture(size_m: tuple[float, float], centre_m: tuple[float, float], seed: int) -> Texture:
-    """Wooden boards along y with grain, and patches of coloured tape and checkers.
-
-    Args:
-        centre_m: Its middle in the base frame, x and y [m].
-    """
+    """Wooden boards along y with grain, and patches of coloured tape and checkers."""
     rng = np.random.default_rng([7, seed])
     columns, rows = (round(extent / TABLE_RESOLUTION_M) for extent in size_m)
     wood = np.array([0.78, 0.63, 0.46])
@@ -162,11 +158,7 @@ def box_surface(
     size_m: Float[np.ndarray, "3"],
     color: tuple[float, float, float],
 ) -> Surface:
-    """A box with hard edges.
-
-    Args:
-        body: Name of the body it moves with; "" for the laboratory.
-    """
+    """A box with hard edges, of a body that moves or ("") of the laboratory."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
