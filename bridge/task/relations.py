@@ -107,7 +107,7 @@ def footprint_gap_m(
         t = np.clip((from_middle * along).sum(axis=-1), -lengths, lengths)
         away = np.linalg.norm(from_middle - t[..., None] * along, axis=-1)
         gaps.append(np.where(flat, away, np.inf).min(axis=-1))
-    return np.where(overlap <= 0, overlap, np.minimum(*gaps))
+    return np.asarray(np.where(overlap <= 0, overlap, np.minimum(*gaps)))
 
 
 def _gap_m(a: Box, b: Box) -> float:

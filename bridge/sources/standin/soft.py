@@ -113,7 +113,7 @@ def cage_weights(
     low_m: Float[np.ndarray, "3"],
     high_m: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "num_points 8"]:
-    """Trilinear weights of the nodes: ``weights @ nodes`` moves points; outside they extrapolate."""
+    """Trilinear weights: ``weights @ nodes`` moves points; outside the box they extrapolate."""
     s = (points_m - low_m) / (high_m - low_m)
     columns = [
         np.prod([s[:, k] if corner[k] else 1.0 - s[:, k] for k in range(3)], axis=0)
