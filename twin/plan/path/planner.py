@@ -214,7 +214,7 @@ def _searched(
         raise NoPathError(
             reason=REASONS[outcome], bodies=bodies, detail=detail, work=int(work["postures"])
         )
-    return knots
+    return np.asarray(knots)
 
 
 def timed_path(
