@@ -133,7 +133,7 @@ def search_rows(pairs: Pairs) -> list[Target]:
         decisions.append((time.process_time() - begun) * 1e3)
         accepted += int(decision.accepted)
         knots += len(path.times_s)
-        least = min(least, float(decision.clearance_m.min()))
+        least = min(least, decision.clearance_m)
     median, p95 = float(np.median(times)), float(np.percentile(times, 95))
     by_kind = ", ".join(
         f"{kind} {np.median([t for t, k in zip(times, pairs.kinds, strict=True) if k == kind]):.1f}"

@@ -233,7 +233,7 @@ def clearance_rows(num_states: int) -> list[Target]:
 
 def candidate_rows(lookup: object) -> list[Target]:
     from bridge.geometry import se3
-    from twin.plan.release.distances import candidate_clearance
+    from twin.plan.constrain.distances import grid_clearance
 
     rng = np.random.default_rng(SEED)
     points = rng.normal(size=(200, 3))
@@ -244,7 +244,7 @@ def candidate_rows(lookup: object) -> list[Target]:
         [se3.rotation_from_vector(v) for v in rng.uniform(-0.2, 0.2, (count, 3))]
     )
     Ts[:, :3, 3] = np.array([0.55, 0.3, 0.12]) + rng.uniform(-0.08, 0.08, (count, 3))
-    us = cpu_us(lambda: candidate_clearance(lookup, points, Ts), repeats=5, each=count)
+    us = cpu_us(lambda: grid_clearance(lookup, points, Ts), repeats=5, each=count)
     one_by_one = cpu_us(
         lambda: [lookup.distance(se3.apply(T, points)).min() for T in Ts[:500]],  # type: ignore[attr-defined]
         repeats=3,

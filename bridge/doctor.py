@@ -22,7 +22,7 @@ EXTRAS = {
         "read, write, check and list episodes",
         (
             *("numpy", "mcap", "cyclopts", "rich", "zstandard", "jaxtyping"),
-            *("jsonschema", "jsonschema-rs", "msgspec", "lz4"),
+            *("jsonschema-rs", "msgspec", "lz4"),
         ),
     ),
     "record": Extra(

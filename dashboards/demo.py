@@ -139,11 +139,7 @@ class Recorded:
 
 
 def look(run: RunFolder, config: DemoConfig) -> Recorded:
-    """Say what of the demo is recorded, and what of it is of no use.
-
-    Raises:
-        UsageError: When the folder holds episodes of anything else, or is being recorded into.
-    """
+    """Say what of the demo is recorded, and what of it is of no use."""
     found = Recorded()
     trials = {trial for group in groups_of(config) for trial in group.trials(config)}
     for path in sorted(run.episodes_dir.glob("*.part")):

@@ -134,12 +134,7 @@ class StageChart:
 
 
 def nice_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """Return round numbers (1, 2, 5 times a power of ten) within a range.
-
-    Args:
-        high: Upper end; a range that is empty or not finite has no ticks.
-        wanted: About how many ticks; fewer where the round step is larger.
-    """
+    """Return round numbers (1, 2, 5 times a power of ten) in a range; none if it is not finite."""
     if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
         return []
     rough = (high - low) / max(wanted, 1)
@@ -159,13 +154,7 @@ def _labels(values: Sequence[float]) -> list[str]:
 
 
 def axis(low: float, high: float, px_low: float, px_high: float, wanted: int = 5) -> Axis:
-    """Build an axis with round ticks; a single value gets a margin.
-
-    Args:
-        px_low: Where the least value is drawn [px].
-        px_high: Where the greatest value is drawn [px]; below ``px_low`` for an axis that points
-            up.
-    """
+    """Build an axis with round ticks between two places [px]; a single value gets a margin."""
     if high - low < 1e-12:
         margin = max(abs(low) * 0.1, 1e-3)
         low, high = low - margin, high + margin

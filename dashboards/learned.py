@@ -46,12 +46,7 @@ class Learned:
 
 
 def learned_in(run: RunFolder, protocol: Protocol) -> Learned:
-    """Read what a run learned, and check that a study may use it.
-
-    Raises:
-        UsageError: When it learned nothing of one of the study's tasks, in another laboratory, with
-            another task file, or from one of the study's starts.
-    """
+    """Read what a run learned, and check that a study may use it."""
     path, known = run.scene_dir / CALIBRATION_FILE, read_calibration(run)
     again = f"robot-gst calibrate {run.path} --posterior"
     record = {} if known is None else known.record

@@ -22,11 +22,7 @@ class Library:
 
     @staticmethod
     def open(paths: Sequence[Path]) -> "Library":
-        """Open every run folder; folders of the same name get a number.
-
-        Raises:
-            UsageError: When a path is not a run folder, or holds results alone.
-        """
+        """Open every run folder; folders of the same name get a number."""
         runs: dict[str, RunFolder] = {}
         for path in paths:
             run = RunFolder.open(path)
@@ -54,11 +50,7 @@ class Library:
 
 
 def episode_path(run: RunFolder, episode_id: str) -> Path:
-    """Return the file of a recorded episode; nothing outside the run folder is ever reached.
-
-    Args:
-        episode_id: As it stands in an address, so it may be anything.
-    """
+    """Return the file of a recorded episode; nothing outside the run folder is ever reached."""
     what = f"episode {episode_id!r}"
     for path in run.episodes():
         if path.stem == episode_id:
@@ -68,11 +60,7 @@ def episode_path(run: RunFolder, episode_id: str) -> Path:
 
 
 def derived_paths(run: RunFolder, episode_id: str, kind: str) -> list[Path]:
-    """Return the derived episodes of one kind (replay, localised, views) of one episode.
-
-    Args:
-        kind: replay, localised or views.
-    """
+    """Return the derived episodes of one kind (replay, localised, views) of one episode."""
     found = run.derived(f"{escape(episode_id)}.{kind}.*")
     return [path for path in found if _is_inside(run, path)]
 
@@ -87,11 +75,7 @@ def scene_stamps(run: RunFolder, path: Path) -> Stamps:
 
 
 def derived_path(run: RunFolder, name: str) -> Path:
-    """Return one derived episode by file name, among those that exist in the run.
-
-    Args:
-        name: File name as it stands in an address, so it may be anything.
-    """
+    """Return one derived episode by file name, among those that exist in the run."""
     for path in run.derived():
         if path.name == name:
             return _inside(run, path, f"derived episode {name!r}")

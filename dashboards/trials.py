@@ -29,14 +29,16 @@ from bridge.task.find import chosen_task_file
 from bridge.task.model_policy import server_of
 from bridge.task.plan import STUDY_ARMS
 from bridge.task.protocol import (
+    FILE_NAME,
     SEEDS_PER_SESSION,
     PolicyArms,
     Protocol,
     StudyTask,
-    keep_protocol,
+    read_protocol,
     with_coins,
 )
 from bridge.terminal import Output
+from bridge.whole_file import write_whole
 from dashboards.demo import (
     Background,
     StepFailedError,
@@ -89,11 +91,7 @@ class Job:
 
 
 def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
-    """Write the protocol, do every job that is not done, replay and evaluate.
-
-    Raises:
-        DashboardError: When a command failed.
-    """
+    """Write the protocol, do every job that is not done, replay and evaluate."""
     protocol, chosen = protocol_of(config)
     learned = None
     if config.calibration is not None:
@@ -118,12 +116,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
 
 
 def protocol_of(config: TrialsConfig) -> tuple[Protocol, dict[str, str]]:
-    """What the study will do, and by name how each of its tasks was asked for.
-
-    Raises:
-        UsageError: When a task or an arm is unknown, the arm control has no coin, or a model's
-            address is none or holds a secret.
-    """
+    """What the study will do, and by name how each of its tasks was asked for."""
     names = list(config.task)
     if EVERY_TASK in names:
         names = sorted(each.stem for each in (datasets_folder() / "tasks").glob("*.toml"))
@@ -198,11 +191,7 @@ def yes_shares(run: RunFolder) -> dict[str, tuple[int, int]]:
 
 
 def jobs_of(protocol: Protocol, chosen: dict[str, str]) -> list[Job]:
-    """Every start under every policy, numbered in the protocol's order.
-
-    Args:
-        chosen: How each task was asked for, by its name.
-    """
+    """Every start under every policy, numbered in the protocol's order."""
     jobs: list[Job] = []
     for task in protocol.tasks:
         for policy in protocol.policies:
@@ -439,3 +428,38 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
     for arm in job.arms:
         words += ["--study-arms", arm]
     return words
+
+
+CARRIED_OUT = (
+    *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
+    *("calibration_sha256", "calibration_from", "model_name", "model_address"),
+)
+"""What whoever carries a study out decides, too; the rest is the design's alone."""
+
+
+def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> None:
+    """Write a protocol before the first trial, or check that it is the one that was written.
+
+    A design that is there stays as it is, where what carries it out fits it.
+    """
+    path, there = run_path / FILE_NAME, read_protocol(run_path)
+    if there is None and has_trials:
+        message = f"{run_path} holds trials and no {FILE_NAME}: use a new folder for a study."
+        raise UsageError(message)
+    if there is None:
+        write_whole(path, protocol.to_json())
+        return
+    if there.edited:
+        raise UsageError(f"{path} was edited after it was written: put the written text back.")
+    compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
+    hidden = ("sha256", "edited")
+    names = [
+        name
+        for name in compared
+        if name not in hidden and getattr(there, name) != getattr(protocol, name)
+    ]
+    if names:
+        raise UsageError(
+            f"{path} was written before the first trial and says something else "
+            f"about: {', '.join(names)}. Give the same options again, or another folder."
+        )

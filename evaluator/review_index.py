@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bridge.episode.catalogue_store import printable
+from bridge.episode.catalogue_query import printable
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.provenance import software
 from bridge.episode.run_folder import PART, RunFolder

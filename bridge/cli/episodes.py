@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from bridge.episode.catalogue_store import UNLABELLED, CatalogueQuery
+from bridge.episode.catalogue_query import UNLABELLED, CatalogueQuery
 from bridge.errors import refuse_outside
 from bridge.terminal import Advance, Output
 from bridge.wire.config import LOOPBACK
 
 if TYPE_CHECKING:
-    from bridge.episode.catalogue_store import Entry
+    from bridge.episode.catalogue_query import Entry
     from bridge.episode.metadata import Outcome
     from bridge.episode.recovery_report import RecoveryReport
     from bridge.episode.run_folder import RunFolder

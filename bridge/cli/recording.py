@@ -182,7 +182,7 @@ def _with_task_file(about: EpisodeAbout) -> "tuple[EpisodeAbout, TaskFile | None
 
 def _describe_list(answer: dict[str, Any]) -> str:
     from bridge.cli.episodes import episode_table
-    from bridge.episode.catalogue_store import Entry
+    from bridge.episode.catalogue_query import Entry
     from bridge.episode.metadata import build
 
     entries = [build(Entry, item) for item in answer["episodes"]]

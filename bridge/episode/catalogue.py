@@ -1,25 +1,19 @@
-"""A run's episodes at a glance: listed, filtered and labelled.
-
-Opening an episode takes a third of a millisecond; a process that lists again opens only what
-changed.
-"""
+"""A run's episodes at a glance: listed, filtered and labelled."""
 
 import json
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from bridge.episode.assigned import TRIAL_SUFFIX, assign
-from bridge.episode.catalogue_store import (
+from bridge.episode.assigned import assign
+from bridge.episode.catalogue_query import (
     LABEL_SUFFIX,
     UNLABELLED,
     CatalogueQuery,
     printable,
-    stamp_of,
 )
-from bridge.episode.catalogue_store import Entry as Entry
+from bridge.episode.catalogue_query import Entry as Entry
 from bridge.episode.contract import PRESENCE_RECORD, presence_lines
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
@@ -31,10 +25,6 @@ from bridge.whole_file import write_whole
 
 Advance = Callable[[int, int], None]
 """Called as ``advance(done, total)`` while files are read."""
-_known: dict[Path, tuple[str, Entry]] = {}
-"""What this process read of a file, and what the disk said of it then."""
-
-
 EVERYTHING = CatalogueQuery()
 
 
@@ -44,25 +34,14 @@ def find_episodes(
     """Return the episodes that pass all filters; a broken one is listed with its error."""
     found = []
     episodes = run.episode_parts()
-    for done, (name, parts) in enumerate(episodes.items(), start=1):
-        entry = _current(run, run.episodes_dir / name, parts)
+    for done, name in enumerate(episodes, start=1):
+        entry = read_entry(run, run.episodes_dir / name)
         if query.takes(entry):
             found.append(entry)
         if advance is not None:
             advance(done, len(episodes))
     found.sort(key=query.sort_key, reverse=query.reverse)
     return found[: query.limit]
-
-
-def _current(run: RunFolder, path: Path, parts: Sequence[str]) -> Entry:
-    notes = [run.notes_dir / f"{path.stem}{suffix}" for suffix in (LABEL_SUFFIX, TRIAL_SUFFIX)]
-    stamp = stamp_of([*(run.episodes_dir / part for part in parts), *notes], time.time_ns())
-    known = _known.get(path)
-    if stamp and known is not None and known[0] == stamp:
-        return known[1]
-    entry = read_entry(run, path)
-    _known[path] = (stamp, entry)
-    return entry
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:

@@ -8,13 +8,15 @@ and whether every number is one.
 import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from typing import TYPE_CHECKING, Any
 
 from bridge.errors import UsageError
-from bridge.task.record import find_problems
+from bridge.task.record import find_problems, schema_of
 
 if TYPE_CHECKING:
-    from jsonschema.exceptions import ValidationError
+    from jsonschema_rs import ValidationError
 
 SCHEMA_VERSION = 1
 GRIPPER, TABLE = "gripper", "table"
@@ -42,23 +44,16 @@ class TaskFileError(UsageError):
 
 
 def task_problems(table: Mapping[str, Any]) -> list[str]:
-    """List what is wrong with the content of a task file; nothing for a good one.
-
-    Returns:
-        One line each: the place, what was found, what is allowed, and the nearest name.
-    """
+    """List what is wrong with the content of a task file, one line each; nothing for a good one."""
     version = table.get("schema_version")
     if type(version) is int and version > SCHEMA_VERSION:
         return [
             f"schema_version: {version} is newer than the {SCHEMA_VERSION} this version reads. "
             "Upgrade robot-gst."
         ]
-    found = [_sentence(error) for error in find_problems(table, name="task")]
-    found += [
-        f"{_place(path)}: {value} is not a number"
-        for path, value in _numbers(table)
-        if not math.isfinite(value)
-    ]
+    if odd := [f"{_place(path)}: {what}" for path, what in _odd(table)]:
+        return odd
+    found = sorted(_sentence(error) for error in find_problems(table, name="task"))
     return list(dict.fromkeys(found)) or list(_references(table))
 
 
@@ -82,34 +77,31 @@ def _names(known: Iterable[str]) -> str:
     return ", ".join(sorted(known)) or "none"
 
 
-def _numbers(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, float]]:
-    if isinstance(value, float):
-        yield path, value
-    elif isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _numbers(inner, (*path, key))
-    elif isinstance(value, list):
-        for index, inner in enumerate(value):
-            yield from _numbers(inner, (*path, index))
+def _odd(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, str]]:
+    """What TOML can hold and no task: numbers that are none, dates and times."""
+    if isinstance(value, Mapping | list):
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _odd(inner, (*path, key))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield path, f"{value} is not a number"
+    elif not isinstance(value, str | int | float):
+        yield path, f"{value} is a date or a time, and none is asked for"
 
 
 def _sentence(error: "ValidationError") -> str:
-    """One finding of jsonschema, with the names that are known where one is not."""
-    place, value = _place(error.absolute_path), error.instance
-    match error.validator:
+    """One finding, with the names that are known where one is not."""
+    place, value, about = _place(error.instance_path), error.instance, error.kind.as_dict()
+    match error.kind.name:
         case "additionalProperties":
-            known = error.schema["properties"]
-            wrong = [key for key in value if key not in known]
+            known = reduce(getitem, error.schema_path[:-1], schema_of("task"))["properties"]
+            wrong = about["unexpected"]
             said = "; ".join(f"unknown key {key!r}.{nearest(key, known)}" for key in wrong)
             return f"{place}: {said} Allowed: {_names(known)}."
         case "enum":
-            known = error.validator_value
-            return f"{place}: {value!r} is unknown. Known: {_names(known)}.{_near(value, known)}"
+            known = about["options"]
+            near = nearest(value, known) if isinstance(value, str) else ""
+            return f"{place}: {value!r} is unknown. Known: {_names(known)}.{near}"
     return f"{place}: {error.message:.200}"
-
-
-def _near(value: Any, known: Iterable[str]) -> str:
-    return nearest(value, known) if isinstance(value, str) else ""
 
 
 def _references(table: Mapping[str, Any]) -> Iterator[str]:

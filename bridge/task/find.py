@@ -50,10 +50,8 @@ def find_task_file(
 ) -> TaskFile:
     """Find a task file by name: the episode's attachment, the run's ``tasks/``, those shipped.
 
-    Where the episode says with which file it was recorded, only that very text will do.
-
-    Args:
-        name: Of the task; never read as a path.
+    Where the episode says with which file it was recorded, only that very text will do. The name is
+    never read as a path.
     """
     looked: list[str] = []
     wanted = attached.sha256
@@ -136,9 +134,6 @@ def union_of(files: Iterable[TaskFile]) -> Task | None:
     """Join the objects of several tasks: a scene may hold those of all; None without any.
 
     Name, stages and success are those of the first.
-
-    Raises:
-        UsageError: When two files define one object differently; names both.
     """
     joined: Task | None = None
     defined: dict[str, tuple[ObjectModel, str]] = {}

@@ -73,10 +73,6 @@ def evaluate_contacts(task: Task, rollout: Rollout, *, tolerance_m: float = 0.0)
     """Say whether nothing touched what it may not, from the start of the execution to its end.
 
     Asked of every rollout; the tolerance of a task that lists the predicate itself counts.
-
-    Args:
-        task: Its own ``allowed_contacts`` predicate is used where it has one.
-        tolerance_m: Depth up to which two bodies do not count as touching.
     """
     listed = (spec for spec in task.success if spec["kind"] == ALLOWED_CONTACTS)
     spec = next(listed, {"kind": ALLOWED_CONTACTS, "tolerance_m": tolerance_m})
@@ -99,11 +95,7 @@ def is_goal(spec: Mapping[str, Any]) -> bool:
 
 
 def already_true_at_start(task: Task, rollout: Rollout) -> bool:
-    """Say whether the geometric part of the goal held before anything moved (a useless trial).
-
-    Args:
-        task: Of its predicates only goals are looked at, see ``is_goal``.
-    """
+    """Say whether the geometric part of the goal held before anything moved (a useless trial)."""
     start = Rollout(
         stamps_ns=rollout.stamps_ns[:1],
         Ts_base_object={key: Ts[:1] for key, Ts in rollout.Ts_base_object.items()},

@@ -11,9 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bridge.errors import UsageError
 from bridge.task.record import check_record, made_of, parse_record
-from bridge.whole_file import write_whole
 
 Item = TypeVar("Item")
 
@@ -149,12 +147,7 @@ class Protocol:
         return _shuffled(all_, STARTS_STREAM, self.study_seed)
 
     def policies_at(self, task: StudyTask, start: int) -> list[PolicyArms]:
-        """Return the policies in the order in which they try one start.
-
-        Args:
-            task: One of ``tasks``.
-            start: Counted from 0.
-        """
+        """Return the policies in the order in which they try one start."""
         seeds = self.study_seed, task.start_seed(start)
         return _shuffled(self.policies, STARTS_STREAM, *seeds)
 
@@ -217,45 +210,6 @@ def read_protocol(run_path: Path) -> Protocol | None:
     """Return a run's protocol, None where it has none."""
     path = run_path / FILE_NAME
     return Protocol.from_json(path.read_bytes()) if path.is_file() else None
-
-
-CARRIED_OUT = (
-    *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
-    *("calibration_sha256", "calibration_from", "model_name", "model_address"),
-)
-"""What whoever carries a study out decides, too; the rest is the design's alone."""
-
-
-def keep_protocol(run_path: Path, protocol: Protocol, *, has_trials: bool) -> None:
-    """Write a protocol before the first trial, or check that it is the one that was written.
-
-    A design that is there stays as it is, where what carries it out fits it.
-
-    Raises:
-        UsageError: When another protocol is there, or trials are and none is, or the file was
-            edited.
-    """
-    path, there = run_path / FILE_NAME, read_protocol(run_path)
-    if there is None and has_trials:
-        message = f"{run_path} holds trials and no {FILE_NAME}: use a new folder for a study."
-        raise UsageError(message)
-    if there is None:
-        write_whole(path, protocol.to_json())
-        return
-    if there.edited:
-        raise UsageError(f"{path} was edited after it was written: put the written text back.")
-    compared = CARRIED_OUT if protocol.primary is None else Protocol.__dataclass_fields__
-    hidden = ("sha256", "edited")
-    names = [
-        name
-        for name in compared
-        if name not in hidden and getattr(there, name) != getattr(protocol, name)
-    ]
-    if names:
-        raise UsageError(
-            f"{path} was written before the first trial and says something else "
-            f"about: {', '.join(names)}. Give the same options again, or another folder."
-        )
 
 
 def with_coins(protocol: Protocol, coins: dict[str, float], coin_from: str) -> Protocol:

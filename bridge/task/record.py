@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,76 +14,54 @@ from bridge.errors import InvalidRecordError
 
 if TYPE_CHECKING:
     import jsonschema_rs
-    from jsonschema import Draft202012Validator
-    from jsonschema.exceptions import ValidationError
 
 
 Record = TypeVar("Record")
 
 
 @cache
-def _schema(package: str, path: str) -> Any:
+def schema_of(name: str, package: str = "bridge.task") -> Any:
     """Load one of our JSON Schemas, once."""
-    return json.loads(resources.files(package).joinpath(path).read_text())
+    return json.loads(resources.files(package).joinpath(f"schemas/{name}.schema.json").read_text())
 
 
 @cache
-def _quick(package: str, path: str) -> "jsonschema_rs.Draft202012Validator":
+def _validator(name: str, package: str) -> "jsonschema_rs.Draft202012Validator":
     import jsonschema_rs  # noqa: PLC0415  # most commands check no record
 
-    return jsonschema_rs.Draft202012Validator(_schema(package, path))
-
-
-def _is_sure(record: Mapping[str, Any], package: str, path: str) -> bool:
-    """Whether a record surely fits.
-
-    ``jsonschema`` takes a quarter of a millisecond for a record of twenty fields, so that it is
-    asked only where this says no: it alone says what does not fit and where.
-    """
-    try:
-        return _quick(package, path).is_valid(record)
-    except ValueError:  # text that is no Unicode, NumPy's own numbers, or too deep
-        return False
-
-
-@cache
-def _validator(package: str, path: str) -> "Draft202012Validator":
-    from jsonschema import Draft202012Validator  # noqa: PLC0415  # only what does not fit needs it
-
-    return Draft202012Validator(_schema(package, path))
+    return jsonschema_rs.Draft202012Validator(schema_of(name, package))
 
 
 def check_record(
     record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
 ) -> Mapping[str, Any]:
     """Return the record if it fits ``schemas/<name>.schema.json``."""
-    path = f"schemas/{name}.schema.json"
-    version = record.get("schema_version")
-    known = _schema(package, path)["version"]
+    version, known = record.get("schema_version"), schema_of(name, package)["version"]
     if isinstance(version, int) and version > known:
         raise InvalidRecordError(
             name=name,
             where="schema_version",
             found=f"version {version} is newer than the {known} this reader knows; upgrade",
         )
-    if _is_sure(record, package, path):
-        return record
-    error = next(iter(_validator(package, path).iter_errors(record)), None)
-    if error is not None:
-        where = "/".join(str(part) for part in error.absolute_path)
+    for error in find_problems(record, name=name, package=package):
+        where = "/".join(str(part) for part in error.instance_path)
         raise InvalidRecordError(name=name, where=where, found=error.message[:300])
     return record
 
 
 def find_problems(
     record: Mapping[str, Any], *, name: str, package: str = "bridge.task"
-) -> list["ValidationError"]:
-    """List everything in a record that does not fit ``schemas/<name>.schema.json``, by place."""
-    path = f"schemas/{name}.schema.json"
-    if _is_sure(record, package, path):
-        return []
-    errors = _validator(package, path).iter_errors(record)
-    return sorted(errors, key=lambda error: [str(part) for part in error.absolute_path])
+) -> list["jsonschema_rs.ValidationError"]:
+    """List everything in a record that does not fit ``schemas/<name>.schema.json``."""
+    validator = _validator(name, package)
+    with suppress(ValueError):  # NumPy's own numbers, text that is no Unicode, or too deep
+        if validator.is_valid(record):
+            return []
+    try:  # numbers that are none are for those to refuse who read and write them
+        plain = json.loads(json.dumps(record), parse_constant=lambda _: 0.5)
+        return list(validator.iter_errors(plain))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InvalidRecordError(name=name, where="", found=str(error)[:300]) from error
 
 
 def made_of(kind: type[Record], record: Mapping[str, Any], *, name: str) -> Record:

@@ -40,6 +40,7 @@ BETWEEN_TOLERANCE_M = 0.03
 TILT_TOLERANCE_RAD = 0.17
 """Of ``upright`` and ``aligned`` where a task says nothing else, 10 degrees."""
 AXES = ("x", "y", "z")
+_PARALLEL_M = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,35 +74,44 @@ class Box:
         return np.asarray(self.T_base_box[:3, [AXES.index(name)]])
 
 
-def footprint_gap_m(a: Box, b: Box) -> float:
+def footprint_gap_m(
+    T_a: Float[np.ndarray, "*#batch 4 4"],
+    half_a_m: Float[np.ndarray, "3"],
+    T_b: Float[np.ndarray, "*#batch 4 4"],
+    half_b_m: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "..."]:
     """Horizontal gap between two boxes seen from above; negative: how deep they overlap [m].
 
     The difference of two projected boxes is a polygon with a pair of parallel edges for each
     edge direction (a zonotope, see Ziegler, Lectures on Polytopes, 7.3): the gap is the distance
     of the origin from it.
     """
-    centre = (a.centre_m - b.centre_m)[:2]
-    halves = [box.T_base_box[:2, :3] * box.half_m for box in (a, b)]
-    edges = np.concatenate(halves, axis=1).T
-    edges = edges[np.linalg.norm(edges, axis=1) > 1e-9]
-    if not len(edges):
-        return float(np.linalg.norm(centre))
-    along = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    normals = np.stack((-along[:, 1], along[:, 0]), axis=1)
-    across = normals @ edges.T
-    parallel = np.abs(across) < 1e-9
+    T_a, T_b = np.broadcast_arrays(T_a, T_b)
+    centre = (T_a[..., :2, 3] - T_b[..., :2, 3])[..., None, :]
+    halves = [T_a[..., :2, :3] * half_a_m, T_b[..., :2, :3] * half_b_m]
+    edges = np.concatenate(halves, axis=-1).swapaxes(-1, -2)
+    long = np.linalg.norm(edges, axis=-1)
+    flat = long > _PARALLEL_M  # an edge that points straight up has no direction from above
+    along = edges / np.where(flat, long, 1.0)[..., None]
+    normals = np.stack((-along[..., 1], along[..., 0]), axis=-1)
+    across = normals @ edges.swapaxes(-1, -2)
+    parallel = np.abs(across) < _PARALLEL_M
     across = np.where(parallel, 0.0, across)
-    depth = np.abs(normals @ centre) - np.abs(across).sum(axis=1)
-    if np.all(depth <= 0):
-        return float(depth.max())
-    lengths = np.where(parallel, np.abs(along @ edges.T), 0.0).sum(axis=1)
+    depth = np.abs((normals * centre).sum(axis=-1)) - np.abs(across).sum(axis=-1)
+    overlap = np.where(flat, depth, -np.inf).max(axis=-1)
+    lengths = np.where(parallel, np.abs(along @ edges.swapaxes(-1, -2)), 0.0).sum(axis=-1)
     to_middle = np.sign(across) @ edges
-    distances = []
+    gaps = []
     for sign in (1.0, -1.0):
         from_middle = -(centre + sign * to_middle)
-        t = np.clip((from_middle * along).sum(axis=1), -lengths, lengths)
-        distances.append(np.linalg.norm(from_middle - t[:, None] * along, axis=1))
-    return float(np.min(distances))
+        t = np.clip((from_middle * along).sum(axis=-1), -lengths, lengths)
+        away = np.linalg.norm(from_middle - t[..., None] * along, axis=-1)
+        gaps.append(np.where(flat, away, np.inf).min(axis=-1))
+    return np.asarray(np.where(overlap <= 0, overlap, np.minimum(*gaps)))
+
+
+def _gap_m(a: Box, b: Box) -> float:
+    return float(footprint_gap_m(a.T_base_box, a.half_m, b.T_base_box, b.half_m))
 
 
 def direction_of(value: str | Sequence[int | float]) -> Float[np.ndarray, "3"]:
@@ -148,7 +158,7 @@ def on(spec: Mapping[str, Any], boxes: Boxes) -> Found:
 
 def outside(spec: Mapping[str, Any], boxes: Boxes) -> Found:
     """Whether an object is wholly out of a container, rim included, seen from above."""
-    gap_m = footprint_gap_m(boxes[spec["object"]], boxes[spec["container"]])
+    gap_m = _gap_m(boxes[spec["object"]], boxes[spec["container"]])
     detail = (
         f"{spec['object']} is {abs(gap_m) * 1e3:.0f} mm "
         f"{'away from' if gap_m >= 0 else 'within'} {spec['container']}, seen from above"
@@ -164,7 +174,7 @@ def beside(spec: Mapping[str, Any], boxes: Boxes) -> Found:
     """
     thing, other = boxes[spec["object"]], boxes[spec["reference"]]
     least, most = spec.get("gap_m", BESIDE_GAP_M)
-    gap_m = footprint_gap_m(thing, other)
+    gap_m = _gap_m(thing, other)
     level = _overlap_m(thing, other) > 0
     detail = (
         f"{spec['object']} is {abs(gap_m) * 1e3:.0f} mm "

@@ -8,11 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from bridge.data_files import dataset_file
-from bridge.errors import UsageError
+from bridge.errors import InvalidRecordError, UsageError
 from bridge.geometry import se3
 from bridge.task.check import TaskFileError, task_problems
 
@@ -124,7 +125,7 @@ class Task:
     instruction: str
     objects: dict[str, ObjectModel]
     manipulated: tuple[str, ...]
-    containers: tuple[str, ...]
+    containers: tuple[str, ...] = ()
     start: dict[str, StartRange]
     stages: tuple[dict[str, Any], ...]
     success: tuple[dict[str, Any], ...]
@@ -222,69 +223,20 @@ def _parsed(data: bytes) -> Task | tuple[str, ...]:
         return (f"cannot be read as TOML: {error}",)
     try:
         problems = tuple(task_problems(table))
-    except RecursionError:
+    except (RecursionError, InvalidRecordError):
         return ("nested too deeply",)
     return problems or _task_from(table)
 
 
-def read_tables(path: Path) -> dict[str, Any]:
-    """Parse a TOML file, with one clear sentence when it is broken."""
-    try:
-        return tomllib.loads(path.read_text())
-    except (ValueError, OSError) as error:  # not TOML, not text, not readable
-        raise UsageError(f"{path} cannot be read as TOML: {error}.") from error
-
-
 def _task_from(table: dict[str, Any]) -> Task:
     """Make a task of a table in which nothing is wrong."""
-    return Task(
-        name=table["name"],
-        instruction=table["instruction"],
-        objects={key: _object_from(key, value) for key, value in table["objects"].items()},
-        manipulated=tuple(table["manipulated"]),
-        containers=tuple(table.get("containers", ())),
-        start={
-            key: StartRange(**{name: _floats(values) for name, values in each.items()})
-            for key, each in table["start"].items()
-        },
-        stages=tuple(table["stages"]),
-        success=tuple(table["success"]),
-        cell=table.get("cell", "standin"),
-        derived=table.get("derived"),
-        grip_force_N=None if (force := table.get("grip_force_N")) is None else float(force),
-    )
+    objects = {key: {"id": key, **_sized(about)} for key, about in table["objects"].items()}
+    return msgspec.convert({**table, "objects": objects}, Task)
 
 
-def _object_from(object_id: str, table: dict[str, Any]) -> ObjectModel:
-    shape, mesh = table["shape"], table.get("mesh")
-    wall = 0.0
-    if shape == "open_box" or mesh == BASKET:
-        wall = float(table["wall_m"])
-        x, y, z = _floats(table["inner_m"])
-        size = (x + 2 * wall, y + 2 * wall, z + wall)
-    else:
-        size = _floats(table["size_m"])
-    return ObjectModel(
-        id=object_id,
-        shape=shape,
-        size_m=size,
-        wall_m=wall,
-        color_srgb=tuple(table["color_srgb"]),
-        mass_kg=float(table.get("mass_kg", 0.1)),
-        fixed=table.get("fixed", False),
-        symmetry=table.get("symmetry", "none"),
-        mesh=mesh,
-        soft=_soft_from(table.get("soft")),
-        grasp_m=_floats(table.get("grasp_m", (0.0, 0.0, 0.004))),
-    )
-
-
-def _soft_from(table: dict[str, float] | None) -> SoftMaterial | None:
-    if table is None:
-        return None
-    return SoftMaterial(**{key: float(value) for key, value in table.items()})
-
-
-def _floats(values: Any) -> tuple[Any, ...]:
-    """Lengths may be written without a point: 1 for 1.0."""
-    return tuple(map(float, values))
+def _sized(about: dict[str, Any]) -> dict[str, Any]:
+    """Add the outer extents of what is given by its cavity; no other shape has walls."""
+    if about["shape"] != "open_box" and about.get("mesh") != BASKET:
+        return {**about, "wall_m": 0.0}
+    (x, y, z), wall = about["inner_m"], float(about["wall_m"])
+    return {**about, "size_m": (x + 2 * wall, y + 2 * wall, z + wall)}

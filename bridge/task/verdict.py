@@ -8,9 +8,6 @@ from typing import Any
 from bridge.task.record import check_record, made_of, parse_record
 
 SCHEMA_VERSION = 1
-CHECKS = ("start", "task", "limits", "audit")
-"""Factors beside the three of I(tau), docs/gate.md: the plan starts where the robot is; it asks for
-no more than its task; the robot may do it; an independent library finds no less distance."""
 STAND_IN_ENGINE = "mujoco"
 """What moves the stand-in cell."""
 SAME_ENGINE = "same engine as the cell"
@@ -59,7 +56,7 @@ class Verdict:
     findings: tuple[dict[str, Any], ...] = ()
     """What each predicate said: side (replayed or recorded), kind, object, value, detail."""
     checks: Mapping[str, Factor] = field(default_factory=dict)
-    """Further factors, by their names in ``CHECKS``; one that was not asked for is absent."""
+    """Further factors, see docs/gate.md: start, task, limits, audit; absent: not asked for."""
     grasps: tuple[dict[str, Any], ...] = ()
     """What became of each grasp in the simulation: object, touched and held (yes or no), and
     p_object_m, where the tool was in the object's frame when a finger first touched it; a planner

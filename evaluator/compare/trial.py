@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
-from bridge.episode.catalogue_store import UNLABELLED
+from bridge.episode.catalogue_query import UNLABELLED
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import NOTHING_EXECUTED, Outcome, treatment_of
 from bridge.episode.reader import Episode

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from bridge.episode.assigned import TRIAL_SUFFIX
-from bridge.episode.catalogue_store import LABEL_SUFFIX
+from bridge.episode.catalogue_query import LABEL_SUFFIX
 from bridge.episode.provenance import hash_file
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder

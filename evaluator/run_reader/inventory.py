@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from bridge.episode.catalogue_store import stamp_of
+from bridge.episode.catalogue_query import stamp_of
 from bridge.episode.provenance import hash_files
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder

@@ -10,11 +10,11 @@ import pytest
 
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
-from bridge.task.protocol import SEEDS_PER_SESSION, keep_protocol, read_protocol
+from bridge.task.protocol import SEEDS_PER_SESSION, read_protocol
 from bridge.terminal import Output
 from dashboards.learned import Learned, learned_in
 from dashboards.standin_settings import TrialsConfig
-from dashboards.trials import jobs_of, protocol_of, run_trials
+from dashboards.trials import jobs_of, keep_protocol, protocol_of, run_trials
 from twin.scene.store.calibration import write_physics, write_posterior
 
 SESSION = 9000

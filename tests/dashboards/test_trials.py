@@ -13,11 +13,11 @@ from bridge.episode.metadata import EpisodeInfo, Outcome, to_strings
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
-from bridge.task.protocol import keep_protocol, read_protocol
+from bridge.task.protocol import read_protocol
 from bridge.terminal import Output
 from dashboards import trials
 from dashboards.standin_settings import TrialsConfig
-from dashboards.trials import Job, command_of, jobs_of, protocol_of, run_trials
+from dashboards.trials import Job, command_of, jobs_of, keep_protocol, protocol_of, run_trials
 
 QUIET = Output(quiet=True)
 ARMS = ("without", "with", "control")

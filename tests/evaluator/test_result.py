@@ -34,14 +34,6 @@ def test_results_survive_writing_and_reading(six_trials: Any, tmp_path: Path) ->
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_results_that_fit_are_checked_without_the_slow_jsonschema(
-    six_trials: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    results = compare_run(six_trials.run).results()
-    monkeypatch.setattr("bridge.task.record._validator", lambda *_: pytest.fail("was asked"))
-    assert load_results(write_results(results, tmp_path / "results.json")) == results
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_nan_never_becomes_a_measurement(value: float) -> None:
     with pytest.raises(ValueError, match="undefined and why"):

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from bridge.geometry.mesh import box_corners
-from twin.plan.release.distances import Boxes, candidate_clearance, lower_by_grid
+from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid
 from twin.replay.clearance.bodies import NearPairs, half_space_solid, solid_of
 from twin.replay.clearance.bounding_spheres import FINE_M, BoundingSpheres, bounding_spheres_of
 from twin.replay.clearance.distance_grid import GridLookup
@@ -176,5 +176,5 @@ def test_margins_of_points_are_their_distances_less_what_is_kept(grid: SdfGrid) 
         lower_by_grid(lookup, margins, 0.003, points, Ts)
         expected = np.minimum(np.minimum(to_boxes, to_grid), most)
         np.testing.assert_allclose(margins, expected, atol=1e-6)
-    nearest = candidate_clearance(lookup, points, Ts)
+    nearest = grid_clearance(lookup, points, Ts)
     np.testing.assert_allclose(nearest, to_grid.min(axis=1) + 0.003, atol=1e-6)

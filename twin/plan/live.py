@@ -1,9 +1,8 @@
 """A planner on the wire: a cell asks how a task is done from here; it remembers nothing."""
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,6 @@ from twin.plan.shapes import problem_of
 from twin.plan.usable_start import refuse_other_robot, refuse_unusable
 from twin.robot.model import load_robot
 
-PROPOSERS: Mapping[str, Callable[[], Proposer]] = {
-    policy: partial(PlanProposer, policy) for policy in POLICIES
-}
 GROUNDING = "gst localisation v1 of the request"
 MOST_CANDIDATES = 5
 """Plans that are made at once; a cell may ask for as many rounds."""
@@ -53,18 +49,12 @@ class LivePlanner:
         run: RunFolder,
         config: LivePlanConfig,
         urdf: Callable[[], str | None],
-        proposers: Mapping[str, Callable[[], Proposer]] = PROPOSERS,
+        proposer: Callable[[str], Proposer] = PlanProposer,
         words: PlanConfig | None = None,
     ) -> None:
-        """Prepare.
-
-        Args:
-            urdf: The robot's description, None before any.
-            words: Name the model that adds to plans of policy ``model``; None, or without a model:
-                that policy has none.
-        """
+        """Prepare; the robot's description is None before any, words name the model to be asked."""
         self._run, self._config, self._urdf = run, config, urdf
-        self._proposers = proposers
+        self._proposer = proposer
         self._words = words if words is not None and words.model else None
 
     def answer(self, payload: bytes) -> PlanAnswer:
@@ -81,8 +71,7 @@ class LivePlanner:
     @property
     def policies(self) -> list[str]:
         """Those whose requests are answered with plans."""
-        without = () if self._words else (MODEL_POLICY,)
-        return sorted(name for name in self._proposers if name not in without)
+        return sorted(name for name in POLICIES if self._words or name != MODEL_POLICY)
 
     def _planned(self, request: PlanRequest) -> PlanAnswer:
         if request.policy == MODEL_POLICY and self._words is None:
@@ -90,7 +79,7 @@ class LivePlanner:
                 "policy 'model' keeps what a vision-language model adds, and this planner asks "
                 "none. Start it with one: robot-gst plan RUN --live --model URL --model-name NAME."
             )
-        if request.policy not in self._proposers:
+        if request.policy not in POLICIES:
             known = ", ".join(self.policies)
             raise NoPlanError(f"policy {request.policy!r} is unknown. There are: {known}.")
         task = find_task_file(
@@ -117,7 +106,7 @@ class LivePlanner:
     def _chosen(self, request: PlanRequest, problem: Problem) -> Candidate:
         """The candidate of the request's round."""
         return choose(
-            self._proposers[request.policy](),
+            self._proposer(request.policy),
             problem,
             plan_id=f"plan_{request.round}",
             seed=request.seed,

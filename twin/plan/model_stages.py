@@ -47,22 +47,24 @@ class Asked:
 
     problem: Problem
     """Its task has the constraints that were added; as it was where the grammar answered."""
+    config: PlanConfig
     answered_by: str
-    understood: UnderstoodTask | None
-    """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
-    model: str
-    address: str
     remarks: tuple[str, ...]
+    understood: UnderstoodTask | None = None
+    """The task that a model made of an instruction; None: it is a file's, or the grammar's."""
 
     def lines(self) -> list[str]:
         """For a person: who answered, whom was asked, what was sent."""
-        head = f"stages: answered by {self.answered_by}; asked {self.address}"
+        head = f"stages: answered by {self.answered_by}; asked {self.config.model}"
         return [head, *(f"  {remark}" for remark in self.remarks)]
 
     @property
     def source(self) -> str:
         """Who answered and who was asked, for a plan."""
-        return f"stages: answered by {self.answered_by}; asked {self.model} at {self.address}"
+        config = self.config
+        return (
+            f"stages: answered by {self.answered_by}; asked {config.model_name} at {config.model}"
+        )
 
     def left_out(self, problem: Problem, why: Exception) -> "Asked":
         """The same without what the model added."""
@@ -74,7 +76,7 @@ class Asked:
         """The same as data."""
         return {
             "answered_by": self.answered_by,
-            "address": self.address,
+            "address": self.config.model,
             "remarks": list(self.remarks),
         }
 
@@ -82,35 +84,29 @@ class Asked:
 def ask_about(
     run: RunFolder, problem: Problem, config: PlanConfig, *, keep_refused: bool = False
 ) -> Asked:
-    """Ask the model of the settings for constraints; the grammar's stages are the fallback.
-
-    Args:
-        keep_refused: What came of asking is kept even where every reply was refused.
-    """
+    """Ask the model of the settings for constraints; without an answer the task stays as it is."""
     task = problem.scene.task
     vocabulary = Vocabulary.of_task(task)
     question = _question(run, problem, vocabulary, task.instruction)
     client = replace(client_of(run, config), keep_refused=keep_refused)
-    answer = ask_model(question, client, lambda: stages_in(task))
+    answer = ask_model(question, client)
+    asked = _asked(answer, config, problem)
     if answer.answered_by == BY_GRAMMAR:
-        return _asked(answer, config, problem)
+        return asked
     added, left_out = with_added(problem, answer.stages)
-    return _asked(answer, config, added, left_out=left_out)
+    return replace(asked, problem=added, remarks=(*asked.remarks, *left_out))
 
 
 def ask_for_goals(
     run: RunFolder, words: str, base: TaskFile, problem: Problem, config: PlanConfig
 ) -> Asked:
-    """Ask the model of the settings what an instruction wants; ``understood`` is the task of it.
-
-    Args:
-        problem: The start; of its task only the objects count.
-    """
+    """Ask the model of the settings what an instruction wants; ``understood`` is the task of it."""
     vocabulary = Vocabulary.of_task(problem.scene.task, objects_alone=True)
     question = _question(run, problem, vocabulary, words)
-    answer = ask_model(question, client_of(run, config), tuple)
+    answer = ask_model(question, client_of(run, config))
+    asked = _asked(answer, config, problem)
     if answer.answered_by == BY_GRAMMAR:
-        return _asked(answer, config, problem)
+        return asked
     try:
         things = vocabulary_of(base.task(), _instances(run))
         grounding = goals_in(answer.stages, words, things, f"{config.model_name} said so")
@@ -118,12 +114,15 @@ def ask_for_goals(
         derived = retasked(problem, file.task())
         refuse_unusable(derived)
     except GstError as error:
-        remarks = (f"its goals cannot be used: {error}", READ_INSTEAD)
-        answer = replace(answer, answered_by=BY_GRAMMAR)
-        return _asked(answer, config, problem, left_out=remarks)
-    understood = UnderstoodTask(file=file, grounding=grounding)
+        remarks = (*asked.remarks, f"its goals cannot be used: {error}", READ_INSTEAD)
+        return replace(asked, answered_by=BY_GRAMMAR, remarks=remarks)
     added, left_out = with_added(derived, answer.stages)
-    return _asked(answer, config, added, left_out=left_out, understood=understood)
+    return replace(
+        asked,
+        problem=added,
+        understood=UnderstoodTask(file=file, grounding=grounding),
+        remarks=(*asked.remarks, *left_out),
+    )
 
 
 def retasked(problem: Problem, task: Task) -> Problem:
@@ -175,22 +174,9 @@ def _question(run: RunFolder, problem: Problem, vocabulary: Vocabulary, words: s
     )
 
 
-def _asked(
-    answer: Answer,
-    config: PlanConfig,
-    problem: Problem,
-    *,
-    left_out: tuple[str, ...] = (),
-    understood: UnderstoodTask | None = None,
-) -> Asked:
-    return Asked(
-        problem=problem,
-        answered_by=answer.answered_by,
-        understood=understood,
-        model=config.model_name,
-        address=config.model,
-        remarks=(*answer.remarks, *left_out),
-    )
+def _asked(answer: Answer, config: PlanConfig, problem: Problem) -> Asked:
+    who, remarks = answer.answered_by, answer.remarks
+    return Asked(problem=problem, config=config, answered_by=who, remarks=remarks)
 
 
 def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
@@ -199,22 +185,6 @@ def client_of(run: RunFolder, config: PlanConfig) -> ModelConfig:
         url=config.model,
         model=config.model_name,
         cache=run.derived_dir / REPLIES,
-    )
-
-
-def stages_in(task: Task) -> tuple[Stage, ...]:
-    """The stages of a task file, as the grammar or a person wrote them."""
-    return tuple(
-        Stage(
-            id=str(table["id"]),
-            text=str(table.get("text", "")),
-            path=tuple(dict(way) for way in table.get("path", ())),
-            grasp=table.get("grasp"),
-            release=table.get("release"),
-            push=table.get("push"),
-            allowed_contacts=tuple((a, b) for a, b in table.get("allowed_contacts", ())),
-        )
-        for table in task.stages
     )
 
 

@@ -27,8 +27,8 @@ from twin.plan.config import PlanConfig
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.ground.run_tasks import UnderstoodTask, names_task, shown_task_file, understand
 from twin.plan.ground.vocabulary import GroundingError
-from twin.plan.live import PROPOSERS
-from twin.plan.loop.propose import Attempt, NoPlanError, Proposer, plan_and_verify
+from twin.plan.loop.nominal import POLICIES, PlanProposer
+from twin.plan.loop.propose import Attempt, NoPlanError, plan_and_verify
 from twin.plan.model_stages import Asked, ask_about, ask_for_goals, client_of, retasked
 from twin.plan.problem import Problem, State
 from twin.plan.shapes import problem_of
@@ -91,11 +91,7 @@ class Start:
 
 
 def start_of(run: RunFolder, task: Task, config: PlanConfig, robot: str = "") -> Start:
-    """Localise a task's objects at the start of the newest episode that shows them all.
-
-    Args:
-        robot: Robot file that takes the place of the recorded description; none: that one.
-    """
+    """Localise a task's objects at the start of the newest episode that shows them all."""
     run.refuse_empty()
     paths = run.episodes()
     if config.episode:
@@ -193,7 +189,9 @@ class Begun:
 
 def begin(run: RunFolder, words: str, config: PlanConfig, robot: str = "") -> Begun:
     """Find out what is to be done and from where; a model is asked first where one is given."""
-    proposer_of(config.policy)
+    if config.policy not in POLICIES:
+        known, near = ", ".join(sorted(POLICIES)), nearest(config.policy, POLICIES)
+        raise UsageError(f"no policy {config.policy!r}. There are: {known}.{near}")
     if config.model:
         client_of(run, config)
     if not config.model or names_task(words):
@@ -281,11 +279,7 @@ class Planned:
 def plan_once(
     run: RunFolder, begun: Begun, judge: Callable[[Plan], Verdict], config: PlanConfig
 ) -> Planned:
-    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay.
-
-    Args:
-        run: The accepted plan goes into its ``plans/``, those refused before beside it.
-    """
+    """Propose, have the twin judge, steer, until a plan is accepted; write each with its replay."""
     understood, start, asked = begun.understood, begun.start, begun.asked
     try:
         attempts = _attempts(
@@ -353,7 +347,7 @@ def _attempts(
 ) -> list[Attempt]:
     name = understood.file.task().name
     return plan_and_verify(
-        proposer_of(config.policy),
+        PlanProposer(config.policy),
         problem,
         judge,
         plan_id=f"{name}.{config.policy}.{config.seed}",
@@ -362,15 +356,6 @@ def _attempts(
         task_sha256=understood.file.sha256,
         grounding_source="" if asked is None else asked.answered_by,
     )
-
-
-def proposer_of(policy: str) -> Proposer:
-    """Who plans by a policy."""
-    if policy not in PROPOSERS:
-        known = ", ".join(sorted(PROPOSERS))
-        message = f"no policy {policy!r}. There are: {known}.{nearest(policy, PROPOSERS)}"
-        raise UsageError(message)
-    return PROPOSERS[policy]()
 
 
 def _attempt_line(attempt: Attempt) -> str:

@@ -15,6 +15,9 @@ from bridge.task.task_file import ObjectModel
 from twin.replay.scene import ReplayScene
 from twin.robot.model import RobotModel
 
+Array = Any
+"""``np.ndarray``, or a number for all states."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
@@ -44,6 +47,15 @@ class Problem:
         """The task file's nominal shape of an object."""
         return self.scene.task.objects[object_id]
 
+    def contacts_of(self, verb: str, object_id: str) -> frozenset[frozenset[str]]:
+        """Pairs that may touch in the stage that grasps, or releases, an object."""
+        return frozenset(
+            frozenset(pair)
+            for stage in self.scene.task.stages
+            if stage.get(verb) == object_id
+            for pair in stage.get("allowed_contacts", ())
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class State:
@@ -52,11 +64,11 @@ class State:
     Everything is batched over its first axis, ``num_states``.
     """
 
-    Ts_base_object: Mapping[str, Any]
+    Ts_base_object: Mapping[str, Array]
     """Per object ``(num_states, 4, 4)``; those that do not move are broadcast."""
-    T_base_tcp: Any
+    T_base_tcp: Array
     """``(num_states, 4, 4)``."""
-    width_m: Any
+    width_m: Array
     """``(num_states,)``, between the finger pads."""
 
     @staticmethod
@@ -90,8 +102,6 @@ class Grasp:
     """Arm at the grasp, from the base's side."""
     pregrasp_m: float
     """Length of the straight approach along the tool's z axis."""
-    contacts_m: Float[np.ndarray, "2 3"] | None = None
-    """Where the pads meet the surface, object frame; None: not known."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
 """The cell file: what the laboratory publishes of itself, and the ranges of what it hides."""
 
+import tomllib
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,9 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.robots.default import ARM_JOINTS
+from bridge.sources.standin.clutter import CLUTTER
 from bridge.sources.standin.deviations import RANGES, Deviations, draw_deviations
-from bridge.task.meshes.toys import DESIGNS
-from bridge.task.task_file import Task, read_tables
+from bridge.task.task_file import Task
 
 SCHEMA_VERSION = 1
 PERCEPTIONS = ("noise", "gate")
@@ -113,9 +115,6 @@ def load_cell(name: str) -> CellFile:
     """Load ``datasets/cells/<name>.toml`` or a TOML file by path.
 
     A file that says ``like = "other"`` holds what differs from that cell.
-
-    Raises:
-        UsageError: Unknown name (lists those that exist), or a file that is no cell.
     """
     path = dataset_file("cells", name)
     table = read_tables(path)
@@ -199,8 +198,8 @@ def _planners(table: dict[str, Any]) -> tuple[PlannerNoise, dict[str, PlannerNoi
 
 def _clutter_from(table: dict[str, Any]) -> Clutter:
     shape = table["shape"]
-    if shape != "box" and shape not in DESIGNS:
-        message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(DESIGNS))}"
+    if shape != "box" and shape not in CLUTTER:
+        message = f"clutter shape {shape!r}; known: box, {', '.join(sorted(CLUTTER))}"
         raise ValueError(message)
     yaw = table["yaw_rad"]
     q = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
@@ -284,12 +283,7 @@ class HiddenParameters:
 
 
 def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenParameters:
-    """Draw one laboratory; the same cell file and seed give the same one.
-
-    Args:
-        task: Whose objects are in it; a cell may have other ranges for a task. Not needed for a
-            cell without deviations.
-    """
+    """Draw one laboratory; the same cell file and seed give the same one."""
     rng = np.random.default_rng([HIDDEN_STREAM, seed])
     own = {} if task is None else cell.ranges_of.get(task.name, {})
     ranges = cell.uniform | {key: own[key] for key in own if key in cell.uniform}
@@ -317,12 +311,16 @@ def draw_hidden(cell: CellFile, seed: int, task: Task | None = None) -> HiddenPa
 def small_transform(
     shift_m: Float[np.ndarray, "3"], turn_rad: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Build a transform from a translation and a rotation vector [rad].
-
-    Args:
-        turn_rad: Axis of the rotation times its angle; zeros for none.
-    """
+    """Build a transform from a translation and a rotation vector [rad]."""
     angle = float(np.linalg.norm(turn_rad))
     axis = turn_rad / angle if angle > 0 else np.array([1.0, 0.0, 0.0])
     q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
     return se3.transform_from(q, shift_m)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Parse a TOML file, with one clear sentence when it is broken."""
+    try:
+        return tomllib.loads(path.read_text())
+    except (ValueError, OSError) as error:  # not TOML, not text, not readable
+        raise UsageError(f"{path} cannot be read as TOML: {error}.") from error

@@ -113,11 +113,7 @@ class Decider:
     def __init__(
         self, cell: StandinCell, session: Session, config: SessionConfig, task_sha256: str
     ) -> None:
-        """Prepare; nothing is asked before ``decide``.
-
-        Raises:
-            UsageError: When the built-in planner is asked for another policy than its own.
-        """
+        """Prepare; nothing is asked before ``decide``."""
         self._cell, self._session, self._config = cell, session, config
         self._task_sha256 = task_sha256
         built_in = config.planner == BUILT_IN

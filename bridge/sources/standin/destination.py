@@ -85,11 +85,7 @@ class Destination:
 def destination_of(
     task: Task, object_id: str, seen: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> Destination:
-    """Find where an object belongs by the success predicates, and where that is.
-
-    Raises:
-        UsageError: When no predicate says it, and there is neither mark nor container.
-    """
+    """Find where an object belongs by the success predicates, and where that is."""
     goal, mark = task.goal_of(object_id), task.mark_of(object_id)
     if goal in (None, ("on", TABLE)) and mark is not None:
         T = np.eye(4)
@@ -142,11 +138,7 @@ def _beside(
 
 
 def slots_of(places: Mapping[str, Destination]) -> dict[str, Float[np.ndarray, "2"]]:
-    """Share each destination among the objects that belong there.
-
-    Returns:
-        Where on the area of its destination each object goes [m].
-    """
+    """Share each destination among its objects: where on its area each goes [m]."""
     slots: dict[str, Any] = {}
     shared = {key: place for key, place in places.items() if place.relation != AT}
     for target in dict.fromkeys(place.id for place in shared.values()):
@@ -160,9 +152,6 @@ def release_slots(count: int, area_m: tuple[float, float]) -> list[Float[np.ndar
     """Where on an area several objects go: two rows along its x axis, from its middle [m].
 
     An odd last one lies between the rows; a single one goes to the middle.
-
-    Args:
-        area_m: Extents of the area along its x and y axes; heights are not decided here.
     """
     x, y = area_m
     columns = -(-count // 2)

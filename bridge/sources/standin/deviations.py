@@ -144,11 +144,7 @@ class Deviations:
     def put_down(
         self, task: Task, declared: Mapping[str, Float[np.ndarray, "4 4"]]
     ) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """Where things come to lie that are put where they were declared, resting on the table.
-
-        Args:
-            declared: Poses on the published table, the plane z = 0.
-        """
+        """Where things come to lie that were declared on the published table, the plane z = 0."""
         poses = {}
         for object_id, T in declared.items():
             model, known = task.objects[object_id], self.objects.get(object_id)
@@ -182,11 +178,7 @@ def _scaled(model: ObjectModel, scale: tuple[float, float, float]) -> ObjectMode
 
 
 def parts_of(model: ObjectModel, deviation: ObjectDeviation | None = None) -> list[BoxPart]:
-    """The boxes a rigid object collides with, and is seen as.
-
-    Args:
-        deviation: Steps along its edges, or a lip; None for the shape of the task file.
-    """
+    """The boxes a rigid object collides with, and is seen as."""
     if model.mesh == BASKET:
         return basket_parts(model.inner_m, model.wall_m)
     panels = model.panels()

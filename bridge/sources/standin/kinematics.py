@@ -73,14 +73,7 @@ class Kinematics:
         T_base_tcp: Float[np.ndarray, "4 4"],
         joints_seed_rad: Float[np.ndarray, "6"],
     ) -> Float[np.ndarray, "6"]:
-        """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3).
-
-        Args:
-            joints_seed_rad: Where the search begins; near the solution wanted.
-
-        Raises:
-            UnreachablePoseError: No convergence to 0.01 mm and 0.01 mrad within the limits.
-        """
+        """Solve the inverse problem from a nearby start: Levenberg-Marquardt on SE(3)."""
         target = pinocchio.SE3(T_base_tcp)
         joints = joints_seed_rad.astype(np.float64).copy()
         damping = DAMPING_START

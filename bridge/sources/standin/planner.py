@@ -59,12 +59,7 @@ def planned_stages(
     seen: Mapping[str, Float[np.ndarray, "4 4"]],
     places: Mapping[str, Destination | None],
 ) -> tuple[Stage, ...]:
-    """What a plan says of each stage of its task: when it is, and where it leaves its object.
-
-    Args:
-        bounds: When each stage begins and ends, from the start of the plan [ns].
-        places: Where each object belongs; None for one that is pushed to its mark.
-    """
+    """What a plan says of each stage of its task: when it is, and where it leaves its object."""
     stages = []
     for index, table in enumerate(task.stages):
         last = index == len(task.stages) - 1
@@ -154,12 +149,7 @@ NO_ERROR = GraspError(along_m=0.0, across_m=0.0, yaw_rad=0.0, height_m=0.0, rele
 
 
 def draw_error(noise: PlannerNoise, *, start_seed: int, round_: int, index: int = 0) -> GraspError:
-    """Draw how a candidate is wrong; the same start, round and object give the same error.
-
-    Args:
-        round_: Number of the attempt, from 0: one more for each plan that was refused.
-        index: Number of the object among those manipulated, from 0.
-    """
+    """Draw how a candidate is wrong; the same start, round and object give the same error."""
     # The first object's stream has no index: a task with one object draws what it always drew.
     more = [index] if index else []
     rng = np.random.default_rng([PLANNER_STREAM, start_seed, round_, *more])
@@ -410,11 +400,7 @@ def pushing_stage(task: Task, object_id: str) -> Mapping[str, Any] | None:
 
 
 def constant_speed(ramp: float) -> TimeLaw:
-    """Evenly faster, then even, then evenly slower: at rest at both ends.
-
-    Args:
-        ramp: Share of the time for speeding up, and again for slowing down; up to a half.
-    """
+    """Evenly faster, then even, then evenly slower: at rest at both ends."""
     top = 1 / (1 - ramp)
 
     def law(s: Float[np.ndarray, " num_times"]) -> Float[np.ndarray, " num_times"]:

@@ -89,11 +89,7 @@ class Renderer:
         backdrop: Layer | None = None,
         skins_m: Mapping[str, Float[np.ndarray, "num_vertices 3"]] | None = None,
     ) -> Picture:
-        """Take a picture of the bodies where they are, the soft ones by their skins.
-
-        Args:
-            backdrop: What ``backdrop`` returned for the same place; None draws the laboratory too.
-        """
+        """Take a picture of the bodies where they are, the soft ones by their skins."""
         which = self._moving if backdrop is not None else [*self._unmoving, *self._moving]
         posed = self._pose(T_base_camera, Ts_base_body, which, skins_m or {})
         seen = self._look(posed, _rays(camera, T_base_camera))
@@ -297,11 +293,7 @@ def measure_depth(
     hidden: HiddenParameters,
     rng: np.random.Generator,
 ) -> UInt16[np.ndarray, "height width"]:
-    """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement".
-
-    Args:
-        rng: Drawn from in a fixed order: the same state gives the same image.
-    """
+    """Depth in whole millimetres with bias, noise and holes; 0 is "no measurement"."""
     true_m = np.where(np.isfinite(picture.depth_m), picture.depth_m, 0.0)
     noise = rng.standard_normal(true_m.shape, dtype=np.float32)
     sigma_m = model.depth_noise_per_m * true_m**2

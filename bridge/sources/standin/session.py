@@ -31,12 +31,7 @@ def run_session(
     should_stop: Callable[[], bool] = lambda: False,
     start_ns: int | None = None,
 ) -> dict[str, Any]:
-    """Record a scan and trials as the configuration says.
-
-    Args:
-        should_stop: Asked every 8 ms of the cell's time; the open episode is then finished.
-        start_ns: The cell's time at the start; the wall clock's when not given.
-    """
+    """Record a scan and trials as the configuration says."""
     task_file = chosen_task_file(config.task)
     task = task_file.task()
     file = load_cell(config.cell_file or task.cell)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from bridge.geometry import se3
 from bridge.sources.standin.cell_file import HiddenParameters
 from bridge.task.meshes.catalogue import object_mesh
-from bridge.task.meshes.lattice import CORNERS, cage_nodes, cage_weights, make_lattice
+from bridge.task.meshes.lattice import CORNERS, make_lattice
 from bridge.task.task_file import ObjectModel, Task
 
 FLEX_RADIUS_M = 0.0005
@@ -99,3 +99,24 @@ def soft_body(model: ObjectModel, mujoco_model: Any) -> SoftBody:
         skin_weights=cage_weights(mesh.vertices_m, low, high),
         lattice_weights=cage_weights(lattice.points_m, low, high),
     )
+
+
+def cage_nodes(
+    low_m: Float[np.ndarray, "3"], high_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "8 3"]:
+    """Corners of a box in the order of ``CORNERS``: z runs fastest."""
+    return np.asarray(low_m + np.array(CORNERS, dtype=np.float64) * (high_m - low_m))
+
+
+def cage_weights(
+    points_m: Float[np.ndarray, "num_points 3"],
+    low_m: Float[np.ndarray, "3"],
+    high_m: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "num_points 8"]:
+    """Trilinear weights: ``weights @ nodes`` moves points; outside the box they extrapolate."""
+    s = (points_m - low_m) / (high_m - low_m)
+    columns = [
+        np.prod([s[:, k] if corner[k] else 1.0 - s[:, k] for k in range(3)], axis=0)
+        for corner in CORNERS
+    ]
+    return np.stack(columns, axis=1)

@@ -105,12 +105,7 @@ class Streams:
     def camera_poses(
         self, poses: Mapping[str, Float[np.ndarray, "4 4"]], stamp_ns: int, *, static: bool
     ) -> None:
-        """Publish where the colour cameras are believed to be in ``base_link``.
-
-        Args:
-            poses: ``T_base_camera`` by camera id, believed, not true.
-            static: They hold from now on (``/tf_static``); else at this instant (``/tf``).
-        """
+        """Publish where the colour cameras are believed to be in ``base_link``."""
         items = [
             FrameTransform(
                 stamp_ns=stamp_ns, parent=BASE_FRAME, child=color_frame(camera_id), T_parent_child=T
@@ -148,11 +143,7 @@ class Streams:
         depth_mm: UInt16[np.ndarray, "height width"],
         stamp_ns: int,
     ) -> None:
-        """Publish colour and depth of one instant.
-
-        Args:
-            depth_mm: Aligned with the colour; 0 is "no measurement".
-        """
+        """Publish colour and depth of one instant, aligned; a depth of 0 is "no measurement"."""
         color = CompressedColor(
             stamp_ns=stamp_ns,
             frame_id=color_frame(camera_id),

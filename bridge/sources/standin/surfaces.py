@@ -18,9 +18,10 @@ from scipy.ndimage import gaussian_filter, zoom
 from bridge.geometry import se3
 from bridge.robots.default import FINGER_LINKS
 from bridge.sources.standin.cell_file import Clutter
+from bridge.sources.standin.clutter import CLUTTER
 from bridge.sources.standin.deviations import Deviations, parts_of
 from bridge.sources.standin.world import TABLE_CENTRE_M, TABLE_SIZE_M, LinkShape, true_links
-from bridge.task.meshes.catalogue import ToyMesh, object_mesh, toy_mesh
+from bridge.task.meshes.catalogue import ToyMesh, object_mesh, scaled_mesh
 from bridge.task.meshes.toys import Paint
 from bridge.task.task_file import ObjectModel, Task
 
@@ -51,11 +52,7 @@ class Texture:
 
 
 def table_texture(size_m: tuple[float, float], centre_m: tuple[float, float], seed: int) -> Texture:
-    """Wooden boards along y with grain, and patches of coloured tape and checkers.
-
-    Args:
-        centre_m: Its middle in the base frame, x and y [m].
-    """
+    """Wooden boards along y with grain, and patches of coloured tape and checkers."""
     rng = np.random.default_rng([7, seed])
     columns, rows = (round(extent / TABLE_RESOLUTION_M) for extent in size_m)
     wood = np.array([0.78, 0.63, 0.46])
@@ -161,11 +158,7 @@ def box_surface(
     size_m: Float[np.ndarray, "3"],
     color: tuple[float, float, float],
 ) -> Surface:
-    """A box with hard edges.
-
-    Args:
-        body: Name of the body it moves with; "" for the laboratory.
-    """
+    """A box with hard edges, of a body that moves or ("") of the laboratory."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     faces = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -302,7 +295,7 @@ def clutter_surfaces(clutter: Sequence[Clutter]) -> list[Surface]:
             box = box_surface("", np.zeros(3), np.array(item.size_m), (red, green, blue))
             surfaces.append(_placed(box, item.T_base_clutter))
         else:
-            surface = _mesh_surface("", toy_mesh(item.shape, item.size_m))
+            surface = _mesh_surface("", scaled_mesh(CLUTTER[item.shape], item.size_m))
             surfaces.append(_placed(surface, item.T_base_clutter))
     return surfaces
 

@@ -357,11 +357,7 @@ def _add_clutter(spec: Any, item: Clutter, index: int) -> None:
 
 
 def standing_clutter(clutter: Sequence[Clutter], hidden: HiddenParameters) -> tuple[Clutter, ...]:
-    """What stands about, where it stands on the true table.
-
-    Args:
-        clutter: As published, on the plane z = 0.
-    """
+    """What stands about as published, on the plane z = 0, where it stands on the true table."""
     if hidden.deviations is None:
         return tuple(clutter)
     T = hidden.deviations.T_base_table

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from bridge.errors import UsageError
 from bridge.task.meshes.solids import Solid, mesh_of
-from bridge.task.meshes.toys import DESIGNS, Paint, basket_design
+from bridge.task.meshes.toys import DESIGNS, Design, Paint, basket_design
 from bridge.task.task_file import BASKET, ObjectModel
 
 
@@ -24,27 +24,19 @@ class ToyMesh:
     solid: Solid
     """Signed distance estimate in the same frame."""
 
-    def colors(self) -> Float[np.ndarray, "num_vertices 3"]:
-        """Colour of each vertex, sRGB 0..1."""
-        return self.paint(self.vertices_m)
 
-    def volume_m3(self) -> float:
-        """Enclosed volume, by the divergence theorem."""
-        a, b, c = (self.vertices_m[self.triangles[:, k]] for k in range(3))
-        return float(np.sum(np.einsum("ij,ij->i", a, np.cross(b, c))) / 6.0)
-
-
-@cache
 def toy_mesh(name: str, size_m: tuple[float, float, float]) -> ToyMesh:
-    """Make one of the toys, scaled to its outer extents, the origin at their middle.
-
-    Args:
-        name: One of ``toys.DESIGNS``.
-    """
+    """Make one of the toys, by its name in ``toys.DESIGNS``."""
     design = DESIGNS.get(name)
     if design is None:
         message = f"no mesh named {name!r}. There are: {', '.join(sorted([*DESIGNS, BASKET]))}."
         raise UsageError(message)
+    return scaled_mesh(design, size_m)
+
+
+@cache
+def scaled_mesh(design: Design, size_m: tuple[float, float, float]) -> ToyMesh:
+    """Scale what is drawn to its outer extents, the origin at their middle."""
     vertices, triangles = mesh_of(design.solid, design.low_m, design.high_m, design.spacing_m)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     middle, scale = (low + high) / 2, np.array(size_m) / (high - low)

@@ -1,4 +1,4 @@
-"""A soft body: tetrahedra that fill its shape, and the cage of eight nodes that moves them."""
+"""A soft body: tetrahedra that fill its shape."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -30,31 +30,16 @@ class Lattice:
     points_m: Float[np.ndarray, "num_points 3"]
     tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
 
-    def volume_m3(self) -> float:
-        """Sum over the tetrahedra."""
-        return float(volumes_m3(self.points_m, self.tetrahedra).sum())
-
 
 def make_lattice(mesh: ToyMesh, cell_m: float) -> Lattice:
-    """Fill a body with cells of about this size whose outer corners lie on its surface.
-
-    Args:
-        cell_m: Edge of a cell [m]; the box around the body is divided evenly.
-
-    Raises:
-        UsageError: The cells are too coarse for the body: none lies inside.
-    """
+    """Fill a body with cells of about this size whose outer corners lie on its surface."""
     return fill(mesh.solid, mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0), cell_m)
 
 
 def fill(
     solid: Solid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell_m: float
 ) -> Lattice:
-    """Fill a solid that a box just holds, as ``make_lattice``.
-
-    Args:
-        low: Lower corner of the box [m].
-    """
+    """Fill a solid that a box just holds, as ``make_lattice``; the box is divided evenly."""
     counts = np.maximum(np.ceil((high - low) / cell_m).astype(int), 1)
     step = (high - low) / counts
     centres = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
@@ -81,40 +66,9 @@ def fill(
 def volumes_m3(
     points_m: Float[np.ndarray, "num_points 3"], tetrahedra: Int[np.ndarray, "num_tetrahedra 4"]
 ) -> Float[np.ndarray, " num_tetrahedra"]:
-    """Signed volume of each tetrahedron.
-
-    Args:
-        points_m: Corners, in any frame.
-        tetrahedra: Four indices of points each; negative volume where their order is mirrored.
-    """
+    """Signed volume of each tetrahedron; negative where the order of its corners is mirrored."""
     a, b, c, d = (points_m[tetrahedra[:, k]] for k in range(4))
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
-
-
-def cage_nodes(
-    low_m: Float[np.ndarray, "3"], high_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "8 3"]:
-    """Corners of a box in the order of ``CORNERS``: z runs fastest."""
-    return np.asarray(low_m + np.array(CORNERS, dtype=np.float64) * (high_m - low_m))
-
-
-def cage_weights(
-    points_m: Float[np.ndarray, "num_points 3"],
-    low_m: Float[np.ndarray, "3"],
-    high_m: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "num_points 8"]:
-    """Trilinear weights of the cage's nodes: ``weights @ nodes`` moves the points with them.
-
-    Args:
-        points_m: In the frame of the box; outside it the weights extrapolate.
-        high_m: Corner with the largest; larger along every axis.
-    """
-    s = (points_m - low_m) / (high_m - low_m)
-    columns = [
-        np.prod([s[:, k] if corner[k] else 1.0 - s[:, k] for k in range(3)], axis=0)
-        for corner in CORNERS
-    ]
-    return np.stack(columns, axis=1)
 
 
 def _node_ids(

@@ -84,11 +84,7 @@ def ring(
     radius: float,
     thickness: float,
 ) -> Float[np.ndarray, " num_points"]:
-    """Distance to a torus: ``radius`` to the middle of the bead, ``thickness`` its own radius.
-
-    Args:
-        axis: What it lies around: 0 for x, 1 for y, 2 for z.
-    """
+    """Distance to a torus: ``radius`` to the middle of the bead, ``thickness`` its own radius."""
     q = p - np.array(centre)
     others = [k for k in range(3) if k != axis]
     flat = np.hypot(q[:, others[0]], q[:, others[1]]) - radius
@@ -98,12 +94,7 @@ def ring(
 def blend(
     first: Float[np.ndarray, " num_points"], second: Float[np.ndarray, " num_points"], width: float
 ) -> Float[np.ndarray, " num_points"]:
-    """Smallest of two distances with a fillet about ``width`` wide: a polynomial smooth minimum.
-
-    Args:
-        width: Points whose two distances are this near to each other are in the fillet; above 0
-            [m].
-    """
+    """Smallest of two distances with a fillet about ``width`` wide: a polynomial smooth minimum."""
     overlap = np.maximum(width - np.abs(first - second), 0.0) / width
     return np.asarray(np.minimum(first, second) - overlap**2 * width / 4)
 
@@ -163,10 +154,7 @@ def mesh_of(
     """Triangulate the surface of a solid, triangles counter-clockwise seen from outside.
 
     Where the surface passes a cell twice, as it can where it touches a plane of the grid, the net
-    is not a surface: then the grid is shifted by part of a cell.
-
-    Args:
-        low_m: Lower corner of the grid; at least two cells outside the solid.
+    is not a surface: then the grid is shifted by part of a cell. Its corners lie two cells outside.
     """
     for shift in SHIFTS:
         low = np.array(low_m) - shift * spacing_m
@@ -216,11 +204,7 @@ def _net(
 def project(
     solid: Solid, points: Float[np.ndarray, "num_points 3"], largest_step_m: float
 ) -> Float[np.ndarray, "num_points 3"]:
-    """Move points onto the surface along the gradient of the distance.
-
-    Args:
-        largest_step_m: No point moves farther than this in one of ``PROJECTIONS`` steps.
-    """
+    """Move points onto the surface along the gradient of the distance, in ``PROJECTIONS`` steps."""
     for _ in range(PROJECTIONS):
         value = solid(points)
         gradient = gradient_of(solid, points)

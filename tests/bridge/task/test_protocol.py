@@ -16,10 +16,10 @@ from bridge.task.protocol import (
     StudyTask,
     arms_in_order,
     blinding_codes,
-    keep_protocol,
     read_protocol,
     with_coins,
 )
+from dashboards.trials import keep_protocol
 
 STUDY = Protocol(
     tasks=(StudyTask(task="stack", task_sha256="a" * 64, session_seed=3, starts=20),),

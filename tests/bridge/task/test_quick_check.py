@@ -1,6 +1,7 @@
-"""What the quick look at a record is not sure of, jsonschema decides and names."""
+"""Records against their schemas: what the library of the product judges, another one does too."""
 
 import json
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +22,26 @@ OUTCOME = Draft202012Validator(json.loads((SCHEMAS / "outcome.schema.json").read
     ("field", "value"),
     [("result", "\ud800"), ("k", True), ("k", np.float64(1.5)), ("n", float("inf"))],
 )
-def test_what_cannot_be_judged_quickly_is_left_to_jsonschema(field: str, value: Any) -> None:
-    record = {"schema_version": 1, "result": "success", "k": 1, "n": 1, field: value}
+def test_what_json_cannot_hold_is_judged_as_another_library_does(field: str, value: Any) -> None:
+    record = {"schema_version": 1, "result": "success", "unit": "trial", "by": "twin"}
+    record |= {"k": 1, "n": 1, field: value}
     if OUTCOME.is_valid(record):
         assert check_record(record, name="outcome") is record
         return
-    with pytest.raises(InvalidRecordError, match=f"^.*{field}"):
+    with pytest.raises(InvalidRecordError, match=f"^.*{field}|surrogates not allowed"):
         check_record(record, name="outcome")
 
 
-def test_what_does_not_fit_is_still_named_by_jsonschema() -> None:
+def test_what_is_no_json_and_what_is_too_deep_is_refused() -> None:
+    deep: Any = []
+    for _ in range(600):
+        deep = [deep]
+    for odd in (date(2026, 1, 2), deep):
+        with pytest.raises(InvalidRecordError, match="outcome"):
+            check_record({"schema_version": 1, "result": "success", "k": odd}, name="outcome")
+
+
+def test_what_does_not_fit_is_named_with_its_place() -> None:
     fine = Factor(value=True)
     verdict = Verdict(
         plan_id="p", trajectory="planned", mode="dynamic", ik=fine, clearance=fine, terminal=fine,
@@ -39,5 +50,5 @@ def test_what_does_not_fit_is_still_named_by_jsonschema() -> None:
     record = json.loads(verdict.to_json())
     assert check_record(record, name="verdict") is record
     record["ik"]["bodies"] = ["arm", 7]
-    with pytest.raises(InvalidRecordError, match=r"ik/bodies/1.*7 is not of type 'string'"):
+    with pytest.raises(InvalidRecordError, match=r'ik/bodies/1.*7 is not of type "string"'):
         check_record(record, name="verdict")

@@ -117,9 +117,9 @@ def test_a_basket_is_stood_in_for_by_an_open_box_and_a_toy_by_the_box_around_it(
     ("old", "new", "match"),
     [
         ('mesh = "sloth"', 'mesh = "elephant"', "'elephant' is unknown. Known: basket"),
-        ('shape = "mesh"\nmesh = "sloth"', 'shape = "mesh"', "'mesh' is a required property"),
+        ('shape = "mesh"\nmesh = "sloth"', 'shape = "mesh"', '"mesh" is a required property'),
         ('shape = "mesh"\nmesh = "sloth"', 'shape = "box"', "unknown key 'soft'"),
-        ("soft = {", "# soft = {", "'soft' is a required property"),
+        ("soft = {", "# soft = {", '"soft" is a required property'),
         ("young_pa", "young_kpa", "unknown key 'young_kpa'. Did you mean 'young_pa'"),
     ],
 )

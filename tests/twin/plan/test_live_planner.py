@@ -202,8 +202,7 @@ def test_live_what_no_plan_keeps_is_left_out_in_every_round(tmp_path: Path) -> N
     run = RunFolder.create(tmp_path / "run")
     with serving(says(adds(NEVER))) as server:
         words = PlanConfig(model=server.url, model_name="stub")
-        made = {"model": KeepsNothing}
-        planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, made, words=words)
+        planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, KeepsNothing, words=words)
         for round_ in range(2):
             answer = planner.answer(request(policy="model", round=round_).to_json())
             assert answer.plan is not None, answer.reason
@@ -232,7 +231,7 @@ def test_when_no_candidate_is_left_the_reason_says_how_many_there_were(tmp_path:
             return super().propose(problem, count=1, **more)
 
     run = RunFolder.create(tmp_path / "run")
-    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"nominal": Few})
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, Few)
     reason = planner.answer(request(round=2).to_json()).reason
     assert "there are 1 candidates, and 2 were tried" in reason
 
@@ -251,7 +250,7 @@ def test_a_bug_is_a_reason_and_no_silence(
             raise ZeroDivisionError("oops")
 
     run = RunFolder.create(tmp_path / "run")
-    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, {"nominal": Broken})
+    planner = LivePlanner(run, LivePlanConfig(), ROBOT.urdf_text, lambda _: Broken())
     assert "ZeroDivisionError: oops" in planner.answer(request().to_json()).reason
     assert "Traceback" in capsys.readouterr().err
 

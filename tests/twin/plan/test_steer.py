@@ -77,9 +77,8 @@ def test_the_failing_clause_chooses_the_change(
     assert (steer.change, steer.object_id) == (change, object_id)
     name = refusal.first_failing
     assert name is not None
-    by = steer.steered_by()
-    assert by.clause == f"{name}.{refusal.factors()[name].cause}"
-    assert by.bodies == refusal.factors()[name].bodies
+    assert steer.clause == f"{name}.{refusal.factors()[name].cause}"
+    assert steer.bodies == refusal.factors()[name].bodies
     expected = (0.01, -0.02, 0.0) if change == "grasp_shift" else None
     assert steer.toward_m == expected
 

@@ -9,10 +9,8 @@ from jaxtyping import Float
 from bridge.geometry.mesh import sample_triangles
 from bridge.task.relations import AXES
 from bridge.task.task_file import ObjectModel
-from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.schema import BASE
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Array, Problem, State
 
 NUM_POINTS = 200
 """Of an object's surface; its corners first."""
@@ -20,6 +18,16 @@ NUM_POINTS = 200
 Record = Mapping[str, Any]
 Point = Callable[[State], Array]
 """A point of each state in the base frame, ``(num_states, 3)``."""
+
+
+def carried(T: Array, points_m: Array) -> Array:
+    """Points of a body in the frame of its pose, ``(num_states, num_points, 3)``."""
+    return points_m @ T[:, :3, :3].swapaxes(-1, -2) + T[:, None, :3, 3]
+
+
+def seen_from(T: Array, points_m: Array) -> Array:
+    """Points ``(num_states, num_points, 3)`` in the frame of a body with this pose."""
+    return (points_m - T[:, None, :3, 3]) @ T[:, :3, :3]
 
 
 def pose_of(state: State, object_id: str) -> Array:
@@ -86,7 +94,7 @@ def point_of(spec: Record, problem: Problem) -> tuple[Point, str]:
 
 
 def _at(T: Array, p_m: Float[np.ndarray, "3"]) -> Array:
-    return arrays.carried(T, p_m[None])[:, 0]
+    return carried(T, p_m[None])[:, 0]
 
 
 def millimetres(p_m: Float[np.ndarray, " num"]) -> str:

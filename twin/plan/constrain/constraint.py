@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.plan.constrain.arrays import Array
-from twin.plan.problem import State
+from twin.plan.problem import Array, State
 
 Measure = Callable[[State], Array]
 """A number of each state, ``(num_states,)``."""

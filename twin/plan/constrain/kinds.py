@@ -10,32 +10,30 @@ from dataclasses import replace
 import numpy as np
 
 from bridge.errors import UsageError
+from bridge.geometry import se3
 from bridge.task.check import TABLE
 from bridge.task.task_file import ObjectModel
-from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
     Record,
     box_pose,
+    carried,
     directions_of,
     half_extents_m,
     heights,
     point_of,
     pose_of,
+    seen_from,
     surface_points,
 )
 from twin.plan.constrain.constraint import Constraint, Term, flattened
+from twin.plan.constrain.distances import Boxes
 from twin.plan.constrain.relations import RELATIONS
 from twin.plan.constrain.schema import SCENE, Vocabulary, check_constraint
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Array, Problem, State
 
 
 def compile_constraint(record: Record, problem: Problem) -> Constraint:
-    """Make a constraint of a record that fits the schema of constraints.
-
-    Args:
-        record: With ``kind`` and what belongs to it; lengths in metres, angles in degrees.
-    """
+    """Make a constraint of a record that fits the schema of constraints."""
     check_constraint(record, Vocabulary.of_task(problem.scene.task))
     for name in _named(record):
         if name in problem.scene.missing():
@@ -45,6 +43,7 @@ def compile_constraint(record: Record, problem: Problem) -> Constraint:
     return _KINDS[record["kind"]](record, problem)
 
 
+_STRAIGHT = np.eye(1, 4)[0]
 _ID_KEYS = ("obj", "container", "support", "reference", "against", "over")
 
 
@@ -62,7 +61,7 @@ def _distance(record: Record, problem: Problem) -> Constraint:
     low, high = float(record.get("min", -np.inf)), float(record.get("max", np.inf))
     term = Term(
         what=f"the distance from {a_name} to {b_name}",
-        measure=lambda state: norm(a(state) - b(state)),
+        measure=lambda state: np.linalg.norm(a(state) - b(state), axis=-1),
     )
     terms = []
     if "target" in record:
@@ -87,7 +86,7 @@ def _above(record: Record, problem: Problem) -> Constraint:
         ),
         Term(
             what=f"its distance aside from {b_name}",
-            measure=lambda state: norm((a(state) - b(state))[:, :2]),
+            measure=lambda state: np.linalg.norm((a(state) - b(state))[:, :2], axis=-1),
             high=record["xy_tol"],
         ),
     )
@@ -99,8 +98,9 @@ def _align(record: Record, problem: Problem) -> Constraint:
     undirected = either or record.get("undirected", False)
 
     def off(state: State) -> Array:
-        pairs = arrays.angle(a(state)[:, :, None], b(state)[:, None], undirected=undirected)
-        return np.amin(np.amin(pairs, axis=2), axis=1)
+        one, other = a(state)[:, :, None], b(state)[:, None]
+        across, along = np.linalg.norm(np.cross(one, other), axis=-1), (one * other).sum(-1)
+        return np.arctan2(across, abs(along) if undirected else along).min(axis=(1, 2))
 
     term = Term(
         what=f"the angle between {a_name} and {b_name}",
@@ -127,13 +127,7 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
     points = surface_points(problem, obj)
     if against == TABLE:
         height = problem.scene.table_height_m
-
-        def over_table(state: State) -> Array:
-            T = pose_of(state, obj)
-            z = arrays.carried(T, points)[..., 2]
-            return np.amin(z, axis=-1) - height
-
-        return over_table
+        return lambda state: carried(pose_of(state, obj), points)[..., 2].min(axis=-1) - height
     if against == SCENE:
         if problem.scene.static_sdf is None:
             message = (
@@ -142,35 +136,23 @@ def _least_distance(obj: str, against: str, problem: Problem) -> Callable[[State
             )
             raise UsageError(message)
         grid = problem.scene.static_sdf.conservative
-
-        def over_scene(state: State) -> Array:
-            T = pose_of(state, obj)
-            found = grid.distance(arrays.carried(T, points))
-            return np.amin(found, axis=-1)
-
-        return over_scene
+        return lambda state: grid.distance(carried(pose_of(state, obj), points)).min(axis=-1)
     others = surface_points(problem, against)
+    there, here = (_boxes_of(problem.model(name)) for name in (against, obj))
 
     def between(state: State) -> Array:
-        T, T_other = pose_of(state, obj), pose_of(state, against)
-        there = arrays.seen_from(T_other, arrays.carried(T, points))
-        back = arrays.seen_from(T, arrays.carried(T_other, others))
+        T_against_obj = se3.invert(pose_of(state, against)) @ pose_of(state, obj)
         return np.minimum(
-            np.amin(_panel_distance(problem.model(against), there), axis=-1),
-            np.amin(_panel_distance(problem.model(obj), back), axis=-1),
+            there.candidate_clearance(points, T_against_obj).min(axis=-1),
+            here.candidate_clearance(others, se3.invert(T_against_obj)).min(axis=-1),
         )
 
     return between
 
 
-def _panel_distance(model: ObjectModel, points: Array) -> Array:
-    """Signed distances of points in an object's frame to the boxes it is made of [m]."""
-    centres, sizes = zip(*model.panels(), strict=True)
-    return arrays.boxes_distance(
-        points,
-        centres,
-        [np.array(size) / 2 for size in sizes],
-    )
+def _boxes_of(model: ObjectModel) -> Boxes:
+    """The boxes that an object is made of, in its frame."""
+    return Boxes.of([(se3.transform_from(_STRAIGHT, p), size) for p, size in model.panels()])
 
 
 def _keepout(record: Record, problem: Problem) -> Constraint:
@@ -180,9 +162,10 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
     half = half_extents_m(problem.model(over))
 
     def least(state: State) -> Array:
-        surface = arrays.carried(pose_of(state, obj), points)
-        q = arrays.seen_from(box_pose(state, over, problem), surface)[..., :2]
-        return np.amin(arrays.box_distance(q, half[:2]), axis=-1)
+        surface = carried(pose_of(state, obj), points)
+        beyond = abs(seen_from(box_pose(state, over, problem), surface)[..., :2]) - half[:2]
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+        return np.amin(outside + np.minimum(beyond.max(axis=-1), 0.0), axis=-1)
 
     return Constraint.of(
         record,
@@ -197,15 +180,14 @@ def _keepout(record: Record, problem: Problem) -> Constraint:
 def _height(record: Record, problem: Problem) -> Constraint:
     table = problem.scene.table_height_m
     if "obj" in record:
-        obj, name = record["obj"], f"the lowest point of {record['obj']}"
-
-        def measure(state: State) -> Array:
-            return heights(state, obj, problem)[0] - table
+        name = f"the lowest point of {record['obj']}"
     else:
         point, name = point_of(record["a"], problem)
 
-        def measure(state: State) -> Array:
-            return point(state)[:, 2] - table
+    def measure(state: State) -> Array:
+        if "obj" in record:
+            return heights(state, record["obj"], problem)[0] - table
+        return point(state)[:, 2] - table
 
     return Constraint.of(
         record,
@@ -228,7 +210,7 @@ def _speed(record: Record, problem: Problem) -> Constraint:
             return np.full(num_states, -limit)
         p = point(flattened(states)).reshape(num_states, num_steps, 3)
         seconds = times_s[1:] - times_s[:-1]
-        speeds = norm(p[:, 1:] - p[:, :-1]) / seconds
+        speeds = np.linalg.norm(p[:, 1:] - p[:, :-1], axis=-1) / seconds
         return np.amax(speeds, axis=-1) - limit
 
     term = Term(what=f"the speed of {name}", measure=_nothing, high=limit, unit="m/s")

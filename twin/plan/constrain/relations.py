@@ -20,10 +20,9 @@ from bridge.task.relations import (
     SIDES,
     TILT_TOLERANCE_RAD,
     direction_of,
+    footprint_gap_m,
 )
 from bridge.task.task_file import Task
-from twin.plan.constrain import arrays
-from twin.plan.constrain.arrays import Array, norm
 from twin.plan.constrain.bodies import (
     Record,
     box_pose,
@@ -31,9 +30,10 @@ from twin.plan.constrain.bodies import (
     heights,
     millimetres,
     pose_of,
+    seen_from,
 )
 from twin.plan.constrain.constraint import Constraint, Term
-from twin.plan.problem import Problem, State
+from twin.plan.problem import Array, Problem, State
 
 
 def _on(record: Record, problem: Problem) -> Constraint:
@@ -65,7 +65,7 @@ def _over_support(record: Record, problem: Problem, support: str, margin: float)
         top = heights(state, support, problem)[1]
         x, y = T_object[:, 0, 3], T_object[:, 1, 3]
         contact = np.stack([x, y, top + 0.0 * x], axis=-1)
-        excess = abs(arrays.seen_from(T, contact[:, None])[:, 0]) - half
+        excess = abs(seen_from(T, contact[:, None])[:, 0]) - half
         up = abs(T[:, 2, :3])
         upward = up == np.amax(up, axis=-1)[:, None]  # the face that looks up is no edge
         return np.amax(np.where(upward, -np.inf, excess), axis=-1)
@@ -83,7 +83,7 @@ def _inside(record: Record, problem: Problem) -> Constraint:
 
     def excess(state: State) -> Array:
         middle = pose_of(state, obj)[:, None, :3, 3]
-        q = arrays.seen_from(pose_of(state, container), middle)[:, 0] - centre
+        q = seen_from(pose_of(state, container), middle)[:, 0] - centre
         return np.amax(abs(q) - inner / 2, axis=-1)
 
     return Constraint.of(
@@ -114,7 +114,7 @@ def _outline_gap(a: str, b: str, problem: Problem) -> Callable[[State], Array]:
 
     def gap(state: State) -> Array:
         T_a, T_b = (box_pose(state, name, problem) for name in (a, b))
-        return arrays.footprint_gap(T_a, half_a, T_b, half_b)
+        return footprint_gap_m(T_a, half_a, T_b, half_b)
 
     return gap
 
@@ -137,7 +137,7 @@ def _beside(record: Record, problem: Problem) -> Constraint:
             way = (box_pose(state, obj, problem) - box_pose(state, reference, problem))[:, :2, 3]
             side = np.array((x, y))
             across = way[:, 0] * side[1] - way[:, 1] * side[0]
-            return np.arctan2(norm(across[:, None]), (way * side).sum(-1))
+            return np.arctan2(abs(across), (way * side).sum(-1))
 
         terms.append(
             Term(
@@ -151,22 +151,14 @@ def _beside(record: Record, problem: Problem) -> Constraint:
 
 
 def _level(a: str, b: str, problem: Problem) -> Term:
-    return Term(
-        what=f"the height that {a} and {b} have in common",
-        measure=_common_height(a, b, problem),
-        low=0.0,
-    )
+    """Two boxes at a common height; negative where there is a gap between their heights [m]."""
 
-
-def _common_height(a: str, b: str, problem: Problem) -> Callable[[State], Array]:
-    """Height that two boxes have in common; negative: the gap between their heights [m]."""
-
-    def measure(state: State) -> Array:
+    def common(state: State) -> Array:
         low_a, high_a = heights(state, a, problem)
         low_b, high_b = heights(state, b, problem)
         return np.minimum(high_a, high_b) - np.maximum(low_a, low_b)
 
-    return measure
+    return Term(what=f"the height that {a} and {b} have in common", measure=common, low=0.0)
 
 
 def _upright(record: Record, problem: Problem) -> Constraint:
@@ -177,9 +169,9 @@ def _upright(record: Record, problem: Problem) -> Constraint:
         R = pose_of(state, obj)[:, :3, :3]
         if not is_cube:
             up = R[:, :, 2]
-            return np.arctan2(norm(up[:, :2]), up[:, 2])
+            return np.arctan2(np.linalg.norm(up[:, :2], axis=-1), up[:, 2])
         up = abs(R[:, 2])  # of each axis, either way up
-        flat = norm(R[:, :2].swapaxes(1, 2))
+        flat = np.linalg.norm(R[:, :2].swapaxes(1, 2), axis=-1)
         return np.amin(np.arctan2(flat, up), axis=-1)
 
     return Constraint.of(
@@ -207,7 +199,7 @@ def _moved(record: Record, problem: Problem) -> Constraint:
 
     def length(state: State) -> Array:
         if direction is None:
-            return norm(way(state))
+            return np.linalg.norm(way(state), axis=-1)
         return (way(state) * direction).sum(-1)
 
     terms = []
@@ -227,7 +219,7 @@ def _near_point(obj: str, target: Float[np.ndarray, " num"], tol: float) -> Term
     """An object's origin near a point of the base frame; near one of two numbers from above."""
 
     def off(state: State) -> Array:
-        return norm(pose_of(state, obj)[:, : len(target), 3] - target)
+        return np.linalg.norm(pose_of(state, obj)[:, : len(target), 3] - target, axis=-1)
 
     return Term(what=f"the distance of {obj} from {millimetres(target)}", measure=off, high=tol)
 

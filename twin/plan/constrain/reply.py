@@ -46,14 +46,7 @@ class ReplyError(UsageError):
 def read_reply(text: str | bytes, vocabulary: Vocabulary, task: str) -> tuple[Stage, ...]:
     """Read the stages of a reply, if nothing in it is wrong.
 
-    Args:
-        task: The instruction that was asked about; a reply to another one is refused.
-
-    Returns:
-        Stages without times; their texts hold printable characters only.
-
-    Raises:
-        ReplyError: Everything that is wrong, each with its place, at most ``MOST_PROBLEMS``.
+    A reply to another instruction is refused. The stages have no times, and printable texts.
     """
     record = parse_strictly(text)
     problems = find_problems(record, "reply", vocabulary)

@@ -126,11 +126,7 @@ def check_constraint(record: Mapping[str, Any], vocabulary: Vocabulary) -> None:
 
 
 def find_problems(value: Any, name: str, vocabulary: Vocabulary) -> tuple[str, ...]:
-    """List what does not fit a part of the schema, at most ``MOST_PROBLEMS``.
-
-    Returns:
-        One line each: the place, what was found, what is allowed.
-    """
+    """List what does not fit a part of the schema, one line each, at most ``MOST_PROBLEMS``."""
     if odd := told(_odd(value, ())):
         return odd
     errors = vocabulary.validator(name).iter_errors(value)

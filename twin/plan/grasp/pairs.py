@@ -150,11 +150,8 @@ def antipodal_pairs(
     """Cast rays into an object from all over its surface, within the cone where they start.
 
     From each point three: along the normal, along the normal laid level, and one drawn from the
-    cone. Which pairs hold, and which are too wide, is for the caller to say.
-
-    Args:
-        hint_m: A line through this point along the object's y axis is tried too, whatever was
-            drawn; None: there is no such point.
+    cone; and a line along the object's y axis through the hint. Which pairs hold, and which are too
+    wide, is for the caller to say.
     """
     points, normals = surface.samples(count, seed)
     rng = np.random.default_rng([seed, 1])

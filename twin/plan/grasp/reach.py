@@ -42,12 +42,6 @@ class ArmReach:
         start = problem.scene.start_rad
         self.start_rad = self.robot.home_rad if start is None else start
 
-    def prepared(
-        self, Ts_base_tcp: Float[np.ndarray, "num_grasps 4 4"], hand: OpenHand, pregrasp_m: float
-    ) -> "_Reaches":
-        """Solve many grasps at once, where the arm has a closed form."""
-        return _Reaches(self, Ts_base_tcp, hand, pregrasp_m)
-
     def is_clear(self, joints_rad: Float[np.ndarray, " num_joints"], open_m: float) -> bool:
         """Whether arm and hand keep clear of the robot itself and of what stands still."""
         self.hulls.place(joints_rad, open_m)
@@ -56,7 +50,7 @@ class ArmReach:
         return self._around.least_m(frozenset(), self._eps_m) >= self._eps_m
 
 
-class _Reaches:
+class Reaches:
     """Solutions of many grasps, looked at one at a time."""
 
     def __init__(
@@ -66,6 +60,7 @@ class _Reaches:
         hand: OpenHand,
         pregrasp_m: float,
     ) -> None:
+        """Solve many grasps at once, where the arm has a closed form."""
         self._arm, self._hand = arm, hand
         turns = (1.0, -1.0) if hand.symmetric else (1.0,)
         self._Ts = np.stack(

@@ -13,7 +13,7 @@ from twin.physics.config import PhysicsConfig
 from twin.plan.grasp.margin import Doubt, Lines, margins, slacks
 from twin.plan.grasp.open_hand import OpenHand, has_fingers, open_hand
 from twin.plan.grasp.pairs import Pairs, SampledSurface, antipodal_pairs, thinned
-from twin.plan.grasp.reach import ArmReach, Reached
+from twin.plan.grasp.reach import ArmReach, Reached, Reaches
 from twin.plan.problem import Grasp, Problem
 from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD
 
@@ -401,7 +401,7 @@ class GraspSearcher:
         """Take the surest that the arm reaches, leaving out what is like one that was taken."""
         config, lines = self.config, found.lines
         T = self.problem.scene.Ts_base_object[object_id]
-        arm = self._reach.prepared(T @ lines.Ts_object_tcp, hand, PREGRASP_M)
+        arm = Reaches(self._reach, T @ lines.Ts_object_tcp, hand, PREGRASP_M)
         taken: list[Grasp] = []
         kept: list[int] = []
         for index in np.argsort(-margin, kind="stable").tolist():
@@ -422,7 +422,6 @@ class GraspSearcher:
                     margin=float(margin[index]),
                     joints_rad=way.joints_rad,
                     pregrasp_m=PREGRASP_M,
-                    contacts_m=_contacts(lines, index),
                 )
             )
             if len(taken) == config.most:
@@ -479,11 +478,6 @@ def in_tools(
     found = turned_all.reshape(3, len(R), len(points_m))
     found -= np.einsum("nij,ni->jn", R, p)[..., None]
     return np.asarray(found)
-
-
-def _contacts(lines: Lines, index: int) -> Float[np.ndarray, "2 3"]:
-    half = lines.Ts_object_tcp[index, :3, 1] * lines.widths_m[index] / 2
-    return np.stack([lines.middles_m[index] - half, lines.middles_m[index] + half])
 
 
 def _is_like(lines: Lines, index: int, kept: list[int], symmetric: bool) -> bool:

@@ -5,7 +5,6 @@ One request to an OpenAI-compatible server (``POST .../chat/completions``), whos
 The answer says which of the three it is. No image leaves the machine.
 """
 
-import fcntl
 import hashlib
 import http.client
 import json
@@ -14,13 +13,13 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bridge.errors import UsageError, refuse_outside
+from bridge.errors import UsageError
 from bridge.task.model_policy import server_of
 from bridge.task.plan import Stage
 from bridge.whole_file import write_whole
@@ -32,6 +31,12 @@ Messages = list[dict[str, Any]]
 BY_MODEL, BY_REPAIR, BY_GRAMMAR = "model", "model, repaired", "grammar"
 READ_INSTEAD = "the grammar read the instruction instead"
 MOST_LABEL = 80
+KEY_VARIABLE = "GST_MODEL_KEY"
+"""Environment variable with the key; not set: none is sent."""
+CONNECT_S, TOTAL_S = 5.0, 60.0
+"""Of one request: to connect, and until the last byte."""
+MOST_ANSWER_BYTES = 1_000_000
+"""Of the server's answer around the reply."""
 _CHUNK = 64 * 1024
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _REFUSES_FORMAT = (400, 404, 415, 422, 501)
@@ -45,36 +50,21 @@ class ModelConfig:
     url: str
     """Base address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1."""
     model: str
-    key_variable: str = "GST_MODEL_KEY"
-    """Environment variable with the key; not set: none is sent."""
-    connect_timeout_s: float = 5.0
-    total_timeout_s: float = 60.0
-    """Of one request, from connecting to the last byte."""
-    max_reply_bytes: int = 1_000_000
-    """Of the server's answer around the reply."""
     cache: Path | None = None
     """Folder of replies that were taken, by the content of their request."""
     keep_refused: bool = False
     """Keep there, too, that both replies were refused: a question has one answer for good."""
 
     def __post_init__(self) -> None:
-        """Refuse addresses and limits that make no sense."""
-        refuse_outside(
-            self,
-            {
-                "connect_timeout_s": (0.01, 600.0),
-                "total_timeout_s": (0.01, 3600.0),
-                "max_reply_bytes": (1000, 100_000_000),
-            },
-        )
+        """Refuse addresses that make no sense."""
         server_of(self.url)
 
     @property
     def key(self) -> str:
         """The key, or nothing."""
-        key = os.environ.get(self.key_variable, "").strip()
+        key = os.environ.get(KEY_VARIABLE, "").strip()
         if key and not (key.isascii() and key.isprintable() and " " not in key):
-            message = f"{self.key_variable} is not a key: it has spaces or odd characters."
+            message = f"{KEY_VARIABLE} is not a key: it has spaces or odd characters."
             raise UsageError(message)
         return key
 
@@ -111,17 +101,15 @@ class EndpointError(TwinError):
         )
 
 
-def ask_model(
-    question: Question, config: ModelConfig, fallback: Callable[[], tuple[Stage, ...]]
-) -> Answer:
-    """Get stages from a model, from its second try, or else from the grammar."""
+def ask_model(question: Question, config: ModelConfig) -> Answer:
+    """Get stages from a model, or from its second try; none where the grammar is to answer."""
     remarks = [f"asked {config.model} at {config.url}"]
-    with _alone(config):
-        found = _judged(question, config, remarks)
-    if found is not None:
-        return _answer(config, *found, remarks)
-    remarks.append(READ_INSTEAD)
-    return _answer(config, fallback(), BY_GRAMMAR, remarks)
+    found = _judged(question, config, remarks)
+    if found is None:
+        remarks.append(READ_INSTEAD)
+    stages, who = found or ((), BY_GRAMMAR)
+    told = tuple(_redacted(remark, config) for remark in remarks)
+    return Answer(stages=stages, answered_by=who, remarks=told)
 
 
 def _judged(
@@ -154,11 +142,6 @@ def _judged(
     if config.keep_refused:
         _keep(config, first, reply, BY_GRAMMAR)
     return None
-
-
-def _answer(config: ModelConfig, stages: tuple[Stage, ...], who: str, remarks: list[str]) -> Answer:
-    told = tuple(_redacted(remark, config) for remark in remarks)
-    return Answer(stages=stages, answered_by=who, remarks=told)
 
 
 # What is said to the model
@@ -253,7 +236,7 @@ def _post(body: Mapping[str, Any], config: ModelConfig) -> Any:
     scheme, host, port, path = server_of(config.url)
     if config.key and scheme == "http" and host not in _LOOPBACK:
         message = (
-            f"the key in {config.key_variable} would go to {host} without encryption. "
+            f"the key in {KEY_VARIABLE} would go to {host} without encryption. "
             "Use https, or unset it."
         )
         raise UsageError(message)
@@ -299,15 +282,14 @@ def _connected(
     scheme: str, host: str, port: int, config: ModelConfig
 ) -> Iterator[http.client.HTTPConnection]:
     """A connection that is cut when the time is up, whatever it waits for."""
-    ends_s = time.monotonic() + config.total_timeout_s
-    timeout_s = min(config.connect_timeout_s, config.total_timeout_s)
+    ends_s = time.monotonic() + TOTAL_S
     if scheme == "https":
         context = ssl.create_default_context()
         connection: http.client.HTTPConnection = http.client.HTTPSConnection(
-            host, port, timeout=timeout_s, context=context
+            host, port, timeout=min(CONNECT_S, TOTAL_S), context=context
         )
     else:
-        connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
+        connection = http.client.HTTPConnection(host, port, timeout=min(CONNECT_S, TOTAL_S))
     try:
         connection.connect()
         link = connection.sock
@@ -343,8 +325,8 @@ def _read(response: http.client.HTTPResponse, config: ModelConfig) -> bytes:
     chunks, size = [], 0
     while chunk := response.read1(_CHUNK):
         size += len(chunk)
-        if size > config.max_reply_bytes:
-            found = f"answers with more than {config.max_reply_bytes} bytes"
+        if size > MOST_ANSWER_BYTES:
+            found = f"answers with more than {MOST_ANSWER_BYTES} bytes"
             raise EndpointError(address=config.url, found=found)
         chunks.append(chunk)
     if response.length:
@@ -354,8 +336,7 @@ def _read(response: http.client.HTTPResponse, config: ModelConfig) -> bytes:
 
 def _failure(error: Exception, config: ModelConfig) -> str:
     if isinstance(error, TimeoutError):
-        connect_s, total_s = config.connect_timeout_s, config.total_timeout_s
-        return f"did not answer in time ({connect_s:g} s to connect, {total_s:g} s in all)"
+        return f"did not answer in time ({CONNECT_S:g} s to connect, {TOTAL_S:g} s in all)"
     if isinstance(error, ConnectionRefusedError):
         return "refuses the connection"
     if isinstance(error, http.client.IncompleteRead | http.client.RemoteDisconnected):
@@ -364,21 +345,6 @@ def _failure(error: Exception, config: ModelConfig) -> str:
 
 
 # What is kept
-
-
-@contextmanager
-def _alone(config: ModelConfig) -> Iterator[None]:
-    """Let no two planners ask at once: the second finds what the first was told."""
-    if config.cache is None:
-        yield
-        return
-    config.cache.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(config.cache, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _digest(config: ModelConfig, messages: Messages) -> str:
@@ -405,6 +371,7 @@ def _keep(config: ModelConfig, messages: Messages, reply: str, who: str) -> None
     """Remember a reply; one that was taken is judged again when it is used."""
     if config.cache is not None:
         record = json.dumps({"answered_by": who, "reply": reply})
+        config.cache.mkdir(parents=True, exist_ok=True)
         write_whole(config.cache / f"{_digest(config, messages)}.json", record.encode())
 
 

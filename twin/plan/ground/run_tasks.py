@@ -115,11 +115,7 @@ def task_files_of(run: RunFolder) -> list[TaskFile]:
 
 
 def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
-    """The task file whose objects an episode shows.
-
-    Args:
-        episode: Its name; empty: the newest that was recorded with a task.
-    """
+    """The task file whose objects an episode shows; no name: the newest recorded with a task."""
     files = task_files_of(run)
     known = {file.sha256: file for file in files}
     for path in run.episodes()[::-1]:
@@ -132,11 +128,7 @@ def shown_task_file(run: RunFolder, episode: str) -> TaskFile:
 
 
 def vocabulary_of_run(run: RunFolder, base: Sequence[TaskFile]) -> Vocabulary:
-    """What the objects of task files are called in a run's scene.
-
-    Args:
-        run: Whose ``scene.json`` holds labels and colours; without one, the files' own.
-    """
+    """What the objects of task files are called in a run's scene; without one, in the files."""
     task = union_of(base)
     if task is None:
         raise UsageError("no task file to take objects from.")

@@ -104,11 +104,9 @@ class Vocabulary:
 
 
 def vocabulary_of(task: Task, instances: Sequence[Mapping[str, Any]] = ()) -> Vocabulary:
-    """Make a vocabulary of a task's objects, called as the rebuilt scene calls them.
+    """Make a vocabulary of a task's objects, called as the rebuilt scene calls its instances.
 
-    Args:
-        instances: ``semantics.instances`` of ``scene.json``; an object that is not among them
-            keeps its name and the colour of the task file.
+    An object that is not among them keeps its name and the colour of the task file.
     """
     seen = {str(item["object"]): item for item in instances if item.get("object")}
     things = {}

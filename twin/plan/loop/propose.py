@@ -1,10 +1,10 @@
 """The loop: propose, have it judged, steer, propose again; nothing of it looks at a clock."""
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-from bridge.task.plan import Plan, Ranking
+from bridge.task.plan import Plan, Ranking, SteeredBy
 from bridge.task.plan_request import Refusal
 from bridge.task.verdict import Verdict
 from twin.errors import TwinError
@@ -79,7 +79,7 @@ def choose(
                 )
             except NoPlanError:
                 return None
-            if fresh := _fresh(found, known):
+            if fresh := next((each for each in found if each.plan.tau not in known), None):
                 return fresh
         return None
 
@@ -93,18 +93,15 @@ def choose(
     )
 
 
-def _fresh(candidates: Iterable[Candidate], known: Collection[object]) -> Candidate | None:
-    return next((each for each in candidates if each.plan.tau not in known), None)
-
-
 def named(
     candidate: Candidate, problem: Problem, *, seed: int, steer: Steer | None = None
 ) -> Candidate:
     """Write into a plan which candidate it is, what steered it and in which scene it was made."""
+    by = None if steer is None else SteeredBy(clause=steer.clause, bodies=steer.bodies)
     plan = replace(
         candidate.plan,
         candidate=Ranking(rank=candidate.rank, cost=candidate.cost, seed=seed),
-        steered_by=None if steer is None else steer.steered_by(),
+        steered_by=by,
         scene_hash=problem.scene.scene_hash,
     )
     return replace(candidate, plan=plan)

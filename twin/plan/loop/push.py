@@ -15,6 +15,7 @@ from bridge.geometry.trajectory import PoseTrajectory
 from bridge.task.plan import Waypoint
 from twin.plan.loop.propose import NoPlanError
 from twin.plan.loop.tau import stages_of
+from twin.plan.path.planner import waypoint
 from twin.plan.problem import Problem
 from twin.robot.config import IkConfig
 from twin.robot.inverse import solve_ik
@@ -154,7 +155,7 @@ def _followed(
     """Waypoints along the legs, and when each stage begins and ends."""
     robot = problem.robot
     T, joints, t_s = robot.T_base_tcp(start_rad), start_rad, 0.0
-    tau = [_waypoint(0.0, T, legs[0].g, joints)]
+    tau = [waypoint(0.0, T, joints, g=legs[0].g)]
     bounds: dict[str, tuple[int, int]] = {}
     for leg in legs:
         seconds, law = _law(T, leg)
@@ -176,7 +177,7 @@ def _followed(
                     f"{leg.stage}. Move the object, or where it goes, nearer to the arm."
                 )
             joints = solution.joints_rad
-            tau.append(_waypoint(t_s + float(share) * seconds, pose, leg.g, joints))
+            tau.append(waypoint(t_s + float(share) * seconds, pose, joints, g=leg.g))
         t_s += seconds
         T = leg.T_base_tcp
         bounds[leg.stage] = (bounds.get(leg.stage, (begin_ns, 0))[0], round(t_s * 1e9))
@@ -203,20 +204,3 @@ def _duration_s(T: Float[np.ndarray, "4 4"], T_next: Float[np.ndarray, "4 4"]) -
     far_m = float(np.linalg.norm(T_next[:3, 3] - T[:3, 3]))
     turn_rad = float(se3.rotation_angle_rad(T[:3, :3].T @ T_next[:3, :3]))
     return max(SHORTEST_S, far_m / SPEED_M_S, turn_rad / TURN_RAD_S)
-
-
-def _waypoint(
-    t_s: float,
-    T: Float[np.ndarray, "4 4"],
-    g: int,
-    joints_rad: Float[np.ndarray, " num_joints"],
-) -> Waypoint:
-    x, y, z = T[:3, 3].tolist()
-    w, i, j, k = se3.quaternion_from_rotation(T[:3, :3]).tolist()
-    return Waypoint(
-        t_ns=round(t_s * 1e9),
-        p_m=(x, y, z),
-        q_wxyz=(w, i, j, k),
-        g=g,
-        joints_rad=tuple(joints_rad.tolist()),
-    )

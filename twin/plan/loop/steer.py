@@ -10,7 +10,7 @@ from jaxtyping import Float
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
 from bridge.task.causes import Cause
-from bridge.task.plan import Plan, SteeredBy, Waypoint
+from bridge.task.plan import Plan, Waypoint
 from bridge.task.plan_request import Refusal
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
@@ -58,10 +58,6 @@ class Steer:
     toward_m: tuple[float, float, float] | None = None
     """Where the tool was in the object's frame when a finger first touched it in the twin."""
     refused: tuple[Tried, ...] = ()
-
-    def steered_by(self) -> SteeredBy:
-        """What a plan says of it."""
-        return SteeredBy(clause=self.clause, bodies=self.bodies)
 
     def has_grasp_like(self, object_id: str, T_object_tcp: Float[np.ndarray, "4 4"]) -> bool:
         """Whether a grasp was refused that is the same within 1 cm and 10 degrees."""

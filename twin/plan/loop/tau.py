@@ -1,7 +1,7 @@
 """From movements to a gst plan: the trajectory tau, the stages it goes through, what they leave."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -62,16 +62,7 @@ class Trajectory:
         """Stand still; the command is given as soon as that begins."""
         here, begin_s = self.tau[-1], self.end_s
         for t_s in (begin_s + 0.02, begin_s + seconds):
-            self.tau.append(
-                Waypoint(
-                    t_ns=round(t_s * 1e9),
-                    p_m=here.p_m,
-                    q_wxyz=here.q_wxyz,
-                    g=g,
-                    width_m=width_m,
-                    joints_rad=here.joints_rad,
-                )
-            )
+            self.tau.append(replace(here, t_ns=round(t_s * 1e9), g=g, width_m=width_m))
         self._ends(stage, begin_s, begin_s + seconds)
 
     def _ends(self, stage: str, begin_s: float, end_s: float) -> None:

@@ -34,8 +34,8 @@ class Decision:
     """What the exact checks say of a movement."""
 
     refusals: tuple[PathRefusal, ...]
-    clearance_m: Float[np.ndarray, " num_points"]
-    """Smallest distance over the pairs that may not touch, at and before each knot."""
+    clearance_m: float
+    """Smallest distance over the pairs that may not touch."""
 
     @property
     def accepted(self) -> bool:
@@ -74,10 +74,10 @@ def decide(
     poses = object_poses(problem, timed.joints_rad, carried)
     stamps = np.round(timed.times_s * 1e9).astype(np.int64)
     refusals: list[PathRefusal] = []
-    clearance = np.empty(len(stamps))
+    clearance_m = float("inf")
     for index, joints in enumerate(timed.joints_rad):
         Ts = {name: rows[index] for name, rows in poses.items()}
-        clearance[index] = monitor.measure(int(stamps[index]), joints, width_m, Ts)
+        clearance_m = min(clearance_m, monitor.measure(int(stamps[index]), joints, width_m, Ts))
         if links.touch():
             closest = hulls.self_distance()
             refusals.append(
@@ -99,7 +99,7 @@ def decide(
         )
         for failure in monitor.failures
     ]
-    return Decision(refusals=tuple(refusals), clearance_m=clearance)
+    return Decision(refusals=tuple(refusals), clearance_m=clearance_m)
 
 
 def _least(monitor: ClearanceMonitor, bodies: Sequence[str]) -> float:

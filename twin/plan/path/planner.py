@@ -90,7 +90,6 @@ class Movement:
     decision: Decision
     width_m: float
     carried: Carried | None
-    goal: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +113,7 @@ class _Asked:
             wider_m=wider_m or {},
         )
 
-    def decided(self, path: TimedPath, goal: int = 0) -> Movement:
+    def decided(self, path: TimedPath) -> Movement:
         """The movement with the exact checks' last word."""
         decision = decide(
             self.problem,
@@ -124,9 +123,7 @@ class _Asked:
             carried=self.carried,
             allowed=self.allowed,
         )
-        return Movement(
-            path=path, decision=decision, width_m=self.width_m, carried=self.carried, goal=goal
-        )
+        return Movement(path=path, decision=decision, width_m=self.width_m, carried=self.carried)
 
 
 def plan_move(
@@ -150,12 +147,12 @@ def plan_move(
     for turn in range(config.rounds):
         world = asked.world(wider)
         _let_ends_be(world, np.vstack([start_rad[None], goals_rad]), wider)
-        knots, goal = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
+        knots = _searched(world, start_rad, goals_rad, config, turn, work, refusals)
         path = timed_path(world, knots, config)
-        movement = asked.decided(path, goal)
+        movement = asked.decided(path)
         work["rounds"] = float(turn + 1)
         if movement.decision.accepted:
-            return replace(movement, path=replace(path, work={**work, **path.work}))
+            return replace(movement, path=replace(path, work=work))
         refusals = movement.decision.refusals
         _widen(wider, refusals)
     raise NoPathError(
@@ -198,9 +195,9 @@ def _searched(
     turn: int,
     work: dict[str, float],
     refusals: tuple[PathRefusal, ...],
-) -> tuple[Float[np.ndarray, "num_knots num_joints"], int]:
+) -> Float[np.ndarray, "num_knots num_joints"]:
     """One native search; adds its work."""
-    outcome, pair, goal, knots, spent = world.motion.find(
+    outcome, pair, _, knots, spent = world.motion.find(
         np.ascontiguousarray(start_rad, dtype=np.float64),
         np.ascontiguousarray(goals_rad, dtype=np.float64),
         config.seed + turn,
@@ -217,7 +214,7 @@ def _searched(
         raise NoPathError(
             reason=REASONS[outcome], bodies=bodies, detail=detail, work=int(work["postures"])
         )
-    return knots, goal
+    return np.asarray(knots)
 
 
 def timed_path(
@@ -240,16 +237,12 @@ def timed_path(
         )
         return found
 
-    times, joints, corners, rounded, *_ = law(1.0, rounding=True)
+    times, joints, *_ = law(1.0, rounding=True)
     for share, rounding in _OTHERWISE:
         if world.motion.blocked(joints) < 0:
             break
-        times, joints, corners, rounded, *_ = law(share, rounding=rounding)
-    return TimedPath(
-        times_s=times,
-        joints_rad=joints,
-        work={"corners": float(corners), "rounded": float(rounded)},
-    )
+        times, joints, *_ = law(share, rounding=rounding)
+    return TimedPath(times_s=times, joints_rad=joints)
 
 
 def limits_of(
@@ -291,7 +284,7 @@ def plan_straight(
     if not movement.decision.accepted:
         first = movement.decision.refusals[0]
         raise NoPathError(reason="refused", bodies=first.bodies, detail=first.detail)
-    return replace(movement, path=replace(path, work={**path.work, "postures": float(len(knots))}))
+    return replace(movement, path=replace(path, work={"postures": float(len(knots))}))
 
 
 def _straight_knots(
@@ -341,18 +334,28 @@ def waypoints_of(
     robot: RobotModel, path: TimedPath, *, g: int, width_m: float, begin_s: float = 0.0
 ) -> tuple[Waypoint, ...]:
     """The movement as a plan's tau = {(p_t, q_t, g_t)} with its joints."""
-    found = []
-    for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True):
-        q, p = se3.split(robot.T_base_tcp(joints))
-        w, x, y, z = q.tolist()
-        found.append(
-            Waypoint(
-                t_ns=round((begin_s + t_s) * 1e9),
-                p_m=(float(p[0]), float(p[1]), float(p[2])),
-                q_wxyz=(w, x, y, z),
-                g=g,
-                width_m=width_m,
-                joints_rad=tuple(joints.tolist()),
-            )
-        )
-    return tuple(found)
+    return tuple(
+        waypoint(begin_s + t_s, robot.T_base_tcp(joints), joints, g=g, width_m=width_m)
+        for t_s, joints in zip(path.times_s.tolist(), path.joints_rad, strict=True)
+    )
+
+
+def waypoint(
+    t_s: float,
+    T_base_tcp: Float[np.ndarray, "4 4"],
+    joints_rad: Float[np.ndarray, " num_joints"],
+    *,
+    g: int,
+    width_m: float | None = None,
+) -> Waypoint:
+    """One commanded instant."""
+    q, p = se3.split(T_base_tcp)
+    (w, i, j, k), (x, y, z) = q.tolist(), p.tolist()
+    return Waypoint(
+        t_ns=round(t_s * 1e9),
+        p_m=(x, y, z),
+        q_wxyz=(w, i, j, k),
+        g=g,
+        width_m=width_m,
+        joints_rad=tuple(joints_rad.tolist()),
+    )

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bridge.geometry import se3
-from bridge.task.task_file import Task
 from twin.plan.path.planner import (
     Movement,
     NoPathError,
@@ -42,17 +41,6 @@ class Leg:
     movement: Movement
     g: int
     """1 closed, 0 open."""
-
-
-def contacts_of(task: Task, object_id: str, *, grasp: bool) -> Allowed:
-    """Pairs that a task's stage allows which grasps, or releases, an object."""
-    key = "grasp" if grasp else "release"
-    return frozenset(
-        frozenset(pair)
-        for stage in task.stages
-        if stage.get(key) == object_id
-        for pair in stage.get("allowed_contacts", ())
-    )
 
 
 def plan_transfer(
@@ -104,7 +92,7 @@ class _Transfer:
     def take(self, start_rad: Float[np.ndarray, " num_joints"]) -> tuple[Leg, Leg, Leg]:
         """From where the arm stands to the lifted object."""
         grasp, config = self.grasp, self.config
-        taking = self._touching(grasp=True)
+        taking = self._touching("grasp")
         with _named("approach"):
             T_base_tcp = self.problem.robot.T_base_tcp(grasp.joints_rad)
             back = T_base_tcp @ _along_z(-grasp.pregrasp_m)
@@ -128,7 +116,7 @@ class _Transfer:
         joints_rad: Float[np.ndarray, " num_joints"],
     ) -> tuple[Leg, Leg, Leg]:
         """From the lifted object to where the arm has left, let go with these joints."""
-        leaving = self._touching(grasp=False)
+        leaving = self._touching("release")
         with _named("lower"):
             rise = self._straight_up(joints_rad, leaving)
         with _named("carry"):
@@ -152,9 +140,8 @@ class _Transfer:
     def _grip(self) -> Allowed:
         return frozenset({frozenset((GRIPPER, self.grasp.object_id))})
 
-    def _touching(self, *, grasp: bool) -> Allowed:
-        task, name = self.problem.scene.task, self.grasp.object_id
-        return contacts_of(task, name, grasp=grasp) | self._grip
+    def _touching(self, verb: str) -> Allowed:
+        return self.problem.contacts_of(verb, self.grasp.object_id) | self._grip
 
     def _straight_up(
         self, joints_rad: Float[np.ndarray, " num_joints"], allowed: Allowed
@@ -237,11 +224,7 @@ def _along_z(way_m: float) -> Float[np.ndarray, "4 4"]:
 
 
 def _backwards(movement: Movement) -> Movement:
-    return replace(
-        movement,
-        path=reversed_path(movement.path),
-        decision=replace(movement.decision, clearance_m=movement.decision.clearance_m[::-1]),
-    )
+    return replace(movement, path=reversed_path(movement.path))
 
 
 def nearest_solutions(

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import box_corners
+from twin.plan.constrain.distances import scene_grid
 from twin.plan.path._motion import Motion
 from twin.plan.path.spheres import box_spheres, covering_spheres, excess_m
 from twin.plan.problem import Problem
@@ -23,7 +24,7 @@ from twin.replay.clearance.bounding_spheres import (
 )
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.monitor import Allowed
-from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
+from twin.replay.clearance.static_obstacles import stationary_links
 from twin.robot.collision import RobotHulls, hulls_of
 from twin.robot.model import RobotModel
 
@@ -125,9 +126,7 @@ class World:
     motion: Motion
     names: list[Names]
     robot: RobotModel
-    width_m: float
-    carried: Carried | None = None
-    limits_m: list[float] = field(default_factory=list)
+    limits_m: list[float]
 
 
 @dataclass(kw_only=True)
@@ -196,9 +195,7 @@ def build_world(
 ) -> World:
     """Fill a native world with an arm, what it carries and what is around it.
 
-    Args:
-        allowed: Pairs of names that may touch; they are left to the monitor.
-        wider_m: Pairs of bodies that keep more: what a check refused before.
+    Pairs that may touch are left to the monitor; what a check refused before keeps more.
     """
     robot = problem.robot
     hulls = hulls_of(robot)
@@ -212,7 +209,7 @@ def build_world(
         chain.T_last_tcp[:3, 3],
     )
     obstacles = _obstacles(problem, carried)
-    lookup = _lookup(problem, hulls)
+    lookup = scene_grid(problem, hulls)
     points = _add_bodies(problem, hulls, chain, motion, carried, lookup)
     if lookup is not None:
         _set_grid(motion, lookup, points)
@@ -234,8 +231,6 @@ def build_world(
         motion=motion,
         names=builder.names,
         robot=robot,
-        width_m=width_m,
-        carried=carried,
         limits_m=builder.limits_m,
     )
 
@@ -258,21 +253,6 @@ def _obstacles(problem: Problem, carried: Carried | None) -> list[PlacedBox]:
         if carried is None or name != carried.object_id
     ]
     return found
-
-
-def _lookup(problem: Problem, hulls: RobotHulls) -> GridLookup | None:
-    """Distances to what has no name in a scene."""
-    scene = problem.scene
-    if scene.static_sdf is None:
-        return None
-    _, foot = stationary_links(hulls)
-    panels = [
-        panel
-        for name, T in scene.containers().items()
-        for panel in placed_panels(scene.task.objects[name], T)
-    ]
-    grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
-    return None if grid is None else GridLookup(grid)
 
 
 @dataclass

@@ -8,10 +8,9 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
-from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import SHOWN, Constraint
-from twin.plan.problem import Grasp, Problem, Release, State
+from twin.plan.problem import Array, Grasp, Problem, Release, State
 from twin.plan.release.obstacles import (
     allowed_with,
     hand_points,
@@ -132,7 +131,7 @@ class ReleaseSearch:
         self._outline_m = self._points_m[ConvexHull(self._points_m).vertices]
         self._hand_m = hand_points(hulls, self._width_m, HAND_POINTS)
         self._obstacles = obstacles_of(problem, hulls, {grasp.object_id})
-        pairs = _release_contacts(problem, grasp.object_id)
+        pairs = problem.contacts_of("release", grasp.object_id)
         names = self._obstacles.names
         self._allowed = allowed_with(grasp.object_id, pairs, names)
         self._hand_allowed = allowed_with(gripper.name, pairs, names)
@@ -314,14 +313,6 @@ class ReleaseSearch:
         for points_m, T, allowed in bodies:
             short |= self._obstacles.distances(points_m, T[None])[0] < self._keep_m(allowed)
         return [name for name, is_near in zip(self._obstacles.names, short, strict=True) if is_near]
-
-
-def _release_contacts(problem: Problem, object_id: str) -> list[tuple[str, str]]:
-    """Pairs that may touch where an object is let go: those of its release stage."""
-    for stage in problem.scene.task.stages:
-        if stage.get("release") == object_id:
-            return [(a, b) for a, b in stage.get("allowed_contacts", ())]
-    return []
 
 
 def perturbed(

@@ -8,14 +8,12 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from bridge.geometry import se3
+from twin.plan.constrain.distances import Boxes, grid_clearance, lower_by_grid, scene_grid
 from twin.plan.problem import Problem
-from twin.plan.release.distances import Boxes, candidate_clearance, lower_by_grid
 from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.clearance.distance_grid import GridLookup
 from twin.replay.clearance.static_obstacles import (
     PanelBox,
-    stationary_links,
-    unmodelled_obstacles,
 )
 from twin.robot.collision import RobotHulls
 
@@ -59,7 +57,7 @@ class Obstacles:
                 first, last = self._first[index : index + 2]
                 found[:, index] = to_boxes[:, first:last].min(axis=1)
             else:
-                found[:, index] = candidate_clearance(obstacle.grid, points_m, Ts_base_body)
+                found[:, index] = grid_clearance(obstacle.grid, points_m, Ts_base_body)
         return np.asarray(found - self._error_m)
 
     def margins(
@@ -84,26 +82,14 @@ def obstacles_of(problem: Problem, hulls: RobotHulls, carried: Collection[str]) 
     """Collect what stands still around carried objects."""
     scene = problem.scene
     found = [_table(scene.table_height_m)]
-    panels: list[PanelBox] = []
-    stationary = scene.containers()
     for name, T in scene.Ts_base_object.items():
         if name in carried:
             continue
         boxes = tuple(placed_panels(problem.model(name), T))
-        if name in stationary:
-            panels += boxes
         found.append(Obstacle(name=name, error_m=0.0, boxes=boxes))
-    if scene.static_sdf is not None:
-        foot = stationary_links(hulls)[1]
-        grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
-        if grid is not None:
-            found.append(
-                Obstacle(
-                    name=SCENE,
-                    error_m=float(np.sqrt(3) / 2 * grid.voxel_m),
-                    grid=GridLookup(grid),
-                )
-            )
+    if (grid := scene_grid(problem, hulls)) is not None:
+        error_m = float(np.sqrt(3) / 2 * grid.voxel_m)
+        found.append(Obstacle(name=SCENE, error_m=error_m, grid=grid))
     return Obstacles(found)
 
 
@@ -115,10 +101,9 @@ def _table(height_m: float) -> Obstacle:
 
 
 def allowed_with(
-    body: str, allowed_contacts: Sequence[tuple[str, str]], names: Sequence[str]
+    body: str, pairs: Collection[frozenset[str]], names: Sequence[str]
 ) -> Float[np.ndarray, " num_obstacles"]:
     """Whether a stage allows a body to touch each obstacle, as 1 or 0."""
-    pairs = {frozenset(pair) for pair in allowed_contacts}
     return np.array([frozenset((body, name)) in pairs for name in names], dtype=np.float64)
 
 

@@ -135,11 +135,7 @@ def _same(model: ObjectModel) -> list[Float[np.ndarray, "3 3"]]:
 def resting_poses(
     problem: Problem, grasp: Grasp, target: Target, *, drop_m: float, most_tilted_rad: float
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """Poses ``T_base_object`` a little above where the object would lie, in the middle.
-
-    Args:
-        most_tilted_rad: Poses in which the tool leans farther from straight down are left out.
-    """
+    """Poses ``T_base_object`` a little above where the object would lie, in the middle."""
     T_now = problem.scene.Ts_base_object.get(grasp.object_id)
     if T_now is None:
         message = f"{grasp.object_id} was not localised: nobody knows which way up it is."

@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bridge.geometry import se3
-from twin.plan.constrain.arrays import Array
 from twin.plan.constrain.constraint import Constraint
-from twin.plan.problem import State
+from twin.plan.problem import Array, State
 
 LENGTH_M = 0.01
 """Unit of lengths in the regulariser and in steps of the solver."""
@@ -72,11 +71,7 @@ class Zeta:
 def moved(
     T: Float[np.ndarray, "num 4 4"], step: Float[np.ndarray, "num num_variables"]
 ) -> Float[np.ndarray, "num 4 4"]:
-    """Poses after steps [m, rad].
-
-    Args:
-        step: Three of the position in the base frame, three of a rotation vector in the tool's.
-    """
+    """Poses after steps: of the position in the base frame [m], of a turn in the tool's [rad]."""
     found = T.copy()
     found[:, :3, :3] = T[:, :3, :3] @ se3.rotation_from_vector(step[:, 3:6])
     found[:, :3, 3] += step[:, :3]

@@ -66,11 +66,6 @@ class StageCandidate:
     violations: Mapping[str, float]
     """f of each term [m or rad]."""
 
-    @property
-    def feasible(self) -> bool:
-        """Whether every constraint is satisfied."""
-        return all(value <= 0 for value in self.violations.values())
-
 
 @dataclass(frozen=True, kw_only=True)
 class StageSolution:

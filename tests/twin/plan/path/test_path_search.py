@@ -47,7 +47,7 @@ def test_where_going_straight_is_refused_the_planned_way_is_not(pairs: Pairs) ->
     index = pairs.kinds.index("post")
     movement = moved(pairs, index)
     assert movement.decision.accepted
-    assert movement.decision.clearance_m.min() >= EPS_M
+    assert movement.decision.clearance_m >= EPS_M
     refused = decide(pairs.problem, straight(pairs, index), width_m=WIDTH_M, config=CONFIG.replay)
     assert not refused.accepted
     assert "post" in {body for refusal in refused.refusals for body in refusal.bodies}
@@ -80,7 +80,6 @@ def test_of_several_goals_one_is_reached_and_those_that_touch_are_left_out(pairs
     start, goal = pairs.starts[0], pairs.goals[0]
     inside = joints_at(pairs.problem, tool_down(0.42, 0.05, 0.1, 0.0), start)  # in the wall
     movement = plan_move(pairs.problem, start, np.stack([inside, goal]), CONFIG, width_m=WIDTH_M)
-    assert movement.goal == 1
     assert np.array_equal(movement.path.joints_rad[-1], goal)
 
 

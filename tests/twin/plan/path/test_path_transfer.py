@@ -14,7 +14,7 @@ from twin.plan.path.planner import (
     plan_straight,
     reversed_path,
 )
-from twin.plan.path.transfer import contacts_of, nearest_solutions, plan_transfer
+from twin.plan.path.transfer import nearest_solutions, plan_transfer
 from twin.plan.problem import Grasp, Problem, Release
 from twin.robot.config import IkConfig
 
@@ -45,7 +45,7 @@ def test_a_straight_line_is_straight_on_one_branch_and_slow(pairs: Pairs) -> Non
     T = robot.T_base_tcp(grasp.joints_rad)
     goal = T.copy()
     goal[2, 3] += 0.1
-    allowed = contacts_of(problem.scene.task, "cube", grasp=True)
+    allowed = problem.contacts_of("grasp", "cube")
     path = plan_straight(
         problem, grasp.joints_rad, goal, CONFIG, width_m=0.085, allowed=allowed
     ).path

@@ -75,7 +75,7 @@ def test_answers_are_feasible_distinct_and_ordered() -> None:
     costs = [candidate.cost for candidate in solution.candidates]
     assert costs == sorted(costs)
     for index, one in enumerate(solution.candidates):
-        assert one.feasible
+        assert max(one.violations.values()) <= 0
         zeta = Zeta(T_base_tcp=one.T_base_tcp[None], width_m=np.array([one.width_m]))
         assert all((parts <= 0).all() for parts in STAGE.violations(zeta))
         assert STAGE.cost(zeta)[0] == pytest.approx(one.cost)

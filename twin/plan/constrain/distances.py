@@ -6,25 +6,25 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from twin.plan.problem import Problem
 from twin.replay._clearance import (
     points_to_boxes,
     points_to_grid,
     surface_to_boxes,
     surface_to_grid,
 )
+from twin.replay.clearance.bodies import placed_panels
 from twin.replay.clearance.distance_grid import GridLookup
+from twin.replay.clearance.static_obstacles import stationary_links, unmodelled_obstacles
+from twin.robot.collision import RobotHulls
 
 
-def candidate_clearance(
+def grid_clearance(
     lookup: GridLookup,
     points_m: Float[np.ndarray, "num_points 3"],
     Ts_grid_body: Float[np.ndarray, "num_candidates 4 4"],
 ) -> Float[np.ndarray, " num_candidates"]:
-    """Smallest signed distance of a body's surface points, for each pose it might be released at.
-
-    Returns:
-        Distances [m], negative inside; a candidate is free when it is above ``eps_col_m``.
-    """
+    """Smallest signed distance of a body's surface points to what a grid holds, for each pose."""
     nearest = np.empty(len(Ts_grid_body))
     grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
     surface_to_grid(*grid, *_poses(Ts_grid_body), np.ascontiguousarray(points_m), nearest)
@@ -53,11 +53,7 @@ class Boxes:
         points_m: Float[np.ndarray, "num_points 3"],
         Ts_base_body: Float[np.ndarray, "num_candidates 4 4"],
     ) -> Float[np.ndarray, "num_candidates num_boxes"]:
-        """Smallest signed distance of a body's surface points to each box, for each pose.
-
-        Returns:
-            Distances [m], exact outside; inside minus the depth below the nearest face.
-        """
+        """Smallest signed distance of a body's surface points to each box, for each pose [m]."""
         nearest = np.empty((len(Ts_base_body), len(self.R)))
         body = *_poses(Ts_base_body), np.ascontiguousarray(points_m)
         surface_to_boxes(self.R, self.centres_m, self.halves_m, *body, nearest)
@@ -91,6 +87,21 @@ def lower_by_grid(
     grid = lookup.values_m, lookup.origin_m, lookup.voxel_m
     body = *_poses(Ts_grid_body), np.ascontiguousarray(points_m)
     points_to_grid(*grid, keep_m, *body, margins_m)
+
+
+def scene_grid(problem: Problem, hulls: RobotHulls) -> GridLookup | None:
+    """Distances to what has no name in a scene: all but table, containers and the robot's foot."""
+    scene = problem.scene
+    if scene.static_sdf is None:
+        return None
+    _, foot = stationary_links(hulls)
+    panels = [
+        panel
+        for name, T in scene.containers().items()
+        for panel in placed_panels(problem.model(name), T)
+    ]
+    grid = unmodelled_obstacles(scene.static_sdf, scene.table_height_m, foot, panels)
+    return None if grid is None else GridLookup(grid)
 
 
 def _poses(
