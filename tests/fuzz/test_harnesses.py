@@ -9,7 +9,7 @@ import pytest
 
 HARNESS = Path(__file__).with_name("harness.py")
 ROOT = HARNESS.parents[2]
-SECONDS = int(os.environ.get("GST_FUZZ_S", "2"))
+SECONDS = int(os.environ.get("GST_FUZZ_S", "1"))
 """``make soak`` feeds each for half a minute."""
 
 

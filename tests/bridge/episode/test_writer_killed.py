@@ -17,7 +17,7 @@ from bridge.episode.run_folder import RunFolder
 CHILD = Path(__file__).with_name("writer_child.py")
 MAX_TAIL_NS = 500_000_000
 LIVES_S, CLOSES_AFTER_S = 3.0, 1.0
-KILLS = int(os.environ.get("GST_KILLS", "10"))
+KILLS = int(os.environ.get("GST_KILLS", "5"))
 """`make soak` kills a hundred times, which takes four minutes."""
 
 

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 EPISODES = int(os.environ.get("GST_EPISODES", "60"))
 WARM_UP_EPISODES = 30
-SOAK_S = float(os.environ.get("GST_SOAK_S", "30"))
+SOAK_S = float(os.environ.get("GST_SOAK_S", "20"))
 """Memory goes up and down by 1 MB: over 15 s alone that is a slope of 2 MB/min."""
 WARM_UP_S = float(os.environ.get("GST_WARM_UP_S", "8"))
 WINDOWS = 3

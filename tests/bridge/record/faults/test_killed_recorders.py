@@ -21,7 +21,7 @@ TAIL_S = 0.5
 AFTER_STOP_S = 0.5
 """A recorder answers a stop when all is written; no call of its end comes so long after."""
 MIXES = {"joints": ("joints",), "mix": MIX}
-KILLS = int(os.environ.get("GST_RECORDER_KILLS", "3"))
+KILLS = int(os.environ.get("GST_RECORDER_KILLS", "1"))
 NUMBERS = [int(word) for word in os.environ.get("GST_KILL_NUMBERS", "1").split(",")]
 """At which call of a kind an episode's end is cut off; `make soak` goes on to the fifth."""
 KILLER = str(Path(__file__).with_name("killing_recorder.py"))
