@@ -177,26 +177,45 @@ def draw(seed: str, count: int) -> list[Mutant]:
 
 
 @cache
-def _test_texts() -> dict[Path, str]:
-    return {path: path.read_text() for path in sorted((ROOT / "tests").rglob("test_*.py"))}
+def _texts(folders: tuple[str, ...], pattern: str) -> dict[Path, str]:
+    paths = sorted(path for folder in folders for path in (ROOT / folder).rglob(pattern))
+    return {path.relative_to(ROOT): path.read_text() for path in paths}
 
 
-def near_tests(path: str) -> list[str]:
-    """Test files that mirror a module's path or import it, those of its own name first."""
-    file = Path(path)
-    module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
+def _naming(path: str, folders: tuple[str, ...], pattern: str) -> list[Path]:
+    """Files below folders that import a module."""
+    module = ".".join(Path(path).with_suffix("").parts).removesuffix(".__init__")
     package, _, name = module.rpartition(".")
     imports = re.compile(
         rf"(from|import) {re.escape(module)}\b|from {re.escape(package)} import [^\n]*\b{name}\b"
     )
-    mirrored = ROOT / "tests" / file.parent
-    found = [
-        test
-        for test, text in _test_texts().items()
-        if "end_to_end" not in test.parts
-        and (imports.search(text) or (test.parent == mirrored and name in test.stem))
-    ]
+    texts = _texts(folders, pattern)
+    return [file for file, text in texts.items() if imports.search(text)]
+
+
+def _tests(path: str) -> list[Path]:
+    """Test files that mirror a module's path or import it, those of its own name first."""
+    file = Path(path)
+    name, mirrored = (file.parent.name if file.stem == "__init__" else file.stem), file.parent
+    found = set(_naming(path, ("tests",), "test_*.py"))
+    for test in _texts(("tests",), "test_*.py"):
+        if test.parent == "tests" / mirrored and name in test.stem:
+            found.add(test)
+    near = [test for test in found if "end_to_end" not in test.parts]
+    return sorted(near, key=lambda t: (name not in t.stem, "tests" / mirrored != t.parent, str(t)))
+
+
+def near_tests(path: str) -> list[str]:
+    """Test files that mirror a module's path or import it.
+
+    A module that no test imports is tested through those that import it: then theirs.
+    """
+    found = _tests(path)
     if not found:
-        found = [test for test in _test_texts() if test.parent == mirrored]
-    found.sort(key=lambda test: (name not in test.stem, mirrored != test.parent, str(test)))
-    return [str(test.relative_to(ROOT)) for test in found[:MOST_TESTS]]
+        importers = _naming(path, PACKAGES, "*.py")
+        found = list(dict.fromkeys(test for file in importers for test in _tests(str(file))[:2]))
+    if not found:
+        found = [
+            t for t in _texts(("tests",), "test_*.py") if t.parent == "tests" / Path(path).parent
+        ]
+    return [str(test) for test in found[:MOST_TESTS]]
