@@ -126,8 +126,8 @@ class _Places(ast.NodeVisitor):
         new = SWAPPED.get(type(operator))
         start, end = self._at_end(left), self._at(right)
         between = self._data[start:end].decode()
-        signs = r"not\s+in|<=|>=|==|!=|<|>|\bin\b|\+|-|\*|/|\band\b|\bor\b"
-        signs = re.search(signs, between)
+        operators = r"not\s+in|<=|>=|==|!=|<|>|\bin\b|\+|-|\*|/|\band\b|\bor\b"
+        signs = re.search(operators, between)
         if new is not None and signs is not None and "#" not in between:
             self._add(start + signs.start(), start + signs.end(), left.lineno, new)
 
