@@ -67,7 +67,7 @@ class Mutant:
 
 
 class _Places(ast.NodeVisitor):
-    """Finds what can be changed inside functions; texts and annotations are passed over."""
+    """Finds what can be changed; texts, annotations and decorators are passed over."""
 
     def __init__(self, source: str) -> None:
         self.found: list[tuple[int, int, int, str]] = []
@@ -79,6 +79,10 @@ class _Places(ast.NodeVisitor):
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         for statement in node.body:
+            self.visit(statement)
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        for statement in node.body:  # frozen=True of its decorator declares, and does nothing
             self.visit(statement)
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
