@@ -61,13 +61,18 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
         points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
-                found=f"has a collision shape without volume at {item.name}",
+                found=f"has a collision shape without volume at the link {frame.name!r}",
                 hint="Give it three extents above zero, or leave it out.",
             )
         shape = convex_hull(points)
         corners = np.array(shape.points())
         from_mesh = isinstance(item.geometry, coal.BVHModelBase)
         hulls.append(LinkHull(link=frame.name, points_m=corners, shape=shape, from_mesh=from_mesh))
+    if not hulls:
+        raise RobotDescriptionError(
+            found="gives no link a collision shape",
+            hint="Give each link <collision>, or nothing would be watched.",
+        )
     return hulls
 
 
