@@ -11,6 +11,7 @@ import numpy as np
 
 from bridge.episode import schema
 from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import check_image, image_header
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -25,7 +26,7 @@ from bridge.episode.contract import Presence, Spans, TopicReport
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
-from bridge.media.color import decode_color
+from bridge.media import depth
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
@@ -83,7 +84,7 @@ class Decoder:
                 )
                 raise codec.MalformedMessageError(type_name=type_name, found=found)
         elif type_name == schema.IMAGE:
-            codec.decode(type_name, data)
+            check_image(topic, image_header(data))
         elif type_name == schema.CAMERA_INFO:
             camera = CameraInfo.from_cdr(data).camera
             self._info_sizes[topic] = (camera.width, camera.height)
@@ -118,12 +119,9 @@ class Decoder:
 
 def _color(data: bytes) -> object:
     image = CompressedColor.from_cdr(data)
-    if not image.format.lower().strip().startswith(_KNOWN_COLORS):
-        return image
-    return decode_color(image.data)
+    return depth.unpack(image.format, image.data) if image.is_depth else image.image_u8()
 
 
-_KNOWN_COLORS = ("jpeg", "jpg", "png", "rgb8; jpeg", "bgr8; jpeg", "rgb8; png", "bgr8; png")
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
     schema.COMPRESSED_IMAGE: _color,

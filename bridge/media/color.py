@@ -84,7 +84,10 @@ def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     if data[:2] == JPEG_MAGIC:
         return _decode_jpeg(data)
     with open_image(data) as image:
-        return np.asarray(image.convert("RGB"))
+        if not image.mode.startswith("I"):
+            return np.asarray(image.convert("RGB"))
+        grey = np.rint(np.asarray(image).astype(np.float32) / 257).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=2)
 
 
 @contextmanager

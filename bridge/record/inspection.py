@@ -12,10 +12,12 @@ from functools import lru_cache
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
+from bridge.episode.cdr.images import check_image, image_header
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+IMAGE_STARTS = (_JPEG_START, b"\x89P", b"RI", b"II", b"MM", b"BM")
+"""Of JPEG, PNG, WebP, TIFF and BMP."""
 _TAIL_BYTES = 64
 """Cameras may pad a JPEG behind its end mark."""
 
@@ -90,24 +92,17 @@ def _header_stamp_ns(data: bytes) -> int | None:
 def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
-            return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
+            check_image("", image_header(data))
+            return GOOD
         message = codec.decode(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     if type_name == schema.COMPRESSED_IMAGE:
         image = message["data"]
         is_cut = image[:2] == _JPEG_START and _JPEG_END not in bytes(image[-_TAIL_BYTES:])
-        return MessageState.UNDECODABLE if is_cut else GOOD
+        is_known = image[:2] in IMAGE_STARTS or "compressedDepth" in message["format"]
+        return GOOD if is_known and not is_cut else MessageState.UNDECODABLE
     return GOOD
-
-
-def fits(header: ImageHeader) -> bool:
-    """Say whether an image has as many bytes as its size and step ask for."""
-    if len(header.pixels) != header.height * header.step:
-        return False
-    pixel_bytes = 4 if header.encoding == FLOAT_DEPTH else 2
-    is_depth = header.encoding in (*DEPTH_ENCODINGS, FLOAT_DEPTH)
-    return not is_depth or header.step >= pixel_bytes * header.width
 
 
 def _inspect_json(newest: int, data: bytes) -> MessageState:

@@ -120,8 +120,7 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
         if header.encoding not in COLOR_LAYOUTS:
             return None
         layout, channels = COLOR_LAYOUTS[header.encoding]
-        rows = pixel_rows(header, channels)
-        pixels = rows.reshape(header.height, header.width, channels)
+        pixels = pixel_rows(header).reshape(header.height, header.width, channels)
         stamp_ns, frame_id = header.stamp_ns, header.frame_id
     step = -(-pixels.shape[1] // WIDTH)
     data = encode_jpeg(pixels[::step, ::step], QUALITY, layout=layout)

@@ -299,12 +299,16 @@ ENCAPSULATION_LE = b"\x00\x01\x00\x00"
 class MalformedMessageError(BridgeError):
     """The bytes are not a CDR message of the stated type."""
 
-    def __init__(self, *, type_name: str, found: str) -> None:
+    def __init__(
+        self,
+        *,
+        type_name: str,
+        found: str,
+        hint: str = "The publisher sends another type or broken CDR.",
+    ) -> None:
         """Remember the type that was expected."""
         self.type_name = type_name
-        super().__init__(
-            f"not a valid {type_name}: {found}. The publisher sends another type or broken CDR."
-        )
+        super().__init__(f"not a valid {type_name}: {found}. {hint}")
 
 
 def encode(type_name: str, message: Mapping[str, Any]) -> bytes:
