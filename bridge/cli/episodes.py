@@ -109,8 +109,9 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     seen = presence.get("topics")
     shown = seen if isinstance(seen, dict) else {}
     lines += [
-        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}{_when(shown.get(item.topic))}"
+        f"  {item.topic:<{width}}  {count:>7}  {name}{_when(shown.get(item.topic))}"
         for item in topics.values()
+        for name, count in (item.types or {item.type_name: item.count}).items()
     ]
     output.result(data, "\n".join(lines))
     return 0

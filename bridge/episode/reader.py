@@ -1,8 +1,8 @@
 """Read one episode, split or whole: metadata, topics, raw messages; ``streams`` decodes them."""
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -146,8 +146,11 @@ class TopicSummary:
 
     topic: str
     type_name: str
+    """Of most of its messages."""
     message_encoding: str
     count: int
+    types: Mapping[str, int] = field(default_factory=dict)
+    """Messages of each type; of a topic that carries several."""
 
 
 class Episode:
@@ -268,20 +271,26 @@ class Episode:
         return dict(self._topics)
 
     def _summed_up(self) -> dict[str, TopicSummary]:
-        topics: dict[str, TopicSummary] = {}
+        found: dict[str, dict[tuple[str, str], int]] = {}
         for file in self.files:
             statistics = file.summary.statistics
             counts = statistics.channel_message_counts if statistics else {}
             for channel in file.summary.channels.values():
-                record = file.schema_of(channel)
-                before = topics.get(channel.topic)
-                topics[channel.topic] = TopicSummary(
-                    topic=channel.topic,
-                    type_name=record.name if record else "",
-                    message_encoding=channel.message_encoding,
-                    count=counts.get(channel.id, 0) + (before.count if before else 0),
-                )
-        return dict(sorted(topics.items()))
+                record, kinds = file.schema_of(channel), found.setdefault(channel.topic, {})
+                kind = (record.name if record else "", channel.message_encoding)
+                kinds[kind] = kinds.get(kind, 0) + counts.get(channel.id, 0)
+        topics = {}
+        for topic, kinds in sorted(found.items()):
+            type_name, encoding = max(kinds, key=lambda kind: kinds[kind])
+            types = {name: count for (name, _), count in kinds.items() if count}
+            topics[topic] = TopicSummary(
+                topic=topic,
+                type_name=type_name,
+                message_encoding=encoding,
+                count=sum(kinds.values()),
+                types=types if len(types) > 1 else {},
+            )
+        return topics
 
     def topics_of_type(self, type_name: str) -> list[str]:
         """Topics that carry one message type; stand-in truth is never among them."""

@@ -203,7 +203,8 @@ def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
     ]
-    track = joint_track_of([message.data for message in episode.messages(topics)])
+    messages = (m for m in episode.messages(topics) if m.type_name == schema.JOINT_STATE)
+    track = joint_track_of([message.data for message in messages])
     if track is None:
         raise EpisodeError(
             path=episode.path,

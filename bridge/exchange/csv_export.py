@@ -314,7 +314,7 @@ def _write_messages(name: str, episode: Episode, sheets: dict[str, _Sheet]) -> N
         topic: kind
         for topic, summary in episode.topics().items()
         for kind in TABLES
-        if kind.takes(topic, summary.type_name)
+        if any(kind.takes(topic, name) for name in summary.types or (summary.type_name,))
     }
     for kind, cells in _rows(name, episode, taken):
         sheets[kind.name].write(cells)

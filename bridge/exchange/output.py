@@ -8,11 +8,12 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.errors import BridgeError, EpisodeError, UsageError
+from bridge.terminal import Output
 
 
 @contextmanager
@@ -30,6 +31,24 @@ def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
             found=f"message {number} of {topic}: {error}",
             hint="robot-gst check lists everything that is wrong with it.",
         ) from error
+
+
+class Unused(NamedTuple):
+    """Something that came in and that no command will use."""
+
+    what: str
+    why: str
+    is_needed: bool = False
+    """Whether a later command asks for what it would have been."""
+
+
+def tell_unused(output: Output, unused: Iterable[Unused]) -> int:
+    """Say what was not used; return 3 where a later command needs some of it, else 0."""
+    code = 0
+    for item in unused:
+        output.say(f"  not used: {item.what}: {item.why}")
+        code = 3 if item.is_needed else code
+    return code
 
 
 NOTE_NAME = "robot_gst_export.json"

@@ -134,7 +134,7 @@ def _channel(file: McapFile, channel: records.Channel, left_out: dict[str, str])
     if channel.message_encoding != "cdr":
         left_out[channel.topic] = f"{channel.message_encoding or 'bytes'}, not ROS 2"
         return None
-    if record is None or record.encoding not in ROS_TEXTS or not record.data:
+    if record is None or record.encoding not in ROS_TEXTS:  # an empty text is an empty type
         named = record.name if record else "a type without a name"
         left_out[channel.topic] = f"no definition of {named}"
         return None

@@ -3,6 +3,7 @@
 The file is the one that other splat viewers read (SuperSplat, Rerun).
 """
 
+import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -220,11 +221,11 @@ def read_ply(path: Path) -> GaussianCloud:
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="splat file", hint=hint)
     data = path.read_bytes()
-    end = data.find(b"end_header\n")
-    if not data.startswith(b"ply\n") or end < 0:
+    head = re.match(rb"ply\r?\n.*?\bend_header\r?\n", data, re.DOTALL)
+    if head is None:
         raise UnreadablePlyError(path=path, found="no PLY header")
-    names, count = _header(path, data[:end].decode("ascii", "replace").splitlines())
-    body = data[end + len(b"end_header\n") :]
+    names, count = _header(path, head[0].decode("ascii", "replace").splitlines())
+    body = data[head.end() :]
     if len(body) != count * len(names) * 4:
         found = f"{len(body)} bytes of data for {count} rows of {len(names)} floats"
         raise UnreadablePlyError(path=path, found=found)

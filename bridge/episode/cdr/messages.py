@@ -27,6 +27,9 @@ from bridge.media import depth
 from bridge.media.color import decode_color, encode_jpeg
 from bridge.media.pixels import COLORS, rgb_from
 
+FISHEYES = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "ftheta", "f-theta")
+"""Distortion models that bend straight lines whatever their numbers are."""
+
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
     sec, nanosec = split_ns(stamp_ns)
@@ -267,12 +270,14 @@ class CameraInfo:
     def from_cdr(data: bytes) -> "CameraInfo":
         """Read a sensor_msgs/CameraInfo; refuses lens distortion instead of ignoring it."""
         message = codec.decode(schema.CAMERA_INFO, data)
-        if np.any(np.asarray(message["d"]) != 0):
-            raise codec.MalformedMessageError(
-                type_name=schema.CAMERA_INFO,
-                found="lens distortion is not zero; publish rectified images",
-            )
-        k = message["k"]
+        k, model = message["k"], str(message["distortion_model"])
+        found = ""
+        if np.any(np.asarray(message["d"]) != 0) or model.lower() in FISHEYES:
+            found = f"lens distortion ({model or 'no model'}) is not zero; publish rectified images"
+        elif not (np.isfinite(k).all() and min(k[0], k[4]) > 0):
+            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels; calibrate the camera"
+        if found:
+            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found)
         camera = Camera.from_ros(
             width=message["width"],
             height=message["height"],
