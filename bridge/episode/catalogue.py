@@ -20,7 +20,8 @@ from bridge.episode.catalogue_store import (
     stamp_of,
 )
 from bridge.episode.catalogue_store import Entry as Entry
-from bridge.episode.contract import PRESENCE_RECORD, presence_lines
+from bridge.episode.contract import PRESENCE_RECORD, health_lines
+from bridge.episode.health import RECORD_NAME
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id
@@ -119,6 +120,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
     except GstError as error:
         return Entry(**name, **_extent(parts), error=printable(str(error)))
     records = episode.metadata_records
+    presence = records.get(PRESENCE_RECORD, {})
     return Entry(
         **name,
         **_extent(parts),
@@ -141,7 +143,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         messages=messages,
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
-        presence=printable("; ".join(presence_lines(records.get(PRESENCE_RECORD, {})))),
+        presence=printable("; ".join(health_lines({**presence, **records.get(RECORD_NAME, {})}))),
     )
 
 

@@ -21,13 +21,13 @@ from bridge.episode.contract import (
     ContractError,
     Presence,
     Span,
-    breaches_of,
     contract_from,
+    findings_of,
     judge,
     learn_contract,
-    unknown_tails,
     unseen_losses,
 )
+from bridge.episode.health import Finding, in_order, in_words
 from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
@@ -53,38 +53,22 @@ class CheckReport:
     declared_losses: int = 0
     undeclared_losses: int = 0
     """Numbers missing on topics of a recording whose drop log does not list them."""
-    cut_short: str = ""
-    """What ended the recording where a disk did; nobody knows what it would still have held."""
-    recovered: dict[str, Any] | None = None
-    """What recovery said: the recorder died, and the end of the recording is unknown."""
-    breaches: list[str] = field(default_factory=list)
-    """Where a topic broke the contract of its cell."""
-    unknown_tails: list[str] = field(default_factory=list)
-    """Topics that fell silent before the end, so that nobody knows what they sent after."""
+    findings: list[Finding] = field(default_factory=list)
+    """What is wrong with what it holds, the worst first."""
+    start_ns: int = 0
     presences: dict[str, Presence] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
         """Status of the ``check`` command."""
-        if self.faults:
-            return 1
-        lost = bool(self.declared_losses or self.undeclared_losses or self.cut_short)
-        lost = lost or self.recovered is not None
-        return 3 if lost or self.breaches or self.unknown_tails else 0
+        return 1 if self.faults else 3 if self.findings else 0
 
     @property
     def summary(self) -> str:
         """A word or two."""
-        if self.exit_code == 3:
-            if self.breaches:
-                return "contract broken"
-            if self.undeclared_losses:
-                return "drops not logged"
-            if self.cut_short and not self.declared_losses:
-                return "cut short"
-            if self.unknown_tails and not self.declared_losses:
-                return "tail unknown"
-        return {0: "clean", 1: "broken", 3: "drops logged"}[self.exit_code]
+        if self.faults or not self.findings:
+            return "broken" if self.faults else "clean"
+        return in_words(self.findings[0].name)
 
     def lines(self) -> list[str]:
         """What to print: one line, and one for each fault and note."""
@@ -94,8 +78,8 @@ class CheckReport:
         parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
         lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
         lines += [f"  {fault}" for fault in self.faults]
-        lines += [f"  contract: {text}" for text in self.breaches]
-        lines += [f"  {text}" for text in self.unknown_tails]
+        told = (each for each in self.findings if f"{each.about}: {each.text}" not in self.faults)
+        lines += [f"  {found.line(self.start_ns)}" for found in told]
         if self.num_faults > len(self.faults):
             lines.append(f"  and {self.num_faults - len(self.faults)} more faults")
         return lines + [f"  note: {note}" for note in self.notes]
@@ -103,7 +87,7 @@ class CheckReport:
     def to_json(self) -> dict[str, Any]:
         """Everything, for ``--json``."""
         found = asdict(self)
-        del found["path"], found["presences"]
+        del found["path"], found["presences"], found["start_ns"]
         paths = {name: list(map(str, found[name])) for name in ("parts", "missing_parts")}
         return {"file": str(self.path), "state": self.summary, **found, **paths}
 
@@ -126,9 +110,12 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
         _check_parts(report, episode, faults)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
-    if episode is not None and _is_recording(episode):
-        _judge_presence(report, episode, watch, faults, contract)
+    if episode is not None:
+        report.start_ns = episode.start_ns
+        if _is_recording(episode):
+            _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
+    report.findings = in_order(report.findings)
     return report
 
 
@@ -217,14 +204,13 @@ def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
     for file in episode.files:
         stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
         if stopped_by.startswith(BY_DISK):
-            report.cut_short = stopped_by
-            report.notes.append(f"the recording was ended by the {stopped_by}")
+            text = f"the recording was ended by the {stopped_by}"
+            report.findings.append(Finding(name="cut_short", about=file.path.name, text=text))
         recovered = record_of(file, "recovered")
         if recovered:
-            report.recovered = recovered
             lost = recovered.get("bytes_lost", "an unknown number of")
-            why = recovered.get("reason", "its recorder died")
-            report.notes.append(f"{file.path.name} was recovered ({why}); {lost} bytes were lost")
+            text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
+            report.findings.append(Finding(name="recovered", about=file.path.name, text=text))
 
 
 def _check_metadata(episode: Episode, faults: Faults) -> None:
@@ -261,7 +247,12 @@ def _judge_topics(
         result.declared_losses = decoder.drop_log.get(topic, 0)
         result.unnumbered = decoder.unnumbered.get(topic, 0)
         if result.undecodable:
-            say(result.first_fault)
+            count = f"{result.undecodable} of {result.messages} messages"
+            text = f"{count} cannot be read: {result.first_fault}"
+            report.findings.append(Finding(name="unreadable", about=topic, text=text))
+            if ours:
+                faults.add(f"{topic}: {text}")
+        report.findings += topic_watch.findings(is_derived=episode is None or bool(episode.derived))
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             (say if is_recording else report.notes.append)(text)
@@ -269,12 +260,19 @@ def _judge_topics(
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
-                report.notes.append(
-                    f"{topic}: {result.sequence_gaps} numbers are missing, "
+                text = (
+                    f"{result.sequence_gaps} numbers are missing, "
                     f"the drop log lists {result.declared_losses}"
                 )
+                report.findings.append(Finding(name="drops_not_logged", about=topic, text=text))
+        if result.declared_losses:
+            text = f"{result.declared_losses} messages"
+            report.findings.append(Finding(name="drops_logged", about=topic, text=text))
+    report.findings += decoder.findings
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
+    unused = ", ".join(f"{topic} ({what})" for topic, what in sorted(decoder.unused.items()))
+    report.notes += [f"kept, and no command reads them: {unused}"] if unused else []
     for text in decoder.size_faults():
         say(text)
 
@@ -312,8 +310,7 @@ def _judge_presence(
     )
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
-    report.breaches = breaches_of(reports)
-    report.unknown_tails = unknown_tails(reports)
+    report.findings += findings_of(reports, report.presences, span.end_ns)
 
 
 def _is_imported(episode: Episode | None) -> bool:

@@ -3,12 +3,13 @@
 from array import array
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import check_image, image_header
@@ -23,6 +24,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check_file import ScannedMessage
 from bridge.episode.contract import Presence, Spans, TopicReport
+from bridge.episode.health import ContentWatch, Finding, of_event
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
@@ -30,6 +32,10 @@ from bridge.media import depth
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
+
+
+class ForeignMessageError(BridgeError):
+    """Messages are of another world."""
 
 
 class Decoder:
@@ -48,6 +54,10 @@ class Decoder:
         self.has_drop_log = False
         self.missing: set[str] = set()
         """Sentences on packages without which something was not decoded."""
+        self.unused: dict[str, str] = {}
+        """Type or encoding of topics that are kept, and that nothing here reads."""
+        self.findings: list[Finding] = []
+        """What the recorder noticed of clocks, and of itself."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
@@ -64,7 +74,12 @@ class Decoder:
         type_name = message.schema.name if message.schema else ""
         encoding, data = message.channel.message_encoding, message.data
         known = schema.schema_for(type_name)
+        if encoding == "cdr":
+            codec.refuse_other_cdr(type_name, data)
+        if encoding == "ros1":
+            raise ForeignMessageError("ROS 1 messages; convert the recording with rosbags-convert")
         if known is None or encoding not in ("", known.message_encoding):
+            self.unused[topic] = type_name or encoding or "no type"
             return
         if type_of_topic(topic) is None and type_name in DEFINITIONS:
             codec.decode(type_name, data)
@@ -90,6 +105,9 @@ class Decoder:
             self._info_sizes[topic] = (camera.width, camera.height)
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
+        elif type_name == schema.EVENT:
+            event = parse_record(data, name="event", package="bridge.episode")
+            self.findings += of_event(event)
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in DEFINITIONS:
@@ -134,11 +152,13 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.CONTACT: lambda data: parse_record(data, name="contact"),
     schema.DIVERGENCE: lambda data: parse_record(data, name="divergence"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
-    schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
     schema.CLOCKS: lambda data: parse_record(data, name="clocks", package="bridge.episode"),
 }
 
 
+YEAR_NS = 31_556_952 * NS_PER_S
+LATEST_NS, MOST_YEARS = 230 * YEAR_NS, 10
+"""No recorder of today says later, or records for so long."""
 _WRAP = 1 << 32
 _MAX_OPEN_GAPS = 64
 ON_ITS_WAY_NS = 100_000_000
@@ -244,6 +264,10 @@ class TopicWatch:
     topic: str
     pauses: Pauses
     result: TopicCheck = field(default_factory=TopicCheck)
+    contents: dict[str, ContentWatch] = field(default_factory=dict)
+    """By type."""
+    odd: list[int] = field(default_factory=list)
+    """When messages came whose times cannot be."""
     sequences: SequenceWatch = field(default_factory=SequenceWatch)
     presence: Presence = field(default_factory=Presence)
     last_ns: dict[int, int] = field(default_factory=dict)
@@ -254,7 +278,14 @@ class TopicWatch:
         """Take the next message in the order of the file."""
         head, result = message.head, self.result
         result.messages += 1
-        result.type_name = message.schema.name if message.schema else ""
+        name = result.type_name = message.schema.name if message.schema else ""
+        content = self.contents.get(name)
+        if content is None:
+            content = self.contents[name] = ContentWatch(self.topic, name)
+        if content.is_of_use:
+            content.see(message.data, head.log_time_ns)
+        if max(head.log_time_ns, head.publish_time_ns) > LATEST_NS:
+            self.odd.append(head.log_time_ns)
         last_ns = self.presence.last_ns
         may_skip = self.pauses.lies_between(last_ns, head.log_time_ns)
         self.sequences.see(head.sequence, may_skip=may_skip)
@@ -268,7 +299,20 @@ class TopicWatch:
         except BridgeError as error:
             result.undecodable += 1
             if not result.first_fault:
-                result.first_fault = f"{self.topic}: {error}"
+                result.first_fault = str(error)
+
+    def findings(self, *, is_derived: bool) -> Iterator[Finding]:
+        """What its messages hold; a replay may stand still, and its images with it."""
+        for content in () if is_derived else self.contents.values():
+            yield from content.findings.values()
+        span = {"first_ns": self.presence.first_ns, "last_ns": self.presence.last_ns}
+        if len(self.contents) > 1:
+            text = " and ".join(sorted(name or "no type" for name in self.contents))
+            yield Finding(name="mixed_types", about=self.topic, text=text, **span)
+        years = (span["last_ns"] - span["first_ns"]) // YEAR_NS
+        if self.odd or years > MOST_YEARS:
+            text = f"{len(self.odd)} times after the year 2200" if self.odd else f"{years} years"
+            yield Finding(name="odd_times", about=self.topic, text=text, **span)
 
     def finish(self) -> TopicCheck:
         """Work out what needs all messages."""

@@ -3,29 +3,36 @@
 import contextlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import metadata, schema
+from bridge.episode import health, metadata, schema
 from bridge.episode.contract import (
     PRESENCE_RECORD,
     RECORD_NAME,
     Contract,
     Span,
     TopicReport,
-    breaches_of,
+    findings_of,
     judge,
-    unknown_tails,
 )
+from bridge.episode.health import ContentWatch, Finding, in_order, of_event
 from bridge.episode.run_folder import SUFFIX
 from bridge.episode.topics import CLOCKS, DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.clocks import StampJumps
 from bridge.record.config import RecorderConfig
-from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
+from bridge.record.inspection import (
+    GOOD,
+    MessageState,
+    inspector,
+    resolve_type,
+    stamp_reader,
+    why_unreadable,
+)
 from bridge.record.ledger import Ledger
 from bridge.record.presence import News
 from bridge.record.queue import Command, Dropped, Item, second_of
@@ -48,6 +55,7 @@ class Channel:
     """Shared by the channels of a topic."""
     stamp_ns: Callable[[bytes], int | None] | None
     """Reads the time in a message itself, where its type has one."""
+    content: ContentWatch
 
     def later(self, stamp_ns: int) -> int:
         """Log times of a topic never run backwards, also when two threads deliver at once."""
@@ -111,7 +119,19 @@ class Channels:
             )
         look = inspector("" if is_strange else type_name, sample.message_encoding)
         last_ns = self._last_ns.setdefault(topic, [0])
-        return Channel(record, look, last_ns, stamp_reader(record))
+        content = ContentWatch(topic, type_name)
+        return Channel(record, look, last_ns, stamp_reader(record), content)
+
+    def findings(self) -> Iterator[Finding]:
+        """What the messages of all topics hold, and which topics carry several types."""
+        types: dict[str, set[str]] = {}
+        for (topic, type_name, *_), channel in list(self._channels.items()):
+            types.setdefault(topic, set()).add(type_name)
+            yield from list(channel.content.findings.values())
+        for topic, names in types.items():
+            if len(names) > 1:
+                text = " and ".join(sorted(name or "no type" for name in names))
+                yield Finding(name="mixed_types", about=topic, text=text)
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -185,8 +205,11 @@ class EpisodeRecording:
         self.outcome: metadata.Outcome | None = None
         self.presence: dict[str, TopicReport] = {}
         """By topic, when it was there; known at the end."""
+        self._of_presence: tuple[Finding, ...] = ()
         self.news: list[News] = []
         """What it noticed and a person should hear of."""
+        self._noted: list[Finding] = []
+        self._unreadable: dict[str, str] = {}
         self._jumps = StampJumps()
         self._contract = contract
         self._config = config
@@ -265,12 +288,41 @@ class EpisodeRecording:
             self.ledger.count_refused(item)
             return
         finding = item.finding or channel.inspect(item.sample.data)
+        self._look(channel, item, finding)
         try:
             self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
             self.ledger.count_refused(item)
             raise
         self.ledger.count_received(item, finding)
+
+    def _look(self, channel: Channel, item: Item, finding: MessageState) -> None:
+        """Tell of what is wrong with a message, once for each topic and kind."""
+        topic, data = item.sample.topic, item.sample.data
+        if finding is MessageState.UNDECODABLE and topic not in self._unreadable:
+            why = self._unreadable[topic] = why_unreadable(topic, item.type_name, data)
+            text = f"{topic}: messages cannot be read: {why}"
+            told = {"kind": "unreadable", "topic": topic}
+            self.news.append(News(text=text, data=told, warns=True))
+        if channel.content.is_of_use and finding is GOOD:
+            found = channel.content.see(data, item.sample.received_ns)
+            if found is not None:
+                told = {"kind": found.name, "topic": topic}
+                self.news.append(News(text=found.line(), data=told, warns=True))
+
+    def findings(self) -> list[Finding]:
+        """What is wrong with the episode so far; of presence at the end only."""
+        found = [*self._channels.findings(), *self._noted]
+        for topic, tally in self.ledger.totals().items():
+            if tally.lost:
+                found.append(
+                    Finding(name="drops_logged", about=topic, text=f"{tally.lost} messages")
+                )
+            if tally.undecodable:
+                count = f"{tally.undecodable} of {tally.received} messages"
+                text = f"{count} cannot be read: {self._unreadable.get(topic, '')}"
+                found.append(Finding(name="unreadable", about=topic, text=text))
+        return in_order([*found, *self._of_presence])
 
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
@@ -342,6 +394,7 @@ class EpisodeRecording:
             record["data"] = data
         if outcome is not None:
             record["outcome"] = asdict(outcome)
+        self._noted += of_event(record)
         topic = cell_topic(self.info.cell or "recorder", EVENT)
         self._write_json(topic, record, schema.EVENT, stamp_ns)
         self.outcome = outcome or self.outcome
@@ -425,14 +478,16 @@ class EpisodeRecording:
         self.presence = judge(
             self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
         )
+        presences = self.ledger.presences
+        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns))
         record = {
             "topics": {topic: asdict(report) for topic, report in self.presence.items()},
-            "breaches": breaches_of(self.presence),
-            "unknown_tails": unknown_tails(self.presence),
             "unnumbered": self.ledger.unnumbered(),
         }
         values = {name: json.dumps(value) for name, value in record.items()}
         self._writer.add_metadata(PRESENCE_RECORD, values)
+        told = json.dumps([asdict(finding) for finding in self.findings()])
+        self._writer.add_metadata(health.RECORD_NAME, {"findings": told})
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""

@@ -105,6 +105,18 @@ def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     return GOOD
 
 
+def why_unreadable(topic: str, type_name: str, data: bytes) -> str:
+    """Say what is wrong with a message that was found undecodable."""
+    try:
+        if type_name == schema.IMAGE:
+            check_image(topic, image_header(data))
+        elif type_name in schema.DEFINITIONS:
+            codec.decode(type_name, data)
+    except codec.MalformedMessageError as error:
+        return str(error)
+    return f"not what {type_name} says"
+
+
 def _inspect_json(newest: int, data: bytes) -> MessageState:
     try:
         record = json.loads(data)

@@ -7,12 +7,13 @@ import tempfile
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
-from bridge.episode.contract import Contract, breaches_of, unknown_tails
+from bridge.episode.contract import Contract
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
@@ -483,6 +484,5 @@ def counts(take: EpisodeRecording) -> Answer:
         "unknown_type": total.unknown_type,
         "shed": total.shed,
         "unnumbered": take.ledger.unnumbered(),
-        "breaches": breaches_of(take.presence),
-        "unknown_tails": unknown_tails(take.presence),
+        "findings": [asdict(finding) for finding in take.findings()],
     }

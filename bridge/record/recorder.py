@@ -428,8 +428,9 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
-            for news in self._life.take_news():  # of clocks that were set, by the stamps
-                if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
+            for news in self._life.take_news():
+                topics, by_ns = news.data.get("topics"), news.data.get("by_ns")
+                if not topics or not self.clocks.has_named(topics, by_ns):
                     self.note(news)
             if not self._life.may_ask_disk:
                 return

@@ -293,6 +293,10 @@ def _least_bytes(type_name: str) -> int:
     )
 
 
+OTHER_CDR = {2: "a parameter list (PL_CDR)", 3: "a parameter list (PL_CDR)"} | dict.fromkeys(
+    range(6, 12), "CDR version 2"
+)
+"""Encapsulations of XTypes that ROS does not use, by the second byte."""
 ENCAPSULATION_LE = b"\x00\x01\x00\x00"
 
 
@@ -397,10 +401,19 @@ def decode(type_name: str, data: Buffer) -> Message:
 
 
 def _byte_order(type_name: str, data: Buffer) -> str:
+    refuse_other_cdr(type_name, data)
     if len(data) < ORIGIN or data[1] not in (0, 1):
         found = f"{len(data)} bytes without a CDR encapsulation header"
         raise MalformedMessageError(type_name=type_name, found=found)
     return "<" if data[1] == 1 else ">"
+
+
+def refuse_other_cdr(type_name: str, data: Buffer) -> None:
+    """Name an encapsulation of XTypes that is not ROS's; any other bytes pass."""
+    if len(data) >= ORIGIN and not data[0] and data[1] in OTHER_CDR:
+        found = f"{OTHER_CDR[data[1]]} (header 00 {data[1]:02x}) cannot be read"
+        hint = "Have the publisher send plain CDR of version 1."
+        raise MalformedMessageError(type_name=type_name, found=found, hint=hint)
 
 
 _FIRST_IS_HEADER = re.compile(rb"(?:\s*(?:#[^\n]*)?\n)*\s*std_msgs/(?:msg/)?Header\s+header\b")

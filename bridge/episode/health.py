@@ -1,0 +1,176 @@
+"""The health of an episode: what is wrong with it, each thing under one name.
+
+The recorder fills the record while it records and keeps it in the episode; ``check`` finds the same
+by reading. Status, stop, ``info`` and ``ls`` show it; exit codes follow from its severities.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bridge.clock import NS_PER_S, s_from_ns
+from bridge.episode import schema
+from bridge.episode.cdr.messages import DepthImage, JointSample
+from bridge.episode.topics import DEPTH_IMAGE
+from bridge.errors import BridgeError
+
+RECORD_NAME = "health"
+"""Of the metadata record that holds what the recorder found."""
+NAMES = (
+    *("contract_broken", "drops_not_logged", "drops_logged", "cut_short", "tail_unknown"),
+    *("recovered", "rate_collapsed", "frozen_image", "empty_depth", "nan_joints", "stamp_zero"),
+    *("stamp_stuck", "odd_times", "clock_jump", "host_clock_jump", "deaf", "unreadable"),
+    "mixed_types",
+)
+"""Every name; of several the first stands for all. With one of them an episode is not clean."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that is wrong, and when it was so."""
+
+    name: str
+    about: str
+    """The topic, clock or file."""
+    text: str
+    first_ns: int = 0
+    """First and last instant, by the recorder's clock; 0 where it has none."""
+    last_ns: int = 0
+    count: int = 1
+
+    def line(self, start_ns: int = 0) -> str:
+        """One sentence, with seconds after the start where that is known."""
+        text = f"{in_words(self.name)}: {self.about}: {self.text}"
+        if not start_ns or not self.first_ns:
+            return text
+        first_s, last_s = (s_from_ns(at - start_ns) for at in (self.first_ns, self.last_ns))
+        more = "" if first_s == last_s else f" to {last_s:.1f}"
+        return f"{text} (at {first_s:.1f}{more} s)"
+
+
+def in_order(findings: Iterable[Finding]) -> list[Finding]:
+    """The worst first, then by time; one of each name and topic."""
+    kept = {(each.name, each.about, each.text): each for each in findings}
+    return sorted(
+        kept.values(), key=lambda each: (NAMES.index(each.name), each.first_ns, each.about)
+    )
+
+
+def in_words(name: str) -> str:
+    """A name for people."""
+    return name.replace("_", " ")
+
+
+def parsed(value: object) -> list[Finding]:
+    """Read findings as they stand in a record; anything else is none."""
+    try:
+        return msgspec.convert(value, list[Finding])
+    except msgspec.ValidationError:
+        return []
+
+
+_IMAGES = (schema.IMAGE, schema.COMPRESSED_IMAGE)
+_STAMPED = (*_IMAGES, schema.JOINT_STATE, schema.POSE_STAMPED)
+_UNSET = bytes(8)
+_NOT_NUMBERS = (b"\xf8\x7f", b"\xf8\xff", b"\xf0\x7f", b"\xf0\xff")
+"""How NaN and infinity of 64 bits end, little endian; whoever has one of these is looked at."""
+_FRONT, _SAMPLES, _SMALL = 128, 64, 4096
+_LONG_ENOUGH = {
+    "stamp_zero": (20, 0, "header.stamp is 0"),
+    "stamp_stuck": (20, NS_PER_S, "header.stamp stays the same"),
+    "frozen_image": (20, NS_PER_S, "every pixel stays the same"),
+    "empty_depth": (5, 0, "every pixel is 0"),
+    "nan_joints": (1, 0, "a position is no number"),
+}
+"""How many messages in a row, over what time, and what is said of them."""
+
+
+class ContentWatch:
+    """Follows what the messages of one topic hold; what is looked at costs microseconds."""
+
+    def __init__(self, topic: str, type_name: str) -> None:
+        """Choose what to look at."""
+        self.findings: dict[str, Finding] = {}
+        self.is_of_use = type_name in _STAMPED
+        self._topic, self._type = topic, type_name
+        self._is_image = type_name in _IMAGES
+        self._is_depth = self._is_image and topic.endswith(DEPTH_IMAGE)
+        self._is_joints = type_name == schema.JOINT_STATE
+        self._runs: dict[str, list[int]] = {}
+        """Where each run began, how long it is, and how much of it is in a finding."""
+        self._stamp, self._key, self._data = b"", b"", b""
+
+    def see(self, data: bytes, log_ns: int) -> Finding | None:
+        """Take the next message; return what has just become remarkable."""
+        stamp, now = data[4:12], []
+        if stamp == self._stamp:
+            now.append("stamp_zero" if stamp == _UNSET else "stamp_stuck")
+        self._stamp = stamp
+        if self._is_joints and any(end in data for end in _NOT_NUMBERS) and _has_nan(data):
+            now.append("nan_joints")
+        elif self._is_image:
+            key = data[_FRONT :: len(data) // _SAMPLES + 1]
+            is_suspect = self._is_depth and (len(data) < _SMALL or not any(key))
+            if is_suspect and _is_empty(self._type, data):
+                now.append("empty_depth")
+            elif key == self._key and data[12:] == self._data[12:]:
+                now.append("frozen_image")
+            self._key, self._data = key, data
+        if now or self._runs:
+            return self._follow(now, log_ns)
+        return None
+
+    def _follow(self, now: list[str], log_ns: int) -> Finding | None:
+        new = None
+        self._runs = {name: self._runs.get(name, [log_ns, 0, 0]) for name in now}
+        for name, run in self._runs.items():
+            least, span_ns, text = _LONG_ENOUGH[name]
+            run[1] += 1
+            if run[1] < least or log_ns - run[0] < span_ns:
+                continue
+            before = self.findings.get(name)
+            first_ns, count = (before.first_ns, before.count) if before else (run[0], 0)
+            found = self.findings[name] = Finding(
+                name=name, about=self._topic, text=text, first_ns=first_ns, last_ns=log_ns,
+                count=count + run[1] - run[2],
+            )  # fmt: skip
+            run[2] = run[1]
+            new = new if before else found
+        return new
+
+
+def _has_nan(data: bytes) -> bool:
+    try:
+        return not np.isfinite(JointSample.from_cdr(data).position).all()
+    except BridgeError:  # whoever decodes it says so
+        return False
+
+
+def _is_empty(type_name: str, data: bytes) -> bool:
+    try:
+        return not DepthImage.from_message(type_name, data).depth_mm.any()
+    except BridgeError:
+        return False
+
+
+_SET = {"clock_jump": "clock_jump", "stamp_jump": "clock_jump", "deaf": "deaf"}
+"""Kinds of notes that a recorder writes among the events, and what they are here."""
+
+
+def of_event(event: Mapping[str, Any]) -> Iterator[Finding]:
+    """Read what the recorder noticed of clocks and of its own hearing."""
+    at_ns, data = event.get("stamp_ns", 0), event.get("data") or {}
+    if event.get("type") == "clock_step":
+        by_s = data.get("step_ns", 0) / NS_PER_S
+        text = f"set {'ahead' if by_s > 0 else 'back'} by {abs(by_s):.3f} s; log times go on"
+        yield Finding(
+            name="host_clock_jump", about="recorder", text=text, first_ns=at_ns, last_ns=at_ns
+        )
+    name = _SET.get(data.get("kind", "")) if event.get("type") == "note" else None
+    if name is not None:
+        about = str(data.get("source") or (data.get("topics") or ["recorder"])[0])
+        text = str(event.get("text", ""))
+        yield Finding(name=name, about=about, text=text, first_ns=at_ns, last_ns=at_ns)
