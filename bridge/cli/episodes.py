@@ -159,7 +159,7 @@ def check(
     """
     from bridge.episode.check import check_all
     from bridge.episode.contract import find_contract
-    from bridge.episode.run_folder import is_being_written, told_unfinished
+    from bridge.episode.mcap.part_file import told_unfinished
     from bridge.errors import UsageError
 
     if wire.wire is not None:
@@ -174,8 +174,9 @@ def check(
             unfinished.extend(sorted(path.rglob("*.mcap.part")))
         else:
             (unfinished if path.suffix == ".part" else files).append(path)
-    for path in unfinished:
-        output.say(told_unfinished(path))
+    told = [told_unfinished(path) for path in unfinished]
+    for text, _ in told:
+        output.say(text)
     if not files and not unfinished:
         listed = ", ".join(map(str, episodes)) or "no path"
         raise UsageError(f"no episodes in {listed}. Record some: robot-gst record RUN.")
@@ -192,7 +193,8 @@ def check(
     lines = [line for report in reports for line in report.lines()]
     output.result(data, "\n".join(lines))
     codes = {report.exit_code for report in reports}
-    codes |= {1 if path in episodes else 3 for path in unfinished if not is_being_written(path)}
+    left = [path for path, (_, alive) in zip(unfinished, told, strict=True) if not alive]
+    codes |= {1 if path in episodes else 3 for path in left}
     return 1 if 1 in codes else max(codes, default=0)
 
 
@@ -311,11 +313,11 @@ def ls(
         query: Which, and in what order.
     """
     from bridge.episode.catalogue import find_runs
-    from bridge.episode.run_folder import told_unfinished
+    from bridge.episode.mcap.part_file import told_unfinished
 
     runs = find_runs(run)
     for path in (path for each in runs for path in sorted(each.episodes_dir.glob("*.part"))):
-        output.say(told_unfinished(path))
+        output.say(told_unfinished(path)[0])
     found = _find(runs, query, output)
     entries = [entry for _, entry in found]
     shown = entries

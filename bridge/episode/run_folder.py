@@ -1,6 +1,5 @@
 """The run folder: one run is one cell."""
 
-import fcntl
 import os
 import re
 from collections.abc import Collection
@@ -173,25 +172,3 @@ class RunFolder:
         """Derived episode files, in name order."""
         names = file_names(self.derived_dir)
         return [self.derived_dir / name for name in names if fnmatchcase(name, pattern + SUFFIX)]
-
-
-def is_being_written(path: Path) -> bool:
-    """Whether a recorder is at work in the folder of an unfinished episode: it locks it."""
-    try:
-        descriptor = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return isinstance(error, BlockingIOError)
-    finally:
-        os.close(descriptor)
-    return False
-
-
-def told_unfinished(path: Path) -> str:
-    """Name an episode that is not finished, and what to do."""
-    if is_being_written(path):
-        return f"{path} is being written"
-    return f"{path} is not finished: its writer was killed; robot-gst recover {path}"

@@ -242,6 +242,15 @@ def lock_dead(path: Path, *, write: bool = True) -> int | None:
     return None
 
 
+def told_unfinished(path: Path) -> tuple[str, bool]:
+    """Name a file that is not finished and what to do, and say whether its writer is alive."""
+    descriptor = lock_dead(path, write=False)
+    if descriptor is None:
+        return f"{path} is being written", True
+    os.close(descriptor)
+    return f"{path} is not finished: its writer was killed; robot-gst recover {path}", False
+
+
 def sync_folder(folder: Path) -> None:
     """Make a new name in a folder survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
