@@ -67,20 +67,12 @@ def _current(run: RunFolder, path: Path, parts: Sequence[str]) -> Entry:
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
-    """Where the label of an episode is kept.
-
-    Args:
-        episode_id: Its id, which must be safe as a file name.
-    """
+    """Where the label of an episode is kept."""
     return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
 
 
 def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
-    """Return the label given after the fact if there is one, else what the episode says.
-
-    Args:
-        episode: One of its episodes; the label is looked up by the name of its file.
-    """
+    """Return the label given after the fact if there is one, else what the episode says."""
     if not EPISODE_ID.fullmatch(episode.path.stem):
         return episode.outcome  # a file of another program; it cannot have been labelled here
     path = sidecar_path(run, episode.path.stem)
@@ -202,12 +194,7 @@ def find_in_runs(
 def assign_trial(
     run: RunFolder, episode_id: str, *, task: str, start_id: str | None, policy: str | None
 ) -> Path:
-    """Note that an episode is a trial of a task, beside the run.
-
-    Args:
-        start_id: Start it shares with others; None: as it says itself.
-        policy: What moved the robot; None: as it says itself.
-    """
+    """Note that an episode is a trial of a task, beside the run."""
     path, name = _finished(run, episode_id), task_of_run(run, task)
     info = Episode.open(path).info
     return assign(run, path, info, task=name, start_id=start_id, policy=policy)

@@ -133,11 +133,7 @@ def learn_from(path: Path) -> Contract:
 
 
 def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Iterator[CheckReport]:
-    """Check every episode among some files; a later part goes with the first of its episode.
-
-    Args:
-        contract: Judge by this one; None takes the one each episode was recorded under.
-    """
+    """Check every episode among some files; a later part goes with the first of its episode."""
     done: set[Path] = set()
     for path in sorted(paths, key=_by_part):
         if path not in done:

@@ -64,10 +64,6 @@ class Decoder:
     def decode(self, topic: str, message: ScannedMessage) -> None:
         """Read one message.
 
-        Args:
-            topic: Where it was sent; a topic of the contract decides how its message is read.
-            message: With its channel and schema; of an unknown type or encoding it is passed over.
-
         Raises:
             BridgeError: When it is not what its topic and type promise.
         """

@@ -77,11 +77,7 @@ def read_round_trip(*, asked_ns: int, received_ns: int, sent_ns: int, back_ns: i
 
 
 def jump_of(before: Sequence[Reading], new: Reading) -> Jump | None:
-    """Say whether a reading contradicts those before it; None where it agrees with all.
-
-    Args:
-        before: Readings since the clock was last set, in order.
-    """
+    """Say whether a reading contradicts those before it; None where it agrees with all."""
     for old in before[-COMPARED:]:
         allowed_ns = old.error_ns + new.error_ns + SLEW * abs(new.at_ns - old.at_ns)
         if abs(new.offset_ns - old.offset_ns) > allowed_ns + SMALLEST_JUMP_NS:
@@ -112,11 +108,7 @@ class ClockLine:
 
 
 def fit_line(readings: Sequence[Reading]) -> ClockLine:
-    """Fit offset and drift to the quicker half of the readings, the quickest counting most.
-
-    Args:
-        readings: At least one, of a clock that was not set meanwhile.
-    """
+    """Fit offset and drift to the quicker half of the readings, the quickest counting most."""
     limit_ns = statistics.median_low(reading.error_ns for reading in readings)
     used = [reading for reading in readings if reading.error_ns <= limit_ns]
     start_ns = min(reading.at_ns for reading in readings)
@@ -249,11 +241,7 @@ def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) ->
 
 
 def source_clocks(records: Iterable[dict[str, Any]]) -> list[SourceClock]:
-    """Put together what an episode says of clocks, by source.
-
-    Args:
-        records: Those of ``/recorder/clocks``, in log order; what is no such record is left out.
-    """
+    """Put together what an episode says of clocks, by source."""
     found: dict[tuple[str, str], SourceClock] = {}
     for record in records:
         try:
@@ -302,10 +290,6 @@ class StampCorrection:
 
         Of several lines the one that holds at the time counts; between two, the one that puts the
         message closest to its arrival. Sources that share a topic and differ are left alone.
-
-        Args:
-            publish_ns: Its time by the source's clock.
-            log_ns: When it arrived, by the recorder's clock.
         """
         known = self._lines.get(topic)
         if not known:
@@ -332,12 +316,7 @@ def _next(away: Sequence[int]) -> int:
 
 
 def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: int) -> RawMessage:
-    """Move the time of a message, and the time it holds itself, where its type has one.
-
-    Args:
-        definition: Of its type; None where there is none.
-        shift_ns: What is added [ns]; times that were never set stay 0.
-    """
+    """Move the time of a message, and the time it holds itself, where its type has one."""
     publish_ns = max(0, message.publish_time_ns + shift_ns)
     data = message.data
     with contextlib.suppress(codec.MalformedMessageError):
@@ -415,13 +394,7 @@ class CorrectedEpisode(Episode):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Yield messages as ``Episode.messages`` does, with moved stamps.
-
-        Args:
-            topics: Topics wanted; None for all.
-            start_ns: First log time wanted [ns since 1970]; None: from the start.
-            end_ns: Log time to stop before [ns since 1970]; None: to the end.
-        """
+        """Yield messages as ``Episode.messages`` does, with moved stamps."""
         for message in super().messages(topics, start_ns=start_ns, end_ns=end_ns):
             shift_ns = self.shift_ns(message)
             if shift_ns:
@@ -432,11 +405,7 @@ class CorrectedEpisode(Episode):
 
 
 def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
-    """Open an episode as ``Episode.open`` does, with the clock a person asked for.
-
-    Args:
-        clock: ``corrected`` takes the sources' offset and drift out of all stamps.
-    """
+    """Open an episode as ``Episode.open`` does, with the clock a person asked for."""
     episode = Episode.open(path)
     if clock == "recorded":
         return episode

@@ -97,9 +97,6 @@ def read_contract(path: Path) -> Contract:
 def find_contract(run: Path, name: str | None) -> Contract | None:
     """Return the contract of a recording.
 
-    Args:
-        run: The run folder; its ``cell.toml`` holds unless another is named.
-
     Raises:
         UsageError: When there is no such template; lists those that are there.
     """

@@ -95,11 +95,7 @@ def _highest_part(path: Path, episode_id: str) -> int:
 
 
 def record_of(file: McapFile, name: str) -> dict[str, Any]:
-    """Return a metadata record of one file with its values parsed, empty where there is none.
-
-    Args:
-        name: Of the record, such as ``episode`` or ``outcome``; the last of that name counts.
-    """
+    """Return a metadata record of one file with its values parsed, empty where there is none."""
     values: dict[str, Any] = {}
     for record in file.metadata:
         if record.name == name:

@@ -151,11 +151,7 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
 def rgbd_frames(
     episode: Episode, camera_id: str, tree: TransformTree | None = None
 ) -> Iterator[RgbdFrame]:
-    """Yield posed frames in time order; colour without depth nearby is passed over.
-
-    Args:
-        tree: The episode's frames where they are known; None reads them from it.
-    """
+    """Yield posed frames in time order; colour without depth nearby is passed over."""
     tree = transform_tree(episode) if tree is None else tree
     color_info = camera_info(episode, camera_id, "color")
     depth_info = camera_info(episode, camera_id, "depth")
@@ -349,11 +345,7 @@ def robot_description(episode: Episode) -> str | None:
 
 
 def task_file(episode: Episode, name: str = "") -> TaskFile:
-    """Find the task file an episode was recorded with.
-
-    Args:
-        episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
-    """
+    """Find the task file an episode was recorded with."""
     info = episode.info
     attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)
     tasks_dir = RunFolder(episode.path.absolute().parent.parent).tasks_dir

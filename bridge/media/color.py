@@ -45,12 +45,6 @@ def encode_jpeg(
 ) -> bytes:
     """Compress an sRGB image as JPEG.
 
-    Args:
-        image_u8: The image; its rows may lie apart in memory.
-        quality: 1 to 100.
-        layout: Order of the channels: RGB, BGR, RGBA, BGRA or GRAY.
-        subsampling: Of colour: 444 keeps all of it, 420 halves it in both directions.
-
     Raises:
         ValueError: The image is larger than JPEG allows (65500), or empty.
     """

@@ -35,11 +35,7 @@ def to_millimetres(
     invalid_values: Iterable[int] = (0,),
     encoding: str = "",
 ) -> UInt16[np.ndarray, "height width"]:
-    """Apply a folder's decode rules; every invalid code becomes 0.
-
-    Args:
-        encoding: ``ROTATED_ENCODING`` where bits are rotated; "" for plain numbers.
-    """
+    """Apply a folder's decode rules; every invalid code becomes 0."""
     values = undo_rotation(stored) if encoding == ROTATED_ENCODING else stored
     invalid = np.isin(stored, list(invalid_values)) | (values == 0)
     millimetres = np.rint(values * (unit_m * 1e3))

@@ -71,11 +71,7 @@ class Channels:
     def __init__(
         self, max_topics: int, warn: Callable[[str], None], msg_folder: Path | None = None
     ) -> None:
-        """Start empty.
-
-        Args:
-            max_topics: Further ones are refused.
-        """
+        """Start empty."""
         self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
@@ -85,11 +81,7 @@ class Channels:
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
-        """Return the channel of a message, or None when there are too many.
-
-        Args:
-            type_name: The type after ``resolve_type``; "" where nobody knows it.
-        """
+        """Return the channel of a message, or None when there are too many."""
         is_defined = sample.definition is not None
         key = (sample.topic, type_name, sample.message_encoding, sample.type_hash, is_defined)
         channel = self._channels.get(key)
@@ -98,12 +90,7 @@ class Channels:
         return channel
 
     def later(self, topic: str, stamp_ns: int) -> int:
-        """Return a log time for a record of our own.
-
-        Args:
-            stamp_ns: Wanted log time [ns since 1970]; a later one is returned rather than one step
-                back.
-        """
+        """Return a log time for a record of our own."""
         last_ns = self._last_ns.setdefault(topic, [0])
         last_ns[0] = max(last_ns[0], stamp_ns)
         return last_ns[0]
@@ -194,11 +181,7 @@ class EpisodeRecording:
         task: TaskFile | None = None,
         clocks: Iterable[dict[str, Any]] = (),
     ) -> None:
-        """Create the episode file and say in it who and what it is.
-
-        Args:
-            others: What else goes into the ``recorder`` record, by name; asked at the end.
-        """
+        """Create the episode file and say in it who and what it is."""
         self.info = info
         self.ledger = Ledger(config.queues.max_topics)
         self.start_ns = start_ns
@@ -379,14 +362,7 @@ class EpisodeRecording:
         outcome: metadata.Outcome | None = None,
         data: dict[str, Any] | None = None,
     ) -> None:
-        """Append a mark or a label to the cell's events; a label is the outcome from now on.
-
-        Args:
-            kind: One of the types of the event schema, such as ``mark`` or ``label``.
-            text: Free text; "" for none.
-            outcome: Of a label; None leaves the episode's outcome as it is.
-            data: Fields of this kind of event; None for none.
-        """
+        """Append a mark or a label to the cell's events; a label is the outcome from now on."""
         record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
         if text:
             record["text"] = text
@@ -400,12 +376,7 @@ class EpisodeRecording:
         self.outcome = outcome or self.outcome
 
     def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
-        """Write down that the system clock has jumped; log times have not.
-
-        Args:
-            step_ns: How far it jumped, forwards positive.
-            stamp_ns: When that was seen, on the clock that does not jump [ns since 1970].
-        """
+        """Write down that the system clock has jumped; log times have not."""
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
@@ -442,9 +413,6 @@ class EpisodeRecording:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
-
-        Args:
-            outcome: How it ended; None: as it was labelled last.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:

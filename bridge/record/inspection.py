@@ -35,31 +35,18 @@ GOOD = MessageState.GOOD
 
 
 def resolve_type(topic: str, type_name: str) -> str:
-    """Trust the publisher's type name; without one, go by the topic.
-
-    Args:
-        type_name: As the publisher says; "" for unknown.
-    """
+    """Trust the publisher's type name; without one, go by the topic."""
     return type_name or type_of_topic(topic) or ""
 
 
 def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
-    """Check a message without building anything from it.
-
-    Args:
-        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
-    """
+    """Check a message without building anything from it."""
     return inspector(type_name, message_encoding)(data)
 
 
 @lru_cache(maxsize=4096)
 def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], MessageState]:
-    """Return the check for the messages of one type.
-
-    Args:
-        type_name: As ``resolve_type`` gives it; "" for unknown.
-        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
-    """
+    """Return the check for the messages of one type."""
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
         return lambda data: MessageState.UNKNOWN_TYPE

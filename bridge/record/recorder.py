@@ -224,11 +224,7 @@ class Recorder:
         discard: bool = False,
         reason: str = "command",
     ) -> Answer:
-        """Finish the episode, or throw it away, after everything received so far.
-
-        Args:
-            outcome: How it ended; None: as it was labelled last.
-        """
+        """Finish the episode, or throw it away, after everything received so far."""
 
         def act(command: Command) -> Answer:
             self.presence.end()
@@ -270,13 +266,7 @@ class Recorder:
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
     ) -> Answer:
-        """Say how the open episode went, or, by its id, a finished one (kept under notes/).
-
-        Args:
-            text: Free text; "" for none.
-            outcome: How it went; None for text alone.
-            episode: Id of an episode; None: the open one, else the last.
-        """
+        """Say how the open episode went, or, by its id, a finished one (kept under notes/)."""
 
         def act(command: Command) -> Answer:
             take = self._life.take

@@ -272,12 +272,7 @@ class WireSession:
         *,
         max_bytes: int = sys.maxsize,
     ) -> Subscriber:
-        """Receive what matches, for example ``standin/**``, on the network thread.
-
-        Args:
-            key_expression: zenoh keys, where ``*`` stands for one part and ``**`` for any number.
-            callback: Gets each message, in order; must be quick.
-        """
+        """Receive what matches, for example ``standin/**``, on the network thread."""
 
         def on_sample(sample: Any) -> None:
             if sample.kind != zenoh.SampleKind.PUT:

@@ -23,12 +23,7 @@ _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
-    """Read a robot file, build all that replays need of it, and say what was found.
-
-    Args:
-        name: Name in ``datasets/robots``, or path of a robot file.
-        urdf_out: Where the description goes that carries the record; None: nowhere.
-    """
+    """Read a robot file, build all that replays need of it, and say what was found."""
     record = read_robot(name)
     try:
         text = record.description()

@@ -154,13 +154,6 @@ def signed_distance(
     """Distance between two convex shapes [m], negative by the depth when they overlap.
 
     A fresh ``result`` is filled with the nearest points and the direction between them.
-
-    Args:
-        first: One shape, in its own frame.
-        T_first: Where it is, in any frame.
-        second: The other shape, in its own frame.
-        T_second: Where that is, in the same frame as the first.
-        result: Receives nearest points and direction; None: they are not wanted.
     """
     result = coal.DistanceResult() if result is None else result
     distance_m = float(coal.distance(first, T_first, second, T_second, _SIGNED, result))
@@ -195,12 +188,7 @@ class RobotHulls:
         self.pairs = self._pairs()
 
     def place(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Move all hulls to a posture.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Move all hulls to a posture."""
         robot = self.robot
         pin.framesForwardKinematics(
             robot.model, robot.data, robot.configuration(joints_rad, width_m)

@@ -57,11 +57,7 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
 
 
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
-    """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted.
-
-    Args:
-        keep_visuals: Leave what is drawn in; collision elements always stay.
-    """
+    """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted."""
     root = parse_description(urdf)
     for link in root.findall("link"):
         if not keep_visuals:
@@ -405,12 +401,7 @@ class RobotModel:
     def configuration(
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, " num_values"]:
-        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order."""
         if width_m != self._opened_m:  # along a path it seldom changes
             self._opened_m = width_m
             for index, finger in self._fingers:
@@ -445,12 +436,7 @@ class RobotModel:
     def T_base_link(
         self, link: str, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:
-        """Pose of any link or frame.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Pose of any link or frame."""
         if not self.model.existFrame(link):
             names = ", ".join(frame.name for frame in self.model.frames)
             raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")

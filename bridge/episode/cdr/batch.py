@@ -34,11 +34,7 @@ class MessageTemplate:
     def __init__(
         self, type_name: str, build: Callable[[Stamp, list[float]], dict[str, Any]], count: int
     ) -> None:
-        """Serialise once and remember where the numbers went.
-
-        Args:
-            build: Makes the message from a stamp and ``count`` numbers.
-        """
+        """Serialise once and remember where the numbers went."""
         marks = [2.0**-30 * (3 * number + 1) for number in range(count)]
         self._bytes = codec.encode(type_name, build(_STAMP_MARK, marks))
         self._stamp_at = self._place(_STAMP_FIELDS.pack(*_STAMP_MARK.values()))
@@ -124,12 +120,7 @@ def joint_messages(
     names: Sequence[str],
     position: Float[np.ndarray, "num_messages num_joints"],
 ) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone.
-
-    Args:
-        names: Joints, in the order of the columns of ``position``.
-        position: One row for each message [rad; m for a gripper's width].
-    """
+    """Yield sensor_msgs/JointState messages with positions alone."""
     return joint_template(names).fill_all(stamps_ns, position)
 
 
@@ -138,11 +129,7 @@ def pose_messages(
     frame_id: str,
     Ts_frame_body: Float[np.ndarray, "num_messages 4 4"],
 ) -> Iterator[bytes]:
-    """Yield geometry_msgs/PoseStamped messages.
-
-    Args:
-        frame_id: The frame the poses are expressed in.
-    """
+    """Yield geometry_msgs/PoseStamped messages."""
     q, p = se3.split(Ts_frame_body)
     numbers = np.concatenate([p, q[:, 1:], q[:, :1]], axis=1)
     return pose_template(frame_id).fill_all(stamps_ns, numbers)

@@ -316,11 +316,7 @@ class MalformedMessageError(BridgeError):
 
 
 def encode(type_name: str, message: Mapping[str, Any]) -> bytes:
-    """Serialise a message; fields left out take their ROS default (0, empty).
-
-    Args:
-        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-    """
+    """Serialise a message; fields left out take their ROS default (0, empty)."""
     out = bytearray()
     _write(out, type_name, message)
     return ENCAPSULATION_LE + bytes(out)
@@ -383,9 +379,6 @@ def decode(type_name: str, data: Buffer) -> Message:
     Arrays look into ``data``, in its byte order, and are not copied. What is made is never larger
     than a fixed multiple of ``data``, whatever lengths it claims.
 
-    Args:
-        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-
     Raises:
         KeyError: When the type is none of ``ros2_definitions``.
     """
@@ -435,11 +428,7 @@ def header_stamp(data: Buffer) -> tuple[int, int] | None:
 
 
 def with_header_stamp(data: Buffer, sec: int, nanosec: int) -> bytes:
-    """Put another time into the header a message begins with.
-
-    Args:
-        sec: Whole seconds since 1970.
-    """
+    """Put another time into the header a message begins with."""
     out = bytearray(data)
     _STAMPS["<" if data[1] else ">"].pack_into(out, ORIGIN, sec, nanosec)
     return bytes(out)

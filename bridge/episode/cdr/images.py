@@ -115,9 +115,6 @@ def no_encoding(encoding: str, known: Iterable[str]) -> MalformedMessageError:
 def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
     """Compress a raw colour image; an alpha channel is dropped.
 
-    Args:
-        quality: JPEG quality, 1 to 100.
-
     Returns:
         CDR of a sensor_msgs/CompressedImage with the same stamp and frame, or None when the
         encoding is none of ``COLOR_LAYOUTS``.

@@ -152,20 +152,12 @@ class RawColor:
 
 
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
-    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
-
-    Args:
-        type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-    """
+    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``."""
     return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
 
 
 def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
-    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw.
-
-    Args:
-        type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
-    """
+    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw."""
     if type_name != schema.IMAGE:
         return CompressedColor.from_cdr(data)
     jpeg = image_to_jpeg(data)
@@ -224,11 +216,7 @@ class DepthImage:
 
     @staticmethod
     def from_message(type_name: str, data: bytes) -> "DepthImage":
-        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG.
-
-        Args:
-            type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-        """
+        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG."""
         if type_name == schema.IMAGE:
             return DepthImage.from_cdr(data)
         image = CompressedColor.from_cdr(data)
@@ -397,11 +385,7 @@ def joint_trajectory_to_cdr(
     times_ns: list[int],
     positions_rad: Float[np.ndarray, "num_points num_joints"],
 ) -> bytes:
-    """Serialise as trajectory_msgs/JointTrajectory, for viewers.
-
-    Args:
-        names: Joints, in the order of the columns of ``positions_rad``.
-    """
+    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
     points = []
     for t_ns, row in zip(times_ns, positions_rad, strict=True):
         sec, nanosec = split_ns(t_ns)

@@ -98,11 +98,7 @@ class PartFile:
         sync_folder(final_path.parent)
 
     def truncate(self, offset: int, crc: int) -> None:
-        """Drop everything from ``offset`` on; ``crc`` is that of what stays.
-
-        Args:
-            offset: The new length of the file [bytes].
-        """
+        """Drop everything from ``offset`` on; ``crc`` is that of what stays."""
         os.ftruncate(self._descriptor, offset)
         self.offset, self.crc = offset, crc
 

@@ -88,11 +88,7 @@ class PosedIndex:
 
 
 def read_posed_index(folder: Path) -> PosedIndex:
-    """Read whichever of the two layouts the folder has.
-
-    Args:
-        folder: Holds ``transforms.json``, or COLMAP's text model in itself or in ``sparse/0``.
-    """
+    """Read whichever of the two layouts the folder has."""
     if (folder / TRANSFORMS).is_file():
         return _read_transforms(folder)
     for place in COLMAP_FOLDERS:
