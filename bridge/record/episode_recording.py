@@ -270,8 +270,9 @@ class EpisodeRecording:
         if channel is None:
             self.ledger.count_refused(item)
             return
-        finding = item.finding or channel.inspect(item.sample.data)
-        self._look(channel, item, finding)
+        is_known = channel.content.knows(item.sample.data)
+        finding = GOOD if is_known else item.finding or channel.inspect(item.sample.data)
+        self._look(channel, item, finding, is_known=is_known)
         try:
             self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
@@ -279,7 +280,7 @@ class EpisodeRecording:
             raise
         self.ledger.count_received(item, finding)
 
-    def _look(self, channel: Channel, item: Item, finding: MessageState) -> None:
+    def _look(self, channel: Channel, item: Item, finding: MessageState, *, is_known: bool) -> None:
         """Tell of what is wrong with a message, once for each topic and kind."""
         topic, data = item.sample.topic, item.sample.data
         if finding is MessageState.UNDECODABLE and topic not in self._unreadable:
@@ -288,7 +289,7 @@ class EpisodeRecording:
             told = {"kind": "unreadable", "topic": topic}
             self.news.append(News(text=text, data=told, warns=True))
         if channel.content.is_of_use and finding is GOOD:
-            found = channel.content.see(data, item.sample.received_ns)
+            found = channel.content.see(data, item.sample.received_ns, is_known=is_known)
             if found is not None:
                 told = {"kind": found.name, "topic": topic}
                 self.news.append(News(text=found.line(), data=told, warns=True))

@@ -14,6 +14,7 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.images import depth_to_compact
 from bridge.episode.check import check_episode
+from bridge.episode.health import ContentWatch
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.writer import EpisodeWriter
@@ -220,3 +221,25 @@ def test_a_part_that_was_left_is_no_clean_run(
     assert f"its writer was killed; robot-gst recover {part}" in said.err
     robot_gst.run(["ls", str(run.path)])
     assert f"robot-gst recover {part}" in capsys.readouterr().err
+
+
+def test_joints_that_are_taken_for_known_can_be_read_and_are_the_same_joints() -> None:
+    """Law: whatever is taken as known without decoding decodes to the same names and counts."""
+    rng = np.random.default_rng(3)
+    for counts in ((2, 2, 2), (2, 0, 0), (2, 0, 2), (2, 2, 0)):
+        fields = [rng.normal(size=count).tolist() for count in counts]
+        names = ("position", "velocity", "effort")
+        first = joints(1, **dict(zip(names, fields, strict=True)))
+        watch, taken = ContentWatch(JOINTS, schema.JOINT_STATE), 0
+        watch.see(first, 1)
+        expected = codec.decode(schema.JOINT_STATE, first)
+        for _ in range(3000):
+            changed = bytearray(first)
+            for _ in range(rng.integers(1, 3)):
+                changed[rng.integers(len(changed))] ^= 1 << int(rng.integers(8))
+            if watch.knows(bytes(changed)):
+                taken += 1
+                found = codec.decode(schema.JOINT_STATE, bytes(changed))
+                assert found["name"] == expected["name"]
+                assert [len(found[name]) for name in names] == list(counts)
+        assert taken > 100
