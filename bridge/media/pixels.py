@@ -79,7 +79,7 @@ def _rgb_of_yuv(
     blue, red = u.astype(np.int64) - 128, v.astype(np.int64) - 128
     parts = (_V_IN_R * red, _V_IN_G * red + _U_IN_G * blue, _U_IN_B * blue)
     rgb = np.stack([light + part for part in parts], axis=-1) >> _SHIFT
-    return np.clip(rgb, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(rgb, 0, 255).astype(np.uint8))
 
 
 def _mosaic_filled(

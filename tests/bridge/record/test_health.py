@@ -229,7 +229,9 @@ def test_joints_that_are_taken_for_known_can_be_read_and_are_the_same_joints() -
     for counts in ((2, 2, 2), (2, 0, 0), (2, 0, 2), (2, 2, 0)):
         fields = [rng.normal(size=count).tolist() for count in counts]
         names = ("position", "velocity", "effort")
-        first = joints(1, **dict(zip(names, fields, strict=True)))
+        about = {"header": header(1), "name": ["a", "b"]}
+        numbers = dict(zip(names, fields, strict=True))
+        first = codec.encode(schema.JOINT_STATE, {**about, **numbers})
         watch, taken = ContentWatch(JOINTS, schema.JOINT_STATE), 0
         watch.see(first, 1)
         expected = codec.decode(schema.JOINT_STATE, first)
