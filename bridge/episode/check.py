@@ -93,11 +93,7 @@ class CheckReport:
 
 
 def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
-    """Read every byte of an episode and of its parts, and decode every type this project knows.
-
-    Args:
-        contract: Judge by this one; None takes the one the episode was recorded under.
-    """
+    """Read every byte of an episode and of its parts, and decode every type this project knows."""
     report = CheckReport(path=path)
     faults = Faults()
     watch = _Watch()
@@ -111,8 +107,8 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
     if episode is not None:
-        report.start_ns = episode.start_ns
-        if _is_recording(episode):
+        report.start_ns, records = episode.start_ns, episode.metadata_records
+        if "recorder" in records or ("recovered" in records and RECORD_NAME in records):
             _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
     report.findings = in_order(report.findings)
@@ -232,11 +228,13 @@ def _judge_topics(
     report: CheckReport, episode: Episode | None, watch: _Watch, faults: Faults
 ) -> None:
     decoder = watch.decoder
-    ours = watch.is_ours and not _is_imported(episode)
-    is_recording = episode is not None and "recorder" in episode.metadata_records
+    records = {} if episode is None else episode.metadata_records
+    ours = watch.is_ours and records.get("episode", {}).get("kind") != "imported"
+    is_recording = "recorder" in records
     say = faults.add if ours else report.notes.append
     report.notes += sorted(decoder.missing)
-    shared = _shared_topics(episode)
+    shared = records.get("drops", {}).get("several_publishers")
+    shared = shared if isinstance(shared, list) else []  # nobody knows whose number is whose
     for topic, topic_watch in sorted(watch.topics.items()):
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
@@ -273,12 +271,6 @@ def _judge_topics(
         say(text)
 
 
-def _is_recording(episode: Episode) -> bool:
-    """Whether a recorder of ours made it, be it finished or recovered."""
-    records = episode.metadata_records
-    return "recorder" in records or ("recovered" in records and RECORD_NAME in records)
-
-
 def _judge_presence(
     report: CheckReport,
     episode: Episode,
@@ -307,19 +299,6 @@ def _judge_presence(
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
     report.findings += findings_of(reports, report.presences, span.end_ns)
-
-
-def _is_imported(episode: Episode | None) -> bool:
-    """Whether we only keep what another program wrote."""
-    record = episode.metadata_records.get("episode") if episode else None
-    return record is not None and record.get("kind") == "imported"
-
-
-def _shared_topics(episode: Episode | None) -> list[str]:
-    """Topics of several publishers: the file does not say whose number is whose."""
-    record = episode.metadata_records.get("drops", {}) if episode else {}
-    topics = record.get("several_publishers")
-    return topics if isinstance(topics, list) else []
 
 
 def _paused_spans(episode: Episode) -> list[tuple[int, int]]:

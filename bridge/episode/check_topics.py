@@ -28,7 +28,6 @@ from bridge.episode.health import ContentWatch, Finding, of_event
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
-from bridge.media import depth
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
@@ -131,14 +130,9 @@ class Decoder:
         return faults
 
 
-def _color(data: bytes) -> object:
-    image = CompressedColor.from_cdr(data)
-    return depth.unpack(image.format, image.data) if image.is_depth else image.image_u8()
-
-
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
-    schema.COMPRESSED_IMAGE: _color,
+    schema.COMPRESSED_IMAGE: lambda data: CompressedColor.from_cdr(data).decoded(),
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,

@@ -303,16 +303,13 @@ class StampCorrection:
             best = min((line for _, line in holding), key=lambda line: line.uncertainty_ns)
             return -round(best.offset_at(log_ns))
         away = [max(line.start_ns - log_ns, log_ns - line.end_ns) for _, line in known]
-        near = [line for (_, line), far in zip(known, away, strict=True) if far <= _next(away)]
+        near = [
+            line for (_, line), far in zip(known, away, strict=True) if far <= sorted(away)[:2][-1]
+        ]
         return min(
             (-round(line.offset_at(log_ns)) for line in near),
             key=lambda shift_ns: abs(log_ns - (publish_ns + shift_ns)),
         )
-
-
-def _next(away: Sequence[int]) -> int:
-    """The second smallest: at most the lines before and after a jump are asked."""
-    return sorted(away)[:2][-1]
 
 
 def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: int) -> RawMessage:

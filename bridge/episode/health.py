@@ -4,17 +4,15 @@ The recorder fills the record while it records and keeps it in the episode; ``ch
 by reading. Status, stop, ``info`` and ``ls`` show it; exit codes follow from its severities.
 """
 
-import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.episode import schema
-from bridge.episode.cdr import codec
+from bridge.episode.cdr.batch import JointLayout, joint_layout
 from bridge.episode.cdr.messages import DepthImage
 from bridge.episode.topics import DEPTH_IMAGE
 from bridge.errors import BridgeError
@@ -88,36 +86,8 @@ _LONG_ENOUGH = {
 """How many messages in a row, over what time, and what is said of them."""
 
 
-class _Joints:
-    """Where the numbers of one message of joints lie; others differ from it in those only.
-
-    To decode each of 500 a second would cost more than to write it.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        message = codec.decode(schema.JOINT_STATE, data)
-        position, count = message["position"], len(message["velocity"])
-        start = np.frombuffer(data, np.uint8).ctypes.data
-        self.at = position.ctypes.data - start if len(position) else len(data)
-        velocity = self.at + position.nbytes
-        effort = velocity + 4 + (-velocity % 8 + 8 * count if count else 0)
-        self._spans = ((0, 4), (12, self.at), (velocity, velocity + 4), (effort, effort + 4))
-        self._size, self._fixed = len(data), [data[a:b] for a, b in self._spans]
-        self._unpack = struct.Struct(f"<{len(position)}d").unpack_from
-        self.is_of_use = data[1] == 1 and len(position) > 0
-
-    def is_like(self, data: bytes) -> bool:
-        """Whether another message holds the same joints at the same places."""
-        return len(data) == self._size and [data[a:b] for a, b in self._spans] == self._fixed
-
-    def has_nan(self, data: bytes) -> bool:
-        """Whether a position is no number."""
-        total = sum(self._unpack(data, self.at))
-        return total - total != 0.0
-
-
 class ContentWatch:
-    """Follows what the messages of one topic hold; what is looked at costs microseconds."""
+    """Follows what the messages of one topic hold; to decode each would cost more than writing."""
 
     def __init__(self, topic: str, type_name: str) -> None:
         """Choose what to look at."""
@@ -127,7 +97,7 @@ class ContentWatch:
         self._is_image = type_name in _IMAGES
         self._is_depth = self._is_image and topic.endswith(DEPTH_IMAGE)
         self._is_joints = type_name == schema.JOINT_STATE
-        self._joints: _Joints | None = None
+        self._joints: JointLayout | None = None
         self._runs: dict[str, list[int]] = {}
         """Where each run began, how long it is, and how much of it is in a finding."""
         self._stamp, self._key, self._data = b"", b"", b""
@@ -144,7 +114,7 @@ class ContentWatch:
         self._stamp = stamp
         if self._is_joints:
             if not is_known and not self.knows(data):
-                self._joints = _joints_of(data)
+                self._joints = joint_layout(data)
             if self._joints is not None and self._joints.has_nan(data):
                 now.append("nan_joints")
         elif self._is_image:
@@ -176,14 +146,6 @@ class ContentWatch:
             run[2] = run[1]
             new = new if before else found
         return new
-
-
-def _joints_of(data: bytes) -> _Joints | None:
-    try:
-        found = _Joints(data)
-    except BridgeError:  # whoever decodes it says so
-        return None
-    return found if found.is_of_use else None
 
 
 def _is_empty(type_name: str, data: bytes) -> bool:

@@ -109,11 +109,7 @@ class TableKind:
     not_ending: tuple[str, ...] = field(default=())
 
     def takes(self, topic: str, type_name: str) -> bool:
-        """Say whether a topic's messages belong into this file.
-
-        Args:
-            topic: With its leading slash; the truth of a stand-in cell never belongs into a file.
-        """
+        """Say whether a topic's messages belong into this file."""
         return (
             type_name == self.type_name
             and topic.endswith(self.ending)

@@ -21,16 +21,12 @@ _ALIGNED = ("aligned_depth_to_color", "depth_registered", "depth_to_rgb")
 
 
 def mapped(types: Mapping[str, str], asked: Sequence[str] = ()) -> dict[str, str]:
-    """Say under which name each topic of a camera goes into an episode; others keep theirs.
-
-    Args:
-        types: Types by topic.
-        asked: Pairs OLD=NEW that go before what is known of drivers.
-    """
+    """Say under which name each topic goes into an episode: as asked (OLD=NEW), or of a camera."""
     names = dict(_pair(text, types) for text in asked)
     if any(COLOR_TOPIC.search(topic) for topic in types) or asked:
         return names
-    for topic in sorted(types, key=_rank):
+    aligned = {topic for topic in types for word in _ALIGNED if word in topic}
+    for topic in sorted(types, key=lambda name: (name not in aligned, name.count("/"), name)):
         for stream, (ending, image) in _STREAMS.items():
             found = re.fullmatch(f"(.*?)({ending})(?:{image}|(/camera_info))", topic)
             if found is None or (types[topic] in _IMAGES) == bool(found[3]):
@@ -41,11 +37,6 @@ def mapped(types: Mapping[str, str], asked: Sequence[str] = ()) -> dict[str, str
                 names[topic] = name
             break
     return names
-
-
-def _rank(topic: str) -> tuple[bool, int, str]:
-    """Depth in the colour camera's view goes first, then what was not compressed."""
-    return not any(word in topic for word in _ALIGNED), topic.count("/"), topic
 
 
 def _pair(text: str, topics: Iterable[str]) -> tuple[str, str]:

@@ -18,11 +18,7 @@ from bridge.terminal import Output
 
 @contextmanager
 def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
-    """Name the message in whatever goes wrong in the block; ``number`` counts from 1.
-
-    Args:
-        number: The message's place among those read, from 1.
-    """
+    """Name the message in whatever goes wrong in the block; ``number`` counts from 1."""
     try:
         yield
     except BridgeError as error:
@@ -112,11 +108,7 @@ def _sync(folder: Path) -> None:
 
 
 def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict[str, Any]) -> None:
-    """Write what the folder is made of: sources with their hashes, software, every choice.
-
-    Args:
-        choices: Whatever else decided about the result; must be JSON.
-    """
+    """Write what the folder is made of: sources with their hashes, software, every choice."""
     record = {
         "made_by": made_by,
         "software": software(),

@@ -318,10 +318,26 @@ class _McapBag:
         }
 
     def copy_attachments(self, writer: EpisodeWriter) -> None:
-        _copy_attachments(self._files, writer)
+        copy_attachments(self._files, writer)
 
     def copy_metadata(self, writer: EpisodeWriter) -> dict[str, Any]:
-        return _copy_metadata(self._files, writer)
+        files = self._files
+        for file in files:
+            for record in file.metadata:
+                prefix = "source." if record.name in OWN_RECORDS else ""
+                writer.add_metadata(prefix + record.name, record.metadata)
+        headers = [(file.header.profile, file.header.library) for file in files]
+        return {
+            "format": "rosbag2 MCAP",
+            "files": [{"profile": profile, "library": library} for profile, library in headers],
+            "channels": {
+                channel.topic: channel.metadata
+                for file in files
+                for channel in file.summary.channels.values()
+                if channel.metadata
+            },
+            "silent_topics": sorted(_silent(files)),
+        }
 
 
 def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
@@ -336,7 +352,8 @@ def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None
     )
 
 
-def _copy_attachments(files: list[McapFile], writer: EpisodeWriter) -> None:
+def copy_attachments(files: Sequence[McapFile], writer: EpisodeWriter) -> None:
+    """Copy what is attached to some files into an episode."""
     for file in files:
         try:
             for item in file.attachments():
@@ -345,26 +362,6 @@ def _copy_attachments(files: list[McapFile], writer: EpisodeWriter) -> None:
                 )
         except DAMAGE as error:
             raise damaged(file.path, error) from error
-
-
-def _copy_metadata(files: list[McapFile], writer: EpisodeWriter) -> dict[str, Any]:
-    for file in files:
-        for record in file.metadata:
-            prefix = "source." if record.name in OWN_RECORDS else ""
-            writer.add_metadata(prefix + record.name, record.metadata)
-    return {
-        "format": "rosbag2 MCAP",
-        "files": [
-            {"profile": file.header.profile, "library": file.header.library} for file in files
-        ],
-        "channels": {
-            channel.topic: channel.metadata
-            for file in files
-            for channel in file.summary.channels.values()
-            if channel.metadata
-        },
-        "silent_topics": sorted(_silent(files)),
-    }
 
 
 def _silent(files: list[McapFile]) -> set[str]:

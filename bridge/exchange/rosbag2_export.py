@@ -21,6 +21,7 @@ from bridge.episode.topics import is_latched, is_truth
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.output import new_folder, write_note
+from bridge.exchange.rosbag2 import copy_attachments
 
 ROS_TEXTS = ("ros2msg", "ros2idl")
 BAG_VERSION = 8
@@ -76,7 +77,7 @@ def export_bag(
     with new_folder(out, force=force) as folder:
         name = f"{out.name}_0.mcap"
         with EpisodeWriter(folder / name) as writer:
-            _copy_attachments(episode, writer)
+            copy_attachments(episode.files, writer)
             bag = _copy_messages(episode, writer, channels, advance)
         for (topic, _), channel in bag.items():
             report.topics[topic] = report.topics.get(topic, 0) + channel.count
@@ -142,14 +143,6 @@ def _channel(file: McapFile, channel: records.Channel, left_out: dict[str, str])
         name=record.name, schema_encoding=record.encoding, message_encoding="cdr", data=record.data
     )
     return _Channel(topic=channel.topic, record=made, profile=_profile(channel.topic))
-
-
-def _copy_attachments(episode: Episode, writer: EpisodeWriter) -> None:
-    for file in episode.files:
-        for item in file.attachments():
-            writer.attach(
-                item.name, item.data, media_type=item.media_type, log_time_ns=item.log_time
-            )
 
 
 def _metadata(name: str, bag: Bag) -> Iterator[str]:

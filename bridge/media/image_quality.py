@@ -75,13 +75,7 @@ def aligned(
     ),
     alignment: Alignment,
 ) -> Float[np.ndarray, "height width 3"]:
-    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
-
-    Args:
-        recorded_u8: The one to come near to: 8 bits, or numbers in 0..1.
-        replayed_u8: The one to brighten: 8 bits, or numbers in 0..1.
-        alignment: ``raw`` changes nothing, ``gain`` fits a factor.
-    """
+    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets."""
     check_same_shape(recorded_u8, replayed_u8)
     replayed = as_float(replayed_u8)
     if alignment == "raw":

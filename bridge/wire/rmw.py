@@ -25,11 +25,7 @@ NAME_PARTS = 3
 
 
 def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = None) -> Schema | None:
-    """Return the ``ros2msg`` schema of a type, or None when no definition is known.
-
-    Args:
-        type_hash: The definition must have this RIHS01 hash; "" takes the newest.
-    """
+    """Return the ``ros2msg`` schema of a type, or None when no definition is known."""
     text = _definition(type_name, type_hash, folder)
     if text is None:
         return None

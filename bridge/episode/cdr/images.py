@@ -20,12 +20,8 @@ from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth import RVL_FORMAT, pack_rvl
 from bridge.media.pixels import COLORS, YUV420, YUV422, num_rows, pixel_bytes
 
-COLOR_LAYOUTS = {
-    "rgb8": ("RGB", 3),
-    "bgr8": ("BGR", 3),
-    "rgba8": ("RGBA", 4),
-    "bgra8": ("BGRA", 4),
-    "mono8": ("GRAY", 1),
+COLOR_LAYOUTS = {"mono8": ("GRAY", 1)} | {
+    f"{name}8": (name.upper(), len(name)) for name in ("rgb", "bgr", "rgba", "bgra")
 }
 """Colour encodings that JPEG takes as they are: the order of their channels, and how many."""
 SUBSAMPLING = "420"

@@ -108,10 +108,11 @@ class CompressedColor:
             data=bytes(message["data"]),
         )
 
-    @property
-    def is_depth(self) -> bool:
-        """Whether it holds depth, in the form of ROS's compressed depth."""
-        return "compressedDepth" in self.format
+    def decoded(self) -> np.ndarray:
+        """Decode whatever it holds, colour or depth; raises ``UnreadableImageError``."""
+        if "compressedDepth" in self.format:
+            return depth.unpack(self.format, self.data)
+        return self.image_u8()
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
         """Decode to sRGB; raises ``UnreadableImageError``."""

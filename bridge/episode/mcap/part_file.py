@@ -174,11 +174,7 @@ class BackgroundSync:
 
 
 def open_part(path: Path, *, replace_dead: bool) -> PartFile:
-    """Create ``<path>.part``, locked, for an episode that is not there yet.
-
-    Args:
-        replace_dead: Remove a part whose writer died, instead of refusing.
-    """
+    """Create ``<path>.part``, locked, for an episode that is not there yet."""
     part_path = path.with_name(path.name + ".part")
     if path.exists():
         raise _exists(path)

@@ -78,11 +78,7 @@ class FolderIndex:
 def checked_rotation(
     path: Path, R: Float[np.ndarray, "3 3"], where: str
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation nearest to a matrix written with few digits.
-
-    Args:
-        R: The matrix as read; each singular value within ``ROTATION_TOLERANCE`` of 1.
-    """
+    """Return the rotation nearest to a matrix written with few digits."""
     singular = np.linalg.svd(R, compute_uv=False)
     if np.any(np.abs(singular - 1) > ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
         raise FolderError(
