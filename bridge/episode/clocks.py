@@ -60,14 +60,7 @@ class Jump(NamedTuple):
 
 
 def read_round_trip(*, asked_ns: int, received_ns: int, sent_ns: int, back_ns: int) -> Reading:
-    """Turn the four times of a round trip into an offset and its bound.
-
-    Args:
-        asked_ns: When the recorder asked, by its clock.
-        received_ns: When the source received that, by the source's clock.
-        sent_ns: When the source answered, by the source's clock.
-        back_ns: When the answer arrived, by the recorder's clock.
-    """
+    """Turn the four times of a round trip into an offset and its bound."""
     most_ns, least_ns = received_ns - asked_ns, sent_ns - back_ns
     return Reading(
         at_ns=(asked_ns + back_ns) // 2,

@@ -86,6 +86,10 @@ _LONG_ENOUGH = {
 """How many messages in a row, over what time, and what is said of them."""
 
 
+BLIND_NS = 3 * NS_PER_S
+"""A depth camera that has measured sees nothing for so long where a hand is close before it."""
+
+
 class ContentWatch:
     """Follows what the messages of one topic hold; to decode each would cost more than writing."""
 
@@ -100,7 +104,7 @@ class ContentWatch:
         self._joints: JointLayout | None = None
         self._runs: dict[str, list[int]] = {}
         """Where each run began, how long it is, and how much of it is in a finding."""
-        self._stamp, self._key, self._data = b"", b"", b""
+        self._stamp, self._key, self._data, self._has_measured = b"", b"", b"", False
 
     def knows(self, data: bytes) -> bool:
         """Whether it is of joints that were read before, so that nothing of it can be broken."""
@@ -124,6 +128,7 @@ class ContentWatch:
                 now.append("empty_depth")
             elif key == self._key and data[12:] == self._data[12:]:
                 now.append("frozen_image")
+            self._has_measured |= "empty_depth" not in now
             self._key, self._data = key, data
         if now or self._runs:
             return self._follow(now, log_ns)
@@ -134,6 +139,8 @@ class ContentWatch:
         self._runs = {name: self._runs.get(name, [log_ns, 0, 0]) for name in now}
         for name, run in self._runs.items():
             least, span_ns, text = _LONG_ENOUGH[name]
+            if name == "empty_depth" and self._has_measured:
+                span_ns = BLIND_NS
             run[1] += 1
             if run[1] < least or log_ns - run[0] < span_ns:
                 continue
@@ -161,15 +168,14 @@ _SET = {"clock_jump": "clock_jump", "stamp_jump": "clock_jump", "deaf": "deaf"}
 
 def of_event(event: Mapping[str, Any]) -> Iterator[Finding]:
     """Read what the recorder noticed of clocks and of its own hearing."""
-    at_ns, data = event.get("stamp_ns", 0), event.get("data") or {}
-    if event.get("type") == "clock_step":
-        by_s = data.get("step_ns", 0) / NS_PER_S
+    at_ns, data, text = event.get("stamp_ns", 0), event.get("data"), str(event.get("text", ""))
+    data = data if isinstance(data, dict) else {}
+    name, about = _SET.get(str(data.get("kind")), ""), data.get("source")
+    if event.get("type") == "clock_step" and isinstance(data.get("step_ns"), int):
+        by_s, name, about = data["step_ns"] / NS_PER_S, "host_clock_jump", "recorder"
         text = f"set {'ahead' if by_s > 0 else 'back'} by {abs(by_s):.3f} s; log times go on"
-        yield Finding(
-            name="host_clock_jump", about="recorder", text=text, first_ns=at_ns, last_ns=at_ns
-        )
-    name = _SET.get(data.get("kind", "")) if event.get("type") == "note" else None
-    if name is not None:
-        about = str(data.get("source") or (data.get("topics") or ["recorder"])[0])
-        text = str(event.get("text", ""))
-        yield Finding(name=name, about=about, text=text, first_ns=at_ns, last_ns=at_ns)
+    elif event.get("type") != "note" or not name:
+        return
+    topics = data.get("topics")
+    about = about or (topics[0] if isinstance(topics, list) and topics else "recorder")
+    yield Finding(name=name, about=str(about), text=text, first_ns=at_ns, last_ns=at_ns)

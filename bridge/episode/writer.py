@@ -259,12 +259,7 @@ class EpisodeWriter:
         publish_time_ns: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Append one serialised message of a type this project knows.
-
-        Args:
-            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
-            sequence: The publisher's number of it; None counts on from the message before.
-        """
+        """Append one serialised message of a type this project knows."""
         known = schema.schema_for(type_name)
         if known is None:
             raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")
@@ -289,13 +284,7 @@ class EpisodeWriter:
         sequence: int | None = None,
         about: About = (),
     ) -> None:
-        """Append one message with the given schema, or none; the bytes are kept as they are.
-
-        Args:
-            schema_record: What it is; None where nobody knows.
-            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
-            sequence: The publisher's number of it; None counts on from the message before.
-        """
+        """Append one message with the given schema, or none; the bytes are kept as they are."""
         channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:

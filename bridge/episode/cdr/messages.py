@@ -165,8 +165,10 @@ def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
     if jpeg is not None:
         return CompressedColor.from_cdr(jpeg)
     color = RawColor.from_cdr(data)
-    about = {"stamp_ns": color.stamp_ns, "frame_id": color.frame_id}
-    return CompressedColor(**about, format="jpeg", data=encode_jpeg(color.image_u8()))
+    shown = encode_jpeg(color.image_u8())
+    return CompressedColor(
+        stamp_ns=color.stamp_ns, frame_id=color.frame_id, format="jpeg", data=shown
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

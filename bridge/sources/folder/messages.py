@@ -105,9 +105,6 @@ def frame_times_ns(
     Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
     without times gets the configured rate, from ``start_ns`` or 0.
 
-    Args:
-        start_ns: Time of the first image [ns since 1970]; None: as the folder says, else 0.
-
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
     """

@@ -261,11 +261,7 @@ def _unused(keys: Counter[str]) -> Iterator[tuple[str, str, bool]]:
         if key in _READ:
             continue
         is_depth = key == "depth_file_path"
-        why = (
-            "depth is not read here; import rgbd reads it by a scene.json"
-            if is_depth
-            else "not read"
-        )
+        why = "depth is not read here; import rgbd reads it" if is_depth else "not read"
         yield (f"{key} of {count} frames" if count > 1 else key), why, is_depth
 
 

@@ -169,6 +169,19 @@ def test_a_fault_of_a_moment_is_none_and_one_that_comes_back_is_one(tmp_path: Pa
     assert (found.first_ns, found.last_ns) == (41 * 10**8, 119 * 10**8)
 
 
+@pytest.mark.parametrize(("blind_s", "found"), [(2.5, []), (4.0, ["empty_depth"])])
+def test_a_wrist_camera_close_to_what_is_held_is_not_blind(
+    tmp_path: Path, blind_s: float, found: list[str]
+) -> None:
+    with EpisodeWriter(tmp_path / "a.mcap") as writer:
+        for number in range(200):
+            is_blind = 3.0 < number / 20 < 3.0 + blind_s
+            pixels = EMPTY if is_blind else noise(1, np.uint16)[..., 0]
+            data, at_ns = image(number, pixels, "16UC1"), number * NS_PER_S // 20
+            writer.write(DEPTH, data, type_name=schema.IMAGE, log_time_ns=at_ns)
+    assert [each.name for each in check_episode(tmp_path / "a.mcap").findings] == found
+
+
 def test_what_nobody_can_read_is_told_within_a_second(run: RunFolder) -> None:
     clock = AnchoredClock()
     recorder = Recorder(run, now_ns=clock.now_ns)
