@@ -19,7 +19,7 @@ def decode_depth_png(data: bytes) -> UInt16[np.ndarray, "height width"]:
     with open_image(data) as image:
         if not image.mode.startswith("I"):
             found = f"depth has {_BITS.get(image.mode, image.mode)}"
-            raise UnreadableImageError(found=found, expected="a PNG of 16 bits in one channel")
+            raise UnreadableImageError(found=found, expected="a 16-bit PNG of one channel")
         return np.asarray(image).astype(np.uint16)
 
 
