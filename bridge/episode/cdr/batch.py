@@ -224,7 +224,7 @@ class JointLayout:
 
     def has_nan(self, data: bytes) -> bool:
         """Whether a position of a message that is like it is no number."""
-        total = sum(self._unpack(data, self.numbers[0][0]))
+        total: float = sum(self._unpack(data, self.numbers[0][0]))
         return total - total != 0.0
 
 
