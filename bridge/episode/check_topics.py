@@ -1,13 +1,9 @@
 """What one topic shows over a whole episode: numbers, times, rate, and whether it decodes."""
 
-from array import array
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from bridge.clock import NS_PER_S
 from bridge.episode import schema
@@ -207,17 +203,13 @@ class Pauses:
     def __init__(self, spans_ns: Iterable[tuple[int, int]]) -> None:
         """Take spans that do not overlap [ns]."""
         self.spans: Spans = sorted(spans_ns)
-        ordered = self.spans
-        self._starts_ns = [start_ns for start_ns, _ in ordered]
-        self._ends_ns = [end_ns for _, end_ns in ordered]
 
     def lies_between(self, before_ns: int, after_ns: int) -> bool:
-        """Say whether two messages of a topic lie on both sides of a pause [ns].
-
-        A message on its way when the recorder was told may be on either side.
-        """
-        index = bisect_left(self._starts_ns, after_ns) - 1
-        return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
+        """Say whether one lies between two messages; those on their way may be on either side."""
+        return any(
+            start_ns < after_ns and before_ns < end_ns + ON_ITS_WAY_NS
+            for start_ns, end_ns in self.spans
+        )
 
 
 @dataclass(kw_only=True)
@@ -236,9 +228,6 @@ class TopicCheck:
     """Gaps, queue drops and shed messages the drop log lists."""
     time_steps_back: int = 0
     """Messages whose log time is before that of the one before."""
-    latency_median_s: float = 0.0
-    """Log time minus publish time; large where the clocks differ."""
-    latency_max_s: float = 0.0
     undecodable: int = 0
     first_fault: str = ""
     unnumbered: int = 0
@@ -262,7 +251,6 @@ class TopicWatch:
     presence: Presence = field(default_factory=Presence)
     last_ns: dict[int, int] = field(default_factory=dict)
     """By channel: two definitions of a topic may lie in different chunks, in another order."""
-    latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
         """Take the next message in the order of the file."""
@@ -283,7 +271,6 @@ class TopicWatch:
             result.time_steps_back += 1
         self.last_ns[head.channel_id] = head.log_time_ns
         self.presence.see(head.log_time_ns, self.pauses.spans)
-        self.latencies_ns.append(head.log_time_ns - head.publish_time_ns)
         try:
             decoder.decode(self.topic, message)
         except BridgeError as error:
@@ -312,8 +299,4 @@ class TopicWatch:
         span_s = (self.presence.last_ns - self.presence.first_ns) * 1e-9
         if result.messages > 1 and span_s > 0:
             result.rate_hz = (result.messages - 1) / span_s
-        if self.latencies_ns:
-            latencies = np.frombuffer(self.latencies_ns, dtype=np.float64)
-            result.latency_median_s = float(np.median(latencies)) * 1e-9
-            result.latency_max_s = float(latencies.max()) * 1e-9
         return result

@@ -69,7 +69,8 @@ def _follow(first: McapFile, episode_id: str, index: int) -> Parts:
             files.append(file)
             continue
         if highest is None:  # a hole: is there anything behind it?
-            highest = _highest_part(first.path, episode_id)
+            names = map(name_of_part, first.path.parent.glob(f"{episode_id}.*.mcap"))
+            highest = max((name.number for name in names if name is not None), default=1)
         if index > highest:
             if not _was_cut_off(files[-1]) or path.exists():
                 missing.append(path)
@@ -87,11 +88,6 @@ def _open_later(path: Path, *, of: McapFile) -> McapFile | None:
         return None
     ids = {record.get("id") for record in (record_of(of, "episode"), record_of(file, "episode"))}
     return file if len(ids - {None}) < 2 else None
-
-
-def _highest_part(path: Path, episode_id: str) -> int:
-    names = map(name_of_part, path.parent.glob(f"{episode_id}.*.mcap"))
-    return max((name.number for name in names if name is not None), default=1)
 
 
 def record_of(file: McapFile, name: str) -> dict[str, Any]:

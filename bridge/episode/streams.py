@@ -227,17 +227,12 @@ def joint_track_of(payloads: Sequence[bytes]) -> JointTrack | None:
     samples.sort(key=lambda sample: sample.stamp_ns)
     names = max((sample.names for sample in samples), key=len)
     complete = [sample for sample in samples if set(names) <= set(sample.names)]
+    rows = [sample.position[[sample.names.index(name) for name in names]] for sample in complete]
     return JointTrack(
         names=names,
         stamps_ns=np.array([sample.stamp_ns for sample in complete], dtype=np.int64),
-        position=np.stack([_in_order(sample, names) for sample in complete]),
+        position=np.stack(rows),
     )
-
-
-def _in_order(sample: JointSample, names: tuple[str, ...]) -> Float[np.ndarray, " num_joints"]:
-    if sample.names == names:
-        return sample.position
-    return sample.position[[sample.names.index(name) for name in names]]
 
 
 def plans(episode: Episode) -> list[tuple[int, Plan]]:

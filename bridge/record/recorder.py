@@ -419,8 +419,8 @@ class Recorder:
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
             for news in self._life.take_news():
-                topics, by_ns = news.data.get("topics"), news.data.get("by_ns")
-                if not topics or not self.clocks.has_named(topics, by_ns):
+                told = news.data
+                if "topics" not in told or not self.clocks.has_named(told["topics"], told["by_ns"]):
                     self.note(news)
             if not self._life.may_ask_disk:
                 return

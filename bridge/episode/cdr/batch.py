@@ -5,6 +5,7 @@ not alike is left to be read one by one, with the same result. A ``MessageTempla
 messages, byte for byte as one by one (tests compare both).
 """
 
+import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -225,7 +226,7 @@ class JointLayout:
     def has_nan(self, data: bytes) -> bool:
         """Whether a position of a message that is like it is no number."""
         total: float = sum(self._unpack(data, self.numbers[0][0]))
-        return total - total != 0.0
+        return not math.isfinite(total)
 
 
 def joint_layout(data: bytes) -> JointLayout | None:

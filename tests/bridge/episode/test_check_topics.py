@@ -149,15 +149,13 @@ def test_without_a_ledger_numbers_prove_nothing(tmp_path: Path) -> None:
     assert report.topics[JOINTS].sequence_gaps == 6
 
 
-def test_rates_and_latencies_are_reported(tmp_path: Path) -> None:
+def test_rates_are_reported(tmp_path: Path) -> None:
     def fill(writer: EpisodeWriter) -> None:
         write_joints(writer, list(range(11)), step_ns=10_000_000)
 
     report = check(tmp_path, fill)
     found = report.topics[JOINTS]
     assert found.rate_hz == pytest.approx(100)
-    assert found.latency_median_s == pytest.approx(0.05, abs=1e-6)
-    assert found.latency_max_s == pytest.approx(0.1, abs=1e-6)
     assert report.exit_code == 0
 
 
