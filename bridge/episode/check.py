@@ -1,10 +1,8 @@
-"""Verify an episode: every CRC, index and stream, and list the messages that were dropped.
+"""Verify an episode: every CRC, index and stream, and say what is wrong with what it holds.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
-that are not what they promise, parts that are missing. Lost is another matter: a drop log with
-losses, a topic that fell silent against its contract, or a recording that was cut off and
-recovered, leaves a whole file (``exit_code`` 3). Files of other programs are held to the format
-only; our contract is asked of ours.
+that are not what they promise, parts that are missing. ``health`` names what is wrong with a whole
+file (``exit_code`` 3). Files of other programs are held to the format only.
 """
 
 from collections.abc import Iterable, Iterator
@@ -27,7 +25,7 @@ from bridge.episode.contract import (
     learn_contract,
     unseen_losses,
 )
-from bridge.episode.health import Finding, in_order, in_words
+from bridge.episode.health import HealthFinding, in_order, in_words
 from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
@@ -53,10 +51,14 @@ class CheckReport:
     declared_losses: int = 0
     undeclared_losses: int = 0
     """Numbers missing on topics of a recording whose drop log does not list them."""
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[HealthFinding] = field(default_factory=list)
     """What is wrong with what it holds, the worst first."""
     start_ns: int = 0
     presences: dict[str, Presence] = field(default_factory=dict)
+
+    def find(self, name: str, about: str, text: str) -> None:
+        """Take one more finding."""
+        self.findings.append(HealthFinding(name=name, about=about, text=text))
 
     @property
     def exit_code(self) -> int:
@@ -196,13 +198,12 @@ def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
     for file in episode.files:
         stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
         if stopped_by.startswith(BY_DISK):
-            text = f"the recording was ended by the {stopped_by}"
-            report.findings.append(Finding(name="cut_short", about=file.path.name, text=text))
+            report.find("cut_short", file.path.name, f"ended by the {stopped_by}")
         recovered = record_of(file, "recovered")
         if recovered:
             lost = recovered.get("bytes_lost", "an unknown number of")
             text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
-            report.findings.append(Finding(name="recovered", about=file.path.name, text=text))
+            report.find("recovered", file.path.name, text)
 
 
 def _check_metadata(episode: Episode, faults: Faults) -> None:
@@ -243,7 +244,7 @@ def _judge_topics(
         if result.undecodable:
             count = f"{result.undecodable} of {result.messages} messages"
             text = f"{count} cannot be read: {result.first_fault}"
-            report.findings.append(Finding(name="unreadable", about=topic, text=text))
+            report.find("unreadable", topic, text)
             if ours:
                 faults.add(f"{topic}: {text}")
         report.findings += topic_watch.findings(is_derived=episode is None or bool(episode.derived))
@@ -258,10 +259,9 @@ def _judge_topics(
                     f"{result.sequence_gaps} numbers are missing, "
                     f"the drop log lists {result.declared_losses}"
                 )
-                report.findings.append(Finding(name="drops_not_logged", about=topic, text=text))
+                report.find("drops_not_logged", topic, text)
         if result.declared_losses:
-            text = f"{result.declared_losses} messages"
-            report.findings.append(Finding(name="drops_logged", about=topic, text=text))
+            report.find("drops_logged", topic, f"{result.declared_losses} messages")
     report.findings += decoder.findings
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)

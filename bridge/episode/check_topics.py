@@ -20,7 +20,7 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check_file import ScannedMessage
 from bridge.episode.contract import Presence, Spans, TopicReport
-from bridge.episode.health import ContentWatch, Finding, of_event
+from bridge.episode.health import ContentWatch, HealthFinding, of_event
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
@@ -51,7 +51,7 @@ class Decoder:
         """Sentences on packages without which something was not decoded."""
         self.unused: dict[str, str] = {}
         """Type or encoding of topics that are kept, and that nothing here reads."""
-        self.findings: list[Finding] = []
+        self.findings: list[HealthFinding] = []
         """What the recorder noticed of clocks, and of itself."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
@@ -278,18 +278,18 @@ class TopicWatch:
             if not result.first_fault:
                 result.first_fault = str(error)
 
-    def findings(self, *, is_derived: bool) -> Iterator[Finding]:
+    def findings(self, *, is_derived: bool) -> Iterator[HealthFinding]:
         """What its messages hold; a replay may stand still, and its images with it."""
         for content in () if is_derived else self.contents.values():
             yield from content.findings.values()
         span = {"first_ns": self.presence.first_ns, "last_ns": self.presence.last_ns}
         if len(self.contents) > 1:
             text = " and ".join(sorted(name or "no type" for name in self.contents))
-            yield Finding(name="mixed_types", about=self.topic, text=text, **span)
+            yield HealthFinding(name="mixed_types", about=self.topic, text=text, **span)
         years = (span["last_ns"] - span["first_ns"]) // YEAR_NS
         if self.odd or years > MOST_YEARS:
             text = f"{len(self.odd)} times after the year 2200" if self.odd else f"{years} years"
-            yield Finding(name="odd_times", about=self.topic, text=text, **span)
+            yield HealthFinding(name="odd_times", about=self.topic, text=text, **span)
 
     def finish(self) -> TopicCheck:
         """Work out what needs all messages."""

@@ -200,11 +200,7 @@ class StampWatch:
         self._levels: dict[str, list[int]] = {}
 
     def see(self, topic: str, delay_ns: int) -> int:
-        """Take the least (arrival - stamp) of the next second; return how far stamps jumped.
-
-        Returns:
-            Ahead is positive; 0 where there was no jump.
-        """
+        """Take the least (arrival - stamp) of the next second; return how far they jumped ahead."""
         levels = self._levels.setdefault(topic, [])
         levels.append(delay_ns)
         del levels[:-4]

@@ -19,7 +19,7 @@ import msgspec
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
-from bridge.episode.health import Finding, parsed
+from bridge.episode.health import HealthFinding, parsed
 from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole
@@ -271,9 +271,6 @@ def judge(
             silence of their publisher.
         by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
             its clock is not the wall's, and may stand.
-
-    Returns:
-        A report for each topic that was there or was promised.
     """
     rules, absent = contract.topics if contract else {}, Presence()
     total_ns = _silence_ns(span.start_ns, span.end_ns, span.pauses)
@@ -357,17 +354,17 @@ def _rate_breach(
 
 def findings_of(
     reports: Mapping[str, TopicReport], presences: Mapping[str, Presence], end_ns: int
-) -> Iterator[Finding]:
+) -> Iterator[HealthFinding]:
     """Say where a contract was broken, what fell silent, and whose rate fell."""
     for topic, report in reports.items():
         presence = presences.get(topic, Presence())
         span = {"first_ns": presence.first_ns, "last_ns": presence.last_ns}
         for text in report.breaches:
-            yield Finding(name="contract_broken", about=topic, text=text, **span)
+            yield HealthFinding(name="contract_broken", about=topic, text=text, **span)
         if report.tail == "unknown":
             text = f"nothing came in the last {report.tail_s:.1f} s"
             span = {"first_ns": presence.last_ns, "last_ns": end_ns}
-            yield Finding(name="tail_unknown", about=topic, text=text, **span)
+            yield HealthFinding(name="tail_unknown", about=topic, text=text, **span)
         if report.slow is not None:
             first_ns, last_ns, count = report.slow
             text = (
@@ -375,7 +372,7 @@ def findings_of(
                 f"{NS_PER_S / presence.usual_ns:.1f}"
             )
             span = {"first_ns": first_ns, "last_ns": last_ns}
-            yield Finding(name="rate_collapsed", about=topic, text=text, count=count, **span)
+            yield HealthFinding(name="rate_collapsed", about=topic, text=text, count=count, **span)
 
 
 def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
@@ -388,11 +385,7 @@ def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
 
 
 def health_lines(record: Mapping[str, Any], start_ns: int = 0) -> list[str]:
-    """Sentences on what is wrong with an episode; anything else says nothing.
-
-    Args:
-        record: The records ``health`` and ``presence``, or the answer to a stop.
-    """
+    """Sentences on what the records ``health`` and ``presence``, or the answer to a stop, say."""
     old = [record.get("breaches"), record.get("unknown_tails")]  # of earlier editions
     unnumbered = record.get("unnumbered")
     return [

@@ -29,7 +29,7 @@ NAMES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class HealthFinding:
     """One thing that is wrong, and when it was so."""
 
     name: str
@@ -42,7 +42,7 @@ class Finding:
     count: int = 1
 
     def line(self, start_ns: int = 0) -> str:
-        """One sentence, with seconds after the start where that is known."""
+        """What is printed, with seconds after the start where that is known."""
         text = f"{in_words(self.name)}: {self.about}: {self.text}"
         if not start_ns or not self.first_ns:
             return text
@@ -51,7 +51,7 @@ class Finding:
         return f"{text} (at {first_s:.1f}{more} s)"
 
 
-def in_order(findings: Iterable[Finding]) -> list[Finding]:
+def in_order(findings: Iterable[HealthFinding]) -> list[HealthFinding]:
     """The worst first, then by time; one of each name and topic."""
     kept = {(each.name, each.about, each.text): each for each in findings}
     return sorted(
@@ -64,10 +64,10 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def parsed(value: object) -> list[Finding]:
+def parsed(value: object) -> list[HealthFinding]:
     """Read findings as they stand in a record; anything else is none."""
     try:
-        return msgspec.convert(value, list[Finding])
+        return msgspec.convert(value, list[HealthFinding])
     except msgspec.ValidationError:
         return []
 
@@ -81,7 +81,7 @@ _LONG_ENOUGH = {
     "stamp_stuck": (20, NS_PER_S, "header.stamp stays the same"),
     "frozen_image": (20, NS_PER_S, "every pixel stays the same"),
     "empty_depth": (5, 0, "every pixel is 0"),
-    "nan_joints": (1, 0, "a position is no number"),
+    "nan_joints": (1, 0, "a position is not a number"),
 }
 """How many messages in a row, over what time, and what is said of them."""
 
@@ -95,7 +95,7 @@ class ContentWatch:
 
     def __init__(self, topic: str, type_name: str) -> None:
         """Choose what to look at."""
-        self.findings: dict[str, Finding] = {}
+        self.findings: dict[str, HealthFinding] = {}
         self.is_of_use = type_name in _STAMPED
         self._topic, self._type = topic, type_name
         self._is_image = type_name in _IMAGES
@@ -110,7 +110,7 @@ class ContentWatch:
         """Whether it is of joints that were read before, so that nothing of it can be broken."""
         return self._joints is not None and self._joints.is_like(data)
 
-    def see(self, data: bytes, log_ns: int, *, is_known: bool = False) -> Finding | None:
+    def see(self, data: bytes, log_ns: int, *, is_known: bool = False) -> HealthFinding | None:
         """Take the next message; return what has just become remarkable."""
         stamp, now = data[4:12], []
         if stamp == self._stamp:
@@ -134,7 +134,7 @@ class ContentWatch:
             return self._follow(now, log_ns)
         return None
 
-    def _follow(self, now: list[str], log_ns: int) -> Finding | None:
+    def _follow(self, now: list[str], log_ns: int) -> HealthFinding | None:
         new = None
         self._runs = {name: self._runs.get(name, [log_ns, 0, 0]) for name in now}
         for name, run in self._runs.items():
@@ -146,7 +146,7 @@ class ContentWatch:
                 continue
             before = self.findings.get(name)
             first_ns, count = (before.first_ns, before.count) if before else (run[0], 0)
-            found = self.findings[name] = Finding(
+            found = self.findings[name] = HealthFinding(
                 name=name, about=self._topic, text=text, first_ns=first_ns, last_ns=log_ns,
                 count=count + run[1] - run[2],
             )  # fmt: skip
@@ -166,7 +166,7 @@ _SET = {"clock_jump": "clock_jump", "stamp_jump": "clock_jump", "deaf": "deaf"}
 """Kinds of notes that a recorder writes among the events, and what they are here."""
 
 
-def of_event(event: Mapping[str, Any]) -> Iterator[Finding]:
+def of_event(event: Mapping[str, Any]) -> Iterator[HealthFinding]:
     """Read what the recorder noticed of clocks and of its own hearing."""
     at_ns, data, text = event.get("stamp_ns", 0), event.get("data"), str(event.get("text", ""))
     data = data if isinstance(data, dict) else {}
@@ -178,4 +178,4 @@ def of_event(event: Mapping[str, Any]) -> Iterator[Finding]:
         return
     topics = data.get("topics")
     about = about or (topics[0] if isinstance(topics, list) and topics else "recorder")
-    yield Finding(name=name, about=str(about), text=text, first_ns=at_ns, last_ns=at_ns)
+    yield HealthFinding(name=name, about=str(about), text=text, first_ns=at_ns, last_ns=at_ns)

@@ -299,14 +299,9 @@ class Episode:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Yield messages in log order with CRCs checked, optionally of some topics only.
+        """Yield messages in log order with CRCs checked, from ``start_ns`` to before ``end_ns``.
 
         Chunks without a wanted topic are not read; few are held in memory at a time.
-
-        Args:
-            topics: Topics wanted; None for all.
-            start_ns: First log time wanted, included [ns since 1970]; None: from the start.
-            end_ns: Log time to stop before, excluded; None: to the end.
         """
         wanted = None if topics is None else frozenset(topics)
         if wanted is not None and not wanted:

@@ -259,7 +259,10 @@ class EpisodeWriter:
         publish_time_ns: int | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Append one serialised message of a type this project knows."""
+        """Append one serialised message of a type this project knows.
+
+        Without a time it was sent when it was logged; without a number it counts on.
+        """
         known = schema.schema_for(type_name)
         if known is None:
             raise ValueError(f"no schema for {type_name!r}; use write_foreign for other types")

@@ -18,7 +18,7 @@ from bridge.episode.contract import (
     findings_of,
     judge,
 )
-from bridge.episode.health import ContentWatch, Finding, in_order, of_event
+from bridge.episode.health import ContentWatch, HealthFinding, in_order, of_event
 from bridge.episode.run_folder import SUFFIX
 from bridge.episode.topics import CLOCKS, DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
@@ -109,7 +109,7 @@ class Channels:
         content = ContentWatch(topic, type_name)
         return Channel(record, look, last_ns, stamp_reader(record), content)
 
-    def findings(self) -> Iterator[Finding]:
+    def findings(self) -> Iterator[HealthFinding]:
         """What the messages of all topics hold, and which topics carry several types."""
         types: dict[str, set[str]] = {}
         for (topic, type_name, *_), channel in list(self._channels.items()):
@@ -118,7 +118,7 @@ class Channels:
         for topic, names in types.items():
             if len(names) > 1:
                 text = " and ".join(sorted(name or "no type" for name in names))
-                yield Finding(name="mixed_types", about=topic, text=text)
+                yield HealthFinding(name="mixed_types", about=topic, text=text)
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -188,10 +188,10 @@ class EpisodeRecording:
         self.outcome: metadata.Outcome | None = None
         self.presence: dict[str, TopicReport] = {}
         """By topic, when it was there; known at the end."""
-        self._of_presence: tuple[Finding, ...] = ()
+        self._of_presence: tuple[HealthFinding, ...] = ()
         self.news: list[News] = []
         """What it noticed and a person should hear of."""
-        self._noted: list[Finding] = []
+        self._noted: list[HealthFinding] = []
         self._unreadable: dict[str, str] = {}
         self._jumps = StampJumps()
         self._contract = contract
@@ -294,18 +294,18 @@ class EpisodeRecording:
                 told = {"kind": found.name, "topic": topic}
                 self.news.append(News(text=found.line(), data=told, warns=True))
 
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[HealthFinding]:
         """What is wrong with the episode so far; of presence at the end only."""
         found = [*self._channels.findings(), *self._noted]
         for topic, tally in self.ledger.totals().items():
             if tally.lost:
                 found.append(
-                    Finding(name="drops_logged", about=topic, text=f"{tally.lost} messages")
+                    HealthFinding(name="drops_logged", about=topic, text=f"{tally.lost} messages")
                 )
             if tally.undecodable:
                 count = f"{tally.undecodable} of {tally.received} messages"
                 text = f"{count} cannot be read: {self._unreadable.get(topic, '')}"
-                found.append(Finding(name="unreadable", about=topic, text=text))
+                found.append(HealthFinding(name="unreadable", about=topic, text=text))
         return in_order([*found, *self._of_presence])
 
     def _append(

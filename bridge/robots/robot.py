@@ -336,7 +336,7 @@ def mimics_of(urdf: str) -> tuple[Mimic, ...]:
 
 
 def number_of(text: str) -> float:
-    """Read an attribute; what is no number becomes NaN."""
+    """Read an attribute; other text becomes NaN."""
     try:
         return float(text)
     except ValueError:

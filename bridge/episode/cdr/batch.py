@@ -224,7 +224,7 @@ class JointLayout:
         return len(data) == self._size and [data[a:b] for a, b in self._fixed] == self._bytes
 
     def has_nan(self, data: bytes) -> bool:
-        """Whether a position of a message that is like it is no number."""
+        """Whether a position of a message that is like it is not a number."""
         total: float = sum(self._unpack(data, self.numbers[0][0]))
         return not math.isfinite(total)
 

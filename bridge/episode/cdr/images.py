@@ -109,12 +109,7 @@ def no_encoding(encoding: str, known: Iterable[str]) -> MalformedMessageError:
 
 
 def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
-    """Compress a raw colour image; an alpha channel is dropped.
-
-    Returns:
-        CDR of a sensor_msgs/CompressedImage with the same stamp and frame, or None when the
-        encoding is none of ``COLOR_LAYOUTS``.
-    """
+    """Make a raw image of ``COLOR_LAYOUTS`` a CompressedImage; None of another encoding."""
     header = image_header(data)
     if header.encoding not in COLOR_LAYOUTS:
         return None
@@ -129,12 +124,7 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
 
 
 def depth_to_compact(data: Buffer) -> bytes | None:
-    """Compress a raw depth image without loss (RVL).
-
-    Returns:
-        CDR of a sensor_msgs/CompressedImage of format ``RVL_FORMAT`` with the same stamp and
-        frame, or None when the encoding is not 16 bit.
-    """
+    """Make a raw depth image of 16 bits a CompressedImage without loss; None of another one."""
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
