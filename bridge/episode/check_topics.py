@@ -29,10 +29,6 @@ from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
 
 
-class ForeignMessageError(BridgeError):
-    """Messages are of another world."""
-
-
 class Decoder:
     """Reads messages and forgets them, but for the drop log and the sizes of depth images.
 
@@ -57,18 +53,14 @@ class Decoder:
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
     def decode(self, topic: str, message: ScannedMessage) -> None:
-        """Read one message.
-
-        Raises:
-            BridgeError: When it is not what its topic and type promise.
-        """
+        """Read one message; raises BridgeError where it is not what topic and type promise."""
         type_name = message.schema.name if message.schema else ""
         encoding, data = message.channel.message_encoding, message.data
         known = schema.schema_for(type_name)
         if encoding == "cdr":
             codec.refuse_other_cdr(type_name, data)
         if encoding == "ros1":
-            raise ForeignMessageError("ROS 1 messages; convert the recording with rosbags-convert")
+            raise BridgeError("ROS 1 messages; convert the recording with rosbags-convert")
         if known is None or encoding not in ("", known.message_encoding):
             self.unused[topic] = type_name or encoding or "no type"
             return

@@ -297,7 +297,7 @@ class _McapBag:
         for item in merged(self._files, Selection()):
             key = (id(item.file), item.channel.id)
             if key not in schemas:
-                schemas[key] = _schema_of(item.file, item.channel)
+                schemas[key] = schema_of(item.file, item.channel)
             is_cdr = item.channel.message_encoding == "cdr"
             yield BagMessage(
                 item.channel.topic,
@@ -340,7 +340,8 @@ class _McapBag:
         }
 
 
-def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
+def schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
+    """What a channel of a file carries; None where nobody says."""
     record = file.schema_of(channel)
     if record is None:
         return None

@@ -21,7 +21,7 @@ from bridge.episode.topics import is_latched, is_truth
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.output import new_folder, write_note
-from bridge.exchange.rosbag2 import copy_attachments
+from bridge.exchange.rosbag2 import copy_attachments, schema_of
 
 ROS_TEXTS = ("ros2msg", "ros2idl")
 BAG_VERSION = 8
@@ -131,18 +131,15 @@ def _channel(file: McapFile, channel: records.Channel, left_out: dict[str, str])
     """What a channel is in the bag; None where it has no place in one, and why is noted."""
     if is_truth(channel.topic):
         return None
-    record = file.schema_of(channel)
+    record = schema_of(file, channel)
     if channel.message_encoding != "cdr":
         left_out[channel.topic] = f"{channel.message_encoding or 'bytes'}, not ROS 2"
         return None
-    if record is None or record.encoding not in ROS_TEXTS:  # an empty text is an empty type
+    if record is None or record.schema_encoding not in ROS_TEXTS:  # no text: a type without fields
         named = record.name if record else "a type without a name"
         left_out[channel.topic] = f"no definition of {named}"
         return None
-    made = schema.Schema(
-        name=record.name, schema_encoding=record.encoding, message_encoding="cdr", data=record.data
-    )
-    return _Channel(topic=channel.topic, record=made, profile=_profile(channel.topic))
+    return _Channel(topic=channel.topic, record=record, profile=_profile(channel.topic))
 
 
 def _metadata(name: str, bag: Bag) -> Iterator[str]:

@@ -74,7 +74,9 @@ def image_header(data: Buffer) -> ImageHeader:
 def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
     """View the pixels of a message, row padding cut off; nothing is copied."""
     height, width, step, encoding = header.height, header.width, header.step, header.encoding
-    row, rows = width * _pixel_bytes(encoding), num_rows(encoding, height)
+    depth_bytes = 4 if encoding == FLOAT_DEPTH else 2
+    row = width * (pixel_bytes(encoding) if encoding in COLORS else depth_bytes)
+    rows = num_rows(encoding, height)
     if not 0 < height * width <= MAX_PIXELS:
         raise _malformed(f"an image of {width} x {height} pixels")
     if (encoding in YUV422 and width % 2) or (encoding in YUV420 and (width % 2 or height % 2)):
@@ -84,12 +86,6 @@ def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
     if len(header.pixels) != step * rows:
         raise _malformed(f"{len(header.pixels)} bytes for {rows} rows of {step}")
     return np.frombuffer(header.pixels, np.uint8).reshape(rows, step)[:, :row]
-
-
-def _pixel_bytes(encoding: str) -> int:
-    if encoding in COLORS:
-        return pixel_bytes(encoding)
-    return 4 if encoding == FLOAT_DEPTH else 2
 
 
 def check_image(topic: str, header: ImageHeader) -> None:

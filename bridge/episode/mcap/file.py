@@ -346,10 +346,8 @@ _SHARED_BYTES = 1 << 14
 """Longer definitions are not remembered."""
 
 
-@lru_cache(maxsize=1024)
-def _parse_once(opcode: int, body: bytes) -> records.McapRecord | None:
-    """Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
-    return parse(opcode, body)
+_parse_once = lru_cache(maxsize=1024)(parse)
+"""Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
 
 
 def _add(summary: Summary, record: records.McapRecord | None) -> None:
