@@ -218,8 +218,9 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 def read_ply(path: Path) -> GaussianCloud:
     """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored."""
     if not path.is_file():
-        hint = "robot-gst rebuild RUN makes it."
-        raise PathNotFoundError(path=path, what="splat file", hint=hint)
+        raise PathNotFoundError(
+            path=path, what="splat file", hint="robot-gst rebuild RUN makes it."
+        )
     data = path.read_bytes()
     head = re.match(rb"ply\r?\n.*?\bend_header\r?\n", data, re.DOTALL)
     if head is None:
