@@ -190,11 +190,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
     spherical harmonic with the higher ones as ``f_rest_0..8``, ``..23`` or ``..44`` where the cloud
     has them. Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1,
-    where some are; other viewers pass it over.
-
-    Args:
-        path: Of the PLY file; one that is there is replaced.
-        cloud: What is written, with rotations of any length.
+    where some are; other viewers pass it over. A file that is there is replaced.
     """
     quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
     table = np.concatenate(
@@ -218,9 +214,8 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
 def read_ply(path: Path) -> GaussianCloud:
     """Read a splat PLY. Harmonics above degree 3 and unknown columns are ignored."""
     if not path.is_file():
-        raise PathNotFoundError(
-            path=path, what="splat file", hint="robot-gst rebuild RUN makes it."
-        )
+        hint = "robot-gst rebuild RUN makes it."
+        raise PathNotFoundError(path=path, what="splat file", hint=hint)
     data = path.read_bytes()
     head = re.match(rb"ply\r?\n.*?\bend_header\r?\n", data, re.DOTALL)
     if head is None:
