@@ -14,12 +14,7 @@ def datasets_folder() -> Path:
 
 
 def dataset_file(folder: str, name: str, suffix: str = ".toml") -> Path:
-    """Return a file by name (``tasks``, ``cube_into_box``); a path to a file passes through.
-
-    Args:
-        folder: Name of a folder of ``datasets/``, in the plural: ``tasks``, ``cells``, ``robots``.
-        name: A name without suffix, or the path of a file that ends with ``suffix``.
-    """
+    """Return a file by name (``tasks``, ``cube_into_box``); a path to a file passes through."""
     if name.endswith(suffix) and Path(name).is_file():
         return Path(name)
     path = datasets_folder() / folder / f"{name}{suffix}"

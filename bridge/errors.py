@@ -36,12 +36,7 @@ class OptionError(UsageError):
 def refuse_outside(
     settings: object, allowed: Mapping[str, tuple[int | float, int | float]]
 ) -> None:
-    """Check numbers of a settings record against what is allowed, ends included.
-
-    Args:
-        settings: A record whose fields are looked up by name; one that is None is not checked.
-        allowed: Least and most by field name; infinity for no upper end.
-    """
+    """Check numbers of a settings record against what is allowed, ends included."""
     for name, (least, most) in allowed.items():
         value = getattr(settings, name)
         if value is not None and not least <= value <= most:

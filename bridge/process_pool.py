@@ -272,11 +272,7 @@ class Runner(Protocol):
     def run(
         self, function: Function, items: Sequence[Item], cost: Callable[[Item], float]
     ) -> Iterator[tuple[Item, Answer | Failed]]:
-        """Yield every item with what came out, in any order.
-
-        Args:
-            function: Of a module that can be imported; what it raises becomes ``Failed``.
-        """
+        """Yield every item with what came out, in any order."""
 
     def __enter__(self) -> "Runner":
         """Use as a context manager."""
@@ -316,11 +312,7 @@ class ProcessPool:
     """Processes side by side; they start once there is work and stay until the end."""
 
     def __init__(self, size: int, *, prepare: Function | None = None, quiet: bool = False) -> None:
-        """Start nothing yet.
-
-        Args:
-            prepare: Called with None in each before all else, for what takes long to import.
-        """
+        """Start nothing yet."""
         self._size, self._prepare, self._quiet = size, prepare, quiet
         self.workers: list[Worker] = []
         self._preparing: set[Worker] = set()
@@ -357,9 +349,6 @@ class ProcessPool:
         """See ``Runner``; an item whose process died is tried once more after all others.
 
         The longest go first, so that no process is left with a long one at the end (Graham 1969).
-
-        Args:
-            patience_s: Processes none of which answers for so long are ended [s]; None waits.
         """
         todo = deque((item, ATTEMPTS) for item in sorted(items, key=cost, reverse=True))
         at_work: dict[Worker, tuple[Item, int]] = {}

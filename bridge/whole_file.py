@@ -10,11 +10,7 @@ def part_of(path: Path) -> Path:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write the part, sync it to disk, and give it its final name; what fails leaves nothing.
-
-    Args:
-        path: The file; an older one is replaced, and its folder must be there.
-    """
+    """Write the part, sync it to disk, and give it its final name; what fails leaves nothing."""
     part = part_of(path)
     try:
         with part.open("wb") as stream:

@@ -56,7 +56,8 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         episode: An episode file, recorded or derived.
     """
     from bridge.episode.clocks import clocks_of
-    from bridge.episode.contract import PRESENCE_RECORD, presence_lines
+    from bridge.episode.contract import PRESENCE_RECORD, health_lines
+    from bridge.episode.health import RECORD_NAME
     from bridge.episode.reader import Episode
     from bridge.task.find import HASH_DIGITS
 
@@ -64,6 +65,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     topics = opened.topics()
     outcome = opened.outcome
     clocks = clocks_of(opened)
+    health = {"findings": opened.metadata_records.get(RECORD_NAME, {}).get("findings", [])}
     data = {
         "file": str(episode),
         "info": asdict(opened.info),
@@ -75,6 +77,7 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
         "missing_parts": [str(path) for path in opened.missing_parts],
         "recovered": opened.metadata_records.get("recovered"),
         "presence": opened.metadata_records.get(PRESENCE_RECORD),
+        "findings": health["findings"],
         "clocks": [clock.to_json() for clock in clocks],
         "topics": [asdict(item) for item in topics.values()],
     }
@@ -103,14 +106,15 @@ def info(episode: Path, /, *, output: Output = OUTPUT) -> int:
     if opened.missing_parts:
         lines.append(f"  missing: {', '.join(path.name for path in opened.missing_parts)}")
     presence = opened.metadata_records.get(PRESENCE_RECORD, {})
-    lines += [f"  {text}" for text in presence_lines(presence)]
+    lines += [f"  {text}" for text in health_lines({**presence, **health}, opened.start_ns)]
     lines += [f"  {text}" for clock in clocks for text in clock.sentences()]
     width = max((len(topic) for topic in topics), default=0)
     seen = presence.get("topics")
     shown = seen if isinstance(seen, dict) else {}
     lines += [
-        f"  {item.topic:<{width}}  {item.count:>7}  {item.type_name}{_when(shown.get(item.topic))}"
+        f"  {item.topic:<{width}}  {count:>7}  {name}{_when(shown.get(item.topic))}"
         for item in topics.values()
+        for name, count in (item.types or {item.type_name: item.count}).items()
     ]
     output.result(data, "\n".join(lines))
     return 0
@@ -155,6 +159,7 @@ def check(
     """
     from bridge.episode.check import check_all
     from bridge.episode.contract import find_contract
+    from bridge.episode.mcap.part_file import told_unfinished
     from bridge.errors import UsageError
 
     if wire.wire is not None:
@@ -169,11 +174,9 @@ def check(
             unfinished.extend(sorted(path.rglob("*.mcap.part")))
         else:
             (unfinished if path.suffix == ".part" else files).append(path)
-    for path in unfinished:
-        output.say(
-            f"{path} is not finished: it is being written, or its writer was killed. "
-            f"Then robot-gst recover {path}"
-        )
+    told = [told_unfinished(path) for path in unfinished]
+    for text, _ in told:
+        output.say(text)
     if not files and not unfinished:
         listed = ", ".join(map(str, episodes)) or "no path"
         raise UsageError(f"no episodes in {listed}. Record some: robot-gst record RUN.")
@@ -190,7 +193,8 @@ def check(
     lines = [line for report in reports for line in report.lines()]
     output.result(data, "\n".join(lines))
     codes = {report.exit_code for report in reports}
-    codes |= {1 for path in episodes if path.suffix == ".part"}
+    left = [path for path, (_, alive) in zip(unfinished, told, strict=True) if not alive]
+    codes |= {1 if path in episodes else 3 for path in left}
     return 1 if 1 in codes else max(codes, default=0)
 
 
@@ -309,8 +313,11 @@ def ls(
         query: Which, and in what order.
     """
     from bridge.episode.catalogue import find_runs
+    from bridge.episode.mcap.part_file import told_unfinished
 
     runs = find_runs(run)
+    for path in (path for each in runs for path in sorted(each.episodes_dir.glob("*.part"))):
+        output.say(told_unfinished(path)[0])
     found = _find(runs, query, output)
     entries = [entry for _, entry in found]
     shown = entries

@@ -253,6 +253,7 @@ def import_images(
         episode: Id of the new episode.
     """
     from bridge.episode.metadata import EpisodeInfo
+    from bridge.exchange.output import Unused, tell_unused
     from bridge.sources.folder.posed_index import read_posed_index
     from bridge.sources.folder.posed_messages import describe_posed, posed_messages
 
@@ -269,9 +270,11 @@ def import_images(
     info = EpisodeInfo(id=episode, kind="scan", cell=config.cell, tags=(f"folder:{index.name}",))
     images = posed_messages(index, config)
     path = _import_scan(run, info, images, len(index.images), source, output)
+    unused = [Unused(*item) for item in index.unused]
     data = {"file": str(path), "images": len(index.images), **source}
+    data["unused"] = [item._asdict() for item in unused]
     output.result(data, f"{path}: {len(index.images)} posed images without depth")
-    return 0
+    return tell_unused(output, unused)
 
 
 def import_rosbag2(
@@ -281,6 +284,7 @@ def import_rosbag2(
     *,
     episode: str | None = None,
     task: str | None = None,
+    remap: tuple[str, ...] = (),
     output: Output = OUTPUT,
 ) -> int:
     """Turn a rosbag2 recording into an episode; every message stays byte for byte.
@@ -293,11 +297,14 @@ def import_rosbag2(
         run: Run folder; made where needed.
         episode: Id of the new episode; by default from the name of the bag.
         task: Name or file of the task it is a trial of.
+        remap: OLD=NEW: another name for a topic, such as /front/rgb=/cam/front/color/image.
+            Without any, topics of known camera drivers are renamed.
     """
     import re
 
     from bridge.episode.catalogue import task_of_run
     from bridge.episode.run_folder import RunFolder
+    from bridge.exchange.output import tell_unused
     from bridge.exchange.rosbag2 import count_messages, import_bag
 
     stem = re.sub(r"(\.mcap|\.db3)?(\.zstd)?$", "", bag.resolve().name)
@@ -306,16 +313,22 @@ def import_rosbag2(
     opened, name = RunFolder.create(run), episode or plain or "bag"
     of_task = task_of_run(opened, task) if task else ""
     with output.progress("import", total) as advance:
-        report = import_bag(bag, opened, episode_id=name, task=of_task, advance=advance)
+        report = import_bag(
+            bag, opened, episode_id=name, task=of_task, remap=remap, advance=advance
+        )
     data = {
         "file": str(report.path),
         "bag_files": report.files,
         "messages": report.messages,
         "topics": report.topics,
+        "renamed": report.names,
+        "unused": [item._asdict() for item in report.unused],
     }
+    for old, new in report.names.items():
+        output.say(f"  {old} is called {new} in the episode")
     output.result(
         data,
         f"{report.path}: {report.messages} messages on {len(report.topics)} topics "
         f"of {len(report.files)} files",
     )
-    return 0
+    return tell_unused(output, report.unused)

@@ -20,11 +20,7 @@ FIELDS = ("task", "start_id", "policy")
 
 
 def assigned(info: EpisodeInfo, path: Path) -> EpisodeInfo:
-    """Apply the note on a recorded episode, where there is one.
-
-    Args:
-        path: The file; one that lies in no run's ``episodes/`` has no note.
-    """
+    """Apply the note on a recorded episode, where there is one."""
     if path.parent.name != "episodes":
         return info
     note = RunFolder(path.parent.parent).notes_dir / f"{path.stem}{TRIAL_SUFFIX}"

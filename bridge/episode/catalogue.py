@@ -14,7 +14,8 @@ from bridge.episode.catalogue_query import (
     printable,
 )
 from bridge.episode.catalogue_query import Entry as Entry
-from bridge.episode.contract import PRESENCE_RECORD, presence_lines
+from bridge.episode.contract import PRESENCE_RECORD, health_lines
+from bridge.episode.health import RECORD_NAME
 from bridge.episode.metadata import Outcome, build
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import EPISODE_ID, RunFolder, check_episode_id
@@ -45,20 +46,12 @@ def find_episodes(
 
 
 def sidecar_path(run: RunFolder, episode_id: str) -> Path:
-    """Where the label of an episode is kept.
-
-    Args:
-        episode_id: Its id, which must be safe as a file name.
-    """
+    """Where the label of an episode is kept."""
     return run.notes_dir / f"{check_episode_id(episode_id)}{LABEL_SUFFIX}"
 
 
 def outcome_of(run: RunFolder, episode: Episode) -> Outcome | None:
-    """Return the label given after the fact if there is one, else what the episode says.
-
-    Args:
-        episode: One of its episodes; the label is looked up by the name of its file.
-    """
+    """Return the label given after the fact if there is one, else what the episode says."""
     if not EPISODE_ID.fullmatch(episode.path.stem):
         return episode.outcome  # a file of another program; it cannot have been labelled here
     path = sidecar_path(run, episode.path.stem)
@@ -98,6 +91,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
     except GstError as error:
         return Entry(**name, **_extent(parts), error=printable(str(error)))
     records = episode.metadata_records
+    presence = records.get(PRESENCE_RECORD, {})
     return Entry(
         **name,
         **_extent(parts),
@@ -120,7 +114,7 @@ def read_entry(run: RunFolder, path: Path) -> Entry:
         messages=messages,
         lost=_declared_lost(records.get("drops")),
         recovered="recovered" in records,
-        presence=printable("; ".join(presence_lines(records.get(PRESENCE_RECORD, {})))),
+        presence=printable("; ".join(health_lines({**presence, **records.get(RECORD_NAME, {})}))),
     )
 
 
@@ -179,12 +173,7 @@ def find_in_runs(
 def assign_trial(
     run: RunFolder, episode_id: str, *, task: str, start_id: str | None, policy: str | None
 ) -> Path:
-    """Note that an episode is a trial of a task, beside the run.
-
-    Args:
-        start_id: Start it shares with others; None: as it says itself.
-        policy: What moved the robot; None: as it says itself.
-    """
+    """Note that an episode is a trial of a task, beside the run."""
     path, name = _finished(run, episode_id), task_of_run(run, task)
     info = Episode.open(path).info
     return assign(run, path, info, task=name, start_id=start_id, policy=policy)

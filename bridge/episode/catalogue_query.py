@@ -59,11 +59,7 @@ class Entry:
 
 
 def stamp_of(files: Iterable[Path | str], now_ns: int) -> str:
-    """Return size, times and inode of each file; "" when one changed a moment ago.
-
-    Args:
-        now_ns: The system clock, which the files' change times are compared with [ns since 1970].
-    """
+    """Return size, times and inode of each file; "" when one changed a moment ago."""
     marks = []
     for file in files:
         try:

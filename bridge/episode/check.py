@@ -1,10 +1,8 @@
-"""Verify an episode: every CRC, index and stream, and list the messages that were dropped.
+"""Verify an episode: every CRC, index and stream, and say what is wrong with what it holds.
 
 Broken is what contradicts itself: damage, indexes and counts that disagree with the data, messages
-that are not what they promise, parts that are missing. Lost is another matter: a drop log with
-losses, a topic that fell silent against its contract, or a recording that was cut off and
-recovered, leaves a whole file (``exit_code`` 3). Files of other programs are held to the format
-only; our contract is asked of ours.
+that are not what they promise, parts that are missing. ``health`` names what is wrong with a whole
+file (``exit_code`` 3). Files of other programs are held to the format only.
 """
 
 from collections.abc import Iterable, Iterator
@@ -21,13 +19,13 @@ from bridge.episode.contract import (
     ContractError,
     Presence,
     Span,
-    breaches_of,
     contract_from,
+    findings_of,
     judge,
     learn_contract,
-    unknown_tails,
     unseen_losses,
 )
+from bridge.episode.health import HealthFinding, in_order, in_words
 from bridge.episode.metadata import BY_DISK
 from bridge.episode.reader import Episode, name_of_part, record_of
 from bridge.episode.run_folder import part_name
@@ -53,38 +51,26 @@ class CheckReport:
     declared_losses: int = 0
     undeclared_losses: int = 0
     """Numbers missing on topics of a recording whose drop log does not list them."""
-    cut_short: str = ""
-    """What ended the recording where a disk did; nobody knows what it would still have held."""
-    recovered: dict[str, Any] | None = None
-    """What recovery said: the recorder died, and the end of the recording is unknown."""
-    breaches: list[str] = field(default_factory=list)
-    """Where a topic broke the contract of its cell."""
-    unknown_tails: list[str] = field(default_factory=list)
-    """Topics that fell silent before the end, so that nobody knows what they sent after."""
+    findings: list[HealthFinding] = field(default_factory=list)
+    """What is wrong with what it holds, the worst first."""
+    start_ns: int = 0
     presences: dict[str, Presence] = field(default_factory=dict)
+
+    def find(self, name: str, about: str, text: str) -> None:
+        """Take one more finding."""
+        self.findings.append(HealthFinding(name=name, about=about, text=text))
 
     @property
     def exit_code(self) -> int:
         """Status of the ``check`` command."""
-        if self.faults:
-            return 1
-        lost = bool(self.declared_losses or self.undeclared_losses or self.cut_short)
-        lost = lost or self.recovered is not None
-        return 3 if lost or self.breaches or self.unknown_tails else 0
+        return 1 if self.faults else 3 if self.findings else 0
 
     @property
     def summary(self) -> str:
         """A word or two."""
-        if self.exit_code == 3:
-            if self.breaches:
-                return "contract broken"
-            if self.undeclared_losses:
-                return "drops not logged"
-            if self.cut_short and not self.declared_losses:
-                return "cut short"
-            if self.unknown_tails and not self.declared_losses:
-                return "tail unknown"
-        return {0: "clean", 1: "broken", 3: "drops logged"}[self.exit_code]
+        if self.faults or not self.findings:
+            return "broken" if self.faults else "clean"
+        return in_words(self.findings[0].name)
 
     def lines(self) -> list[str]:
         """What to print: one line, and one for each fault and note."""
@@ -94,8 +80,8 @@ class CheckReport:
         parts = f" in {len(self.parts)} parts" if len(self.parts) > 1 else ""
         lines = [f"{self.path.name}: {self.summary}, {self.messages} messages{parts}, {lost}"]
         lines += [f"  {fault}" for fault in self.faults]
-        lines += [f"  contract: {text}" for text in self.breaches]
-        lines += [f"  {text}" for text in self.unknown_tails]
+        told = (each for each in self.findings if f"{each.about}: {each.text}" not in self.faults)
+        lines += [f"  {found.line(self.start_ns)}" for found in told]
         if self.num_faults > len(self.faults):
             lines.append(f"  and {self.num_faults - len(self.faults)} more faults")
         return lines + [f"  note: {note}" for note in self.notes]
@@ -103,17 +89,13 @@ class CheckReport:
     def to_json(self) -> dict[str, Any]:
         """Everything, for ``--json``."""
         found = asdict(self)
-        del found["path"], found["presences"]
+        del found["path"], found["presences"], found["start_ns"]
         paths = {name: list(map(str, found[name])) for name in ("parts", "missing_parts")}
         return {"file": str(self.path), "state": self.summary, **found, **paths}
 
 
 def check_episode(path: Path, *, contract: Contract | None = None) -> CheckReport:
-    """Read every byte of an episode and of its parts, and decode every type this project knows.
-
-    Args:
-        contract: Judge by this one; None takes the one the episode was recorded under.
-    """
+    """Read every byte of an episode and of its parts, and decode every type this project knows."""
     report = CheckReport(path=path)
     faults = Faults()
     watch = _Watch()
@@ -126,9 +108,12 @@ def check_episode(path: Path, *, contract: Contract | None = None) -> CheckRepor
         _check_parts(report, episode, faults)
         _check_metadata(episode, faults)
     _judge_topics(report, episode, watch, faults)
-    if episode is not None and _is_recording(episode):
-        _judge_presence(report, episode, watch, faults, contract)
+    if episode is not None:
+        report.start_ns, records = episode.start_ns, episode.metadata_records
+        if "recorder" in records or ("recovered" in records and RECORD_NAME in records):
+            _judge_presence(report, episode, watch, faults, contract)
     report.faults, report.num_faults = faults.listed, faults.count
+    report.findings = in_order(report.findings)
     return report
 
 
@@ -146,11 +131,7 @@ def learn_from(path: Path) -> Contract:
 
 
 def check_all(paths: Iterable[Path], *, contract: Contract | None = None) -> Iterator[CheckReport]:
-    """Check every episode among some files; a later part goes with the first of its episode.
-
-    Args:
-        contract: Judge by this one; None takes the one each episode was recorded under.
-    """
+    """Check every episode among some files; a later part goes with the first of its episode."""
     done: set[Path] = set()
     for path in sorted(paths, key=_by_part):
         if path not in done:
@@ -217,14 +198,12 @@ def _check_parts(report: CheckReport, episode: Episode, faults: Faults) -> None:
     for file in episode.files:
         stopped_by = str((record_of(file, "recorder") or {}).get("stopped_by", ""))
         if stopped_by.startswith(BY_DISK):
-            report.cut_short = stopped_by
-            report.notes.append(f"the recording was ended by the {stopped_by}")
+            report.find("cut_short", file.path.name, f"ended by the {stopped_by}")
         recovered = record_of(file, "recovered")
         if recovered:
-            report.recovered = recovered
             lost = recovered.get("bytes_lost", "an unknown number of")
-            why = recovered.get("reason", "its recorder died")
-            report.notes.append(f"{file.path.name} was recovered ({why}); {lost} bytes were lost")
+            text = f"{recovered.get('reason', 'its recorder died')}; {lost} bytes were lost"
+            report.find("recovered", file.path.name, text)
 
 
 def _check_metadata(episode: Episode, faults: Faults) -> None:
@@ -250,18 +229,25 @@ def _judge_topics(
     report: CheckReport, episode: Episode | None, watch: _Watch, faults: Faults
 ) -> None:
     decoder = watch.decoder
-    ours = watch.is_ours and not _is_imported(episode)
-    is_recording = episode is not None and "recorder" in episode.metadata_records
+    records = {} if episode is None else episode.metadata_records
+    ours = watch.is_ours and records.get("episode", {}).get("kind") != "imported"
+    is_recording = "recorder" in records
     say = faults.add if ours else report.notes.append
     report.notes += sorted(decoder.missing)
-    shared = _shared_topics(episode)
+    shared = records.get("drops", {}).get("several_publishers")
+    shared = shared if isinstance(shared, list) else []  # nobody knows whose number is whose
     for topic, topic_watch in sorted(watch.topics.items()):
         result = report.topics[topic] = topic_watch.finish()
         report.messages += result.messages
         result.declared_losses = decoder.drop_log.get(topic, 0)
         result.unnumbered = decoder.unnumbered.get(topic, 0)
         if result.undecodable:
-            say(result.first_fault)
+            count = f"{result.undecodable} of {result.messages} messages"
+            text = f"{count} cannot be read: {result.first_fault}"
+            report.find("unreadable", topic, text)
+            if ours:
+                faults.add(f"{topic}: {text}")
+        report.findings += topic_watch.findings(is_derived=episode is None or bool(episode.derived))
         if result.time_steps_back:
             text = f"{topic}: its log time steps back {result.time_steps_back} times"
             (say if is_recording else report.notes.append)(text)
@@ -269,20 +255,20 @@ def _judge_topics(
             missing = max(0, result.sequence_gaps - result.declared_losses)
             report.undeclared_losses += missing
             if missing:
-                report.notes.append(
-                    f"{topic}: {result.sequence_gaps} numbers are missing, "
+                text = (
+                    f"{result.sequence_gaps} numbers are missing, "
                     f"the drop log lists {result.declared_losses}"
                 )
+                report.find("drops_not_logged", topic, text)
+        if result.declared_losses:
+            report.find("drops_logged", topic, f"{result.declared_losses} messages")
+    report.findings += decoder.findings
     report.declared_losses = sum(decoder.drop_log.values())
     report.notes += unseen_losses(decoder.unnumbered)
+    unused = ", ".join(f"{topic} ({what})" for topic, what in sorted(decoder.unused.items()))
+    report.notes += [f"kept, and no command reads them: {unused}"] if unused else []
     for text in decoder.size_faults():
         say(text)
-
-
-def _is_recording(episode: Episode) -> bool:
-    """Whether a recorder of ours made it, be it finished or recovered."""
-    records = episode.metadata_records
-    return "recorder" in records or ("recovered" in records and RECORD_NAME in records)
 
 
 def _judge_presence(
@@ -312,21 +298,7 @@ def _judge_presence(
     )
     for topic, found in reports.items():
         report.topics.setdefault(topic, TopicCheck()).presence = found
-    report.breaches = breaches_of(reports)
-    report.unknown_tails = unknown_tails(reports)
-
-
-def _is_imported(episode: Episode | None) -> bool:
-    """Whether we only keep what another program wrote."""
-    record = episode.metadata_records.get("episode") if episode else None
-    return record is not None and record.get("kind") == "imported"
-
-
-def _shared_topics(episode: Episode | None) -> list[str]:
-    """Topics of several publishers: the file does not say whose number is whose."""
-    record = episode.metadata_records.get("drops", {}) if episode else {}
-    topics = record.get("several_publishers")
-    return topics if isinstance(topics, list) else []
+    report.findings += findings_of(reports, report.presences, span.end_ns)
 
 
 def _paused_spans(episode: Episode) -> list[tuple[int, int]]:

@@ -50,11 +50,6 @@ def summary_faults(
     """Yield a sentence for every place where summary and data disagree.
 
     What a writer may leave out (statistics, repeated records, an index as a whole) is no fault.
-
-    Args:
-        seen: What the walk through the data found; the summary's schemas and channels are added to
-            it.
-        summary: What the file says of itself; None where it has no summary, which is no fault.
     """
     if summary is None:
         return

@@ -1,16 +1,14 @@
 """What one topic shows over a whole episode: numbers, times, rate, and whether it decodes."""
 
-from array import array
-from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from bridge.clock import NS_PER_S
 from bridge.episode import schema
 from bridge.episode.cdr import codec
+from bridge.episode.cdr.images import check_image, image_header
 from bridge.episode.cdr.messages import (
     CameraInfo,
     CompressedColor,
@@ -22,10 +20,10 @@ from bridge.episode.cdr.messages import (
 )
 from bridge.episode.check_file import ScannedMessage
 from bridge.episode.contract import Presence, Spans, TopicReport
+from bridge.episode.health import ContentWatch, HealthFinding, of_event
 from bridge.episode.schema import DEFINITIONS
 from bridge.episode.topics import DEPTH_IMAGE, type_of_topic
 from bridge.errors import BridgeError, MissingDependencyError
-from bridge.media.color import decode_color
 from bridge.task.plan import Plan
 from bridge.task.record import parse_record
 from bridge.task.verdict import Verdict
@@ -47,23 +45,24 @@ class Decoder:
         self.has_drop_log = False
         self.missing: set[str] = set()
         """Sentences on packages without which something was not decoded."""
+        self.unused: dict[str, str] = {}
+        """Type or encoding of topics that are kept, and that nothing here reads."""
+        self.findings: list[HealthFinding] = []
+        """What the recorder noticed of clocks, and of itself."""
         self._depth_sizes: dict[str, tuple[int, int]] = {}
         self._info_sizes: dict[str, tuple[int, int]] = {}
 
     def decode(self, topic: str, message: ScannedMessage) -> None:
-        """Read one message.
-
-        Args:
-            topic: Where it was sent; a topic of the contract decides how its message is read.
-            message: With its channel and schema; of an unknown type or encoding it is passed over.
-
-        Raises:
-            BridgeError: When it is not what its topic and type promise.
-        """
+        """Read one message; raises BridgeError where it is not what topic and type promise."""
         type_name = message.schema.name if message.schema else ""
         encoding, data = message.channel.message_encoding, message.data
         known = schema.schema_for(type_name)
+        if encoding == "cdr":
+            codec.refuse_other_cdr(type_name, data)
+        if encoding == "ros1":
+            raise BridgeError("ROS 1 messages; convert the recording with rosbags-convert")
         if known is None or encoding not in ("", known.message_encoding):
+            self.unused[topic] = type_name or encoding or "no type"
             return
         if type_of_topic(topic) is None and type_name in DEFINITIONS:
             codec.decode(type_name, data)
@@ -83,12 +82,15 @@ class Decoder:
                 )
                 raise codec.MalformedMessageError(type_name=type_name, found=found)
         elif type_name == schema.IMAGE:
-            codec.decode(type_name, data)
+            check_image(topic, image_header(data))
         elif type_name == schema.CAMERA_INFO:
             camera = CameraInfo.from_cdr(data).camera
             self._info_sizes[topic] = (camera.width, camera.height)
         elif type_name == schema.DROPS:
             self._add_losses(parse_record(data, name="drops", package="bridge.episode"))
+        elif type_name == schema.EVENT:
+            event = parse_record(data, name="event", package="bridge.episode")
+            self.findings += of_event(event)
         elif type_name in _DECODERS:
             _DECODERS[type_name](data)
         elif type_name in DEFINITIONS:
@@ -116,17 +118,9 @@ class Decoder:
         return faults
 
 
-def _color(data: bytes) -> object:
-    image = CompressedColor.from_cdr(data)
-    if not image.format.lower().strip().startswith(_KNOWN_COLORS):
-        return image
-    return decode_color(image.data)
-
-
-_KNOWN_COLORS = ("jpeg", "jpg", "png", "rgb8; jpeg", "bgr8; jpeg", "rgb8; png", "bgr8; png")
 _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.JOINT_STATE: JointSample.from_cdr,
-    schema.COMPRESSED_IMAGE: _color,
+    schema.COMPRESSED_IMAGE: lambda data: CompressedColor.from_cdr(data).decoded(),
     schema.TF_MESSAGE: transforms_from_cdr,
     schema.POSE_STAMPED: PoseSample.from_cdr,
     schema.STRING: string_from_cdr,
@@ -136,11 +130,13 @@ _DECODERS: dict[str, Callable[[bytes], object]] = {
     schema.CONTACT: lambda data: parse_record(data, name="contact"),
     schema.DIVERGENCE: lambda data: parse_record(data, name="divergence"),
     schema.LOCALISATION: lambda data: parse_record(data, name="localisation"),
-    schema.EVENT: lambda data: parse_record(data, name="event", package="bridge.episode"),
     schema.CLOCKS: lambda data: parse_record(data, name="clocks", package="bridge.episode"),
 }
 
 
+YEAR_NS = 31_556_952 * NS_PER_S
+LATEST_NS, MOST_YEARS = 230 * YEAR_NS, 10
+"""No recorder of today says later, or records for so long."""
 _WRAP = 1 << 32
 _MAX_OPEN_GAPS = 64
 ON_ITS_WAY_NS = 100_000_000
@@ -199,17 +195,13 @@ class Pauses:
     def __init__(self, spans_ns: Iterable[tuple[int, int]]) -> None:
         """Take spans that do not overlap [ns]."""
         self.spans: Spans = sorted(spans_ns)
-        ordered = self.spans
-        self._starts_ns = [start_ns for start_ns, _ in ordered]
-        self._ends_ns = [end_ns for _, end_ns in ordered]
 
     def lies_between(self, before_ns: int, after_ns: int) -> bool:
-        """Say whether two messages of a topic lie on both sides of a pause [ns].
-
-        A message on its way when the recorder was told may be on either side.
-        """
-        index = bisect_left(self._starts_ns, after_ns) - 1
-        return index >= 0 and before_ns < self._ends_ns[index] + ON_ITS_WAY_NS
+        """Say whether one lies between two messages; those on their way may be on either side."""
+        return any(
+            start_ns < after_ns and before_ns < end_ns + ON_ITS_WAY_NS
+            for start_ns, end_ns in self.spans
+        )
 
 
 @dataclass(kw_only=True)
@@ -228,9 +220,6 @@ class TopicCheck:
     """Gaps, queue drops and shed messages the drop log lists."""
     time_steps_back: int = 0
     """Messages whose log time is before that of the one before."""
-    latency_median_s: float = 0.0
-    """Log time minus publish time; large where the clocks differ."""
-    latency_max_s: float = 0.0
     undecodable: int = 0
     first_fault: str = ""
     unnumbered: int = 0
@@ -246,17 +235,27 @@ class TopicWatch:
     topic: str
     pauses: Pauses
     result: TopicCheck = field(default_factory=TopicCheck)
+    contents: dict[str, ContentWatch] = field(default_factory=dict)
+    """By type."""
+    odd: list[int] = field(default_factory=list)
+    """When messages came whose times cannot be."""
     sequences: SequenceWatch = field(default_factory=SequenceWatch)
     presence: Presence = field(default_factory=Presence)
     last_ns: dict[int, int] = field(default_factory=dict)
     """By channel: two definitions of a topic may lie in different chunks, in another order."""
-    latencies_ns: array = field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
 
     def see(self, message: ScannedMessage, decoder: Decoder) -> None:
         """Take the next message in the order of the file."""
         head, result = message.head, self.result
         result.messages += 1
-        result.type_name = message.schema.name if message.schema else ""
+        name = result.type_name = message.schema.name if message.schema else ""
+        content = self.contents.get(name)
+        if content is None:
+            content = self.contents[name] = ContentWatch(self.topic, name)
+        if content.is_of_use:
+            content.see(message.data, head.log_time_ns)
+        if max(head.log_time_ns, head.publish_time_ns) > LATEST_NS:
+            self.odd.append(head.log_time_ns)
         last_ns = self.presence.last_ns
         may_skip = self.pauses.lies_between(last_ns, head.log_time_ns)
         self.sequences.see(head.sequence, may_skip=may_skip)
@@ -264,13 +263,25 @@ class TopicWatch:
             result.time_steps_back += 1
         self.last_ns[head.channel_id] = head.log_time_ns
         self.presence.see(head.log_time_ns, self.pauses.spans)
-        self.latencies_ns.append(head.log_time_ns - head.publish_time_ns)
         try:
             decoder.decode(self.topic, message)
         except BridgeError as error:
             result.undecodable += 1
             if not result.first_fault:
-                result.first_fault = f"{self.topic}: {error}"
+                result.first_fault = str(error)
+
+    def findings(self, *, is_derived: bool) -> Iterator[HealthFinding]:
+        """What its messages hold; a replay may stand still, and its images with it."""
+        for content in () if is_derived else self.contents.values():
+            yield from content.findings.values()
+        span = {"first_ns": self.presence.first_ns, "last_ns": self.presence.last_ns}
+        if len(self.contents) > 1:
+            text = " and ".join(sorted(name or "no type" for name in self.contents))
+            yield HealthFinding(name="mixed_types", about=self.topic, text=text, **span)
+        years = (span["last_ns"] - span["first_ns"]) // YEAR_NS
+        if self.odd or years > MOST_YEARS:
+            text = f"{len(self.odd)} times after the year 2200" if self.odd else f"{years} years"
+            yield HealthFinding(name="odd_times", about=self.topic, text=text, **span)
 
     def finish(self) -> TopicCheck:
         """Work out what needs all messages."""
@@ -280,8 +291,4 @@ class TopicWatch:
         span_s = (self.presence.last_ns - self.presence.first_ns) * 1e-9
         if result.messages > 1 and span_s > 0:
             result.rate_hz = (result.messages - 1) / span_s
-        if self.latencies_ns:
-            latencies = np.frombuffer(self.latencies_ns, dtype=np.float64)
-            result.latency_median_s = float(np.median(latencies)) * 1e-9
-            result.latency_max_s = float(latencies.max()) * 1e-9
         return result

@@ -60,12 +60,7 @@ class ChunkQueue:
         header: bytes,
         monotonic: Callable[[], float],
     ) -> None:
-        """Start the thread.
-
-        Args:
-            section: The growing file; nobody else writes to it unless ``drain`` has returned.
-            monotonic: A clock without steps [s].
-        """
+        """Start the thread."""
         self._section = section
         self._header = header
         self._monotonic = monotonic

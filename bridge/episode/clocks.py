@@ -60,14 +60,7 @@ class Jump(NamedTuple):
 
 
 def read_round_trip(*, asked_ns: int, received_ns: int, sent_ns: int, back_ns: int) -> Reading:
-    """Turn the four times of a round trip into an offset and its bound.
-
-    Args:
-        asked_ns: When the recorder asked, by its clock.
-        received_ns: When the source received that, by the source's clock.
-        sent_ns: When the source answered, by the source's clock.
-        back_ns: When the answer arrived, by the recorder's clock.
-    """
+    """Turn the four times of a round trip into an offset and its bound."""
     most_ns, least_ns = received_ns - asked_ns, sent_ns - back_ns
     return Reading(
         at_ns=(asked_ns + back_ns) // 2,
@@ -77,11 +70,7 @@ def read_round_trip(*, asked_ns: int, received_ns: int, sent_ns: int, back_ns: i
 
 
 def jump_of(before: Sequence[Reading], new: Reading) -> Jump | None:
-    """Say whether a reading contradicts those before it; None where it agrees with all.
-
-    Args:
-        before: Readings since the clock was last set, in order.
-    """
+    """Say whether a reading contradicts those before it; None where it agrees with all."""
     for old in before[-COMPARED:]:
         allowed_ns = old.error_ns + new.error_ns + SLEW * abs(new.at_ns - old.at_ns)
         if abs(new.offset_ns - old.offset_ns) > allowed_ns + SMALLEST_JUMP_NS:
@@ -112,11 +101,7 @@ class ClockLine:
 
 
 def fit_line(readings: Sequence[Reading]) -> ClockLine:
-    """Fit offset and drift to the quicker half of the readings, the quickest counting most.
-
-    Args:
-        readings: At least one, of a clock that was not set meanwhile.
-    """
+    """Fit offset and drift to the quicker half of the readings, the quickest counting most."""
     limit_ns = statistics.median_low(reading.error_ns for reading in readings)
     used = [reading for reading in readings if reading.error_ns <= limit_ns]
     start_ns = min(reading.at_ns for reading in readings)
@@ -215,11 +200,7 @@ class StampWatch:
         self._levels: dict[str, list[int]] = {}
 
     def see(self, topic: str, delay_ns: int) -> int:
-        """Take the least (arrival - stamp) of the next second; return how far stamps jumped.
-
-        Returns:
-            Ahead is positive; 0 where there was no jump.
-        """
+        """Take the least (arrival - stamp) of the next second; return how far they jumped ahead."""
         levels = self._levels.setdefault(topic, [])
         levels.append(delay_ns)
         del levels[:-4]
@@ -249,11 +230,7 @@ def to_record(clock: SourceClock, identity: str, readings: Iterable[Reading]) ->
 
 
 def source_clocks(records: Iterable[dict[str, Any]]) -> list[SourceClock]:
-    """Put together what an episode says of clocks, by source.
-
-    Args:
-        records: Those of ``/recorder/clocks``, in log order; what is no such record is left out.
-    """
+    """Put together what an episode says of clocks, by source."""
     found: dict[tuple[str, str], SourceClock] = {}
     for record in records:
         try:
@@ -302,10 +279,6 @@ class StampCorrection:
 
         Of several lines the one that holds at the time counts; between two, the one that puts the
         message closest to its arrival. Sources that share a topic and differ are left alone.
-
-        Args:
-            publish_ns: Its time by the source's clock.
-            log_ns: When it arrived, by the recorder's clock.
         """
         known = self._lines.get(topic)
         if not known:
@@ -319,25 +292,17 @@ class StampCorrection:
             best = min((line for _, line in holding), key=lambda line: line.uncertainty_ns)
             return -round(best.offset_at(log_ns))
         away = [max(line.start_ns - log_ns, log_ns - line.end_ns) for _, line in known]
-        near = [line for (_, line), far in zip(known, away, strict=True) if far <= _next(away)]
+        near = [
+            line for (_, line), far in zip(known, away, strict=True) if far <= sorted(away)[:2][-1]
+        ]
         return min(
             (-round(line.offset_at(log_ns)) for line in near),
             key=lambda shift_ns: abs(log_ns - (publish_ns + shift_ns)),
         )
 
 
-def _next(away: Sequence[int]) -> int:
-    """The second smallest: at most the lines before and after a jump are asked."""
-    return sorted(away)[:2][-1]
-
-
 def restamped(message: RawMessage, definition: records.Schema | None, shift_ns: int) -> RawMessage:
-    """Move the time of a message, and the time it holds itself, where its type has one.
-
-    Args:
-        definition: Of its type; None where there is none.
-        shift_ns: What is added [ns]; times that were never set stay 0.
-    """
+    """Move the time of a message, and the time it holds itself, where its type has one."""
     publish_ns = max(0, message.publish_time_ns + shift_ns)
     data = message.data
     with contextlib.suppress(codec.MalformedMessageError):
@@ -415,13 +380,7 @@ class CorrectedEpisode(Episode):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Yield messages as ``Episode.messages`` does, with moved stamps.
-
-        Args:
-            topics: Topics wanted; None for all.
-            start_ns: First log time wanted [ns since 1970]; None: from the start.
-            end_ns: Log time to stop before [ns since 1970]; None: to the end.
-        """
+        """Yield messages as ``Episode.messages`` does, with moved stamps."""
         for message in super().messages(topics, start_ns=start_ns, end_ns=end_ns):
             shift_ns = self.shift_ns(message)
             if shift_ns:
@@ -432,11 +391,7 @@ class CorrectedEpisode(Episode):
 
 
 def open_episode(path: Path, *, clock: ClockChoice = "recorded") -> Episode:
-    """Open an episode as ``Episode.open`` does, with the clock a person asked for.
-
-    Args:
-        clock: ``corrected`` takes the sources' offset and drift out of all stamps.
-    """
+    """Open an episode as ``Episode.open`` does, with the clock a person asked for."""
     episode = Episode.open(path)
     if clock == "recorded":
         return episode

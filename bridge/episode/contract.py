@@ -10,7 +10,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -19,6 +19,7 @@ import msgspec
 
 from bridge.clock import NS_PER_S, s_from_ns
 from bridge.data_files import dataset_file
+from bridge.episode.health import HealthFinding, parsed
 from bridge.episode.topics import EVENT, OF_RECORDER, is_latched, is_truth
 from bridge.errors import UsageError
 from bridge.whole_file import write_whole
@@ -38,6 +39,9 @@ LEAST_SILENCE_S = 1.0
 """Without a contract no shorter silence is remarkable [s]."""
 HABIT = 5
 """Without a contract a silence is remarkable beyond so many times the longest one before it."""
+SLOW, SLOW_NS = 4, 2 * NS_PER_S
+"""Without a contract a rate has collapsed where several gaps in a row are so many times the usual
+one, for so long [ns]."""
 FEWEST_FOR_RATE = 10
 """A rate is judged when the contract promises at least so many messages."""
 
@@ -92,9 +96,6 @@ def read_contract(path: Path) -> Contract:
 
 def find_contract(run: Path, name: str | None) -> Contract | None:
     """Return the contract of a recording.
-
-    Args:
-        run: The run folder; its ``cell.toml`` holds unless another is named.
 
     Raises:
         UsageError: When there is no such template; lists those that are there.
@@ -173,6 +174,12 @@ class Presence:
     longest_ns: int = 0
     """The longest silence between two messages, pauses not counted."""
     longest_at_ns: int = 0
+    usual_ns: float = 0.0
+    """Between two messages, as long as the rate does not fall; and how far from it they are."""
+    spread_ns: float = 0.0
+    slow: tuple[int, int, int] | None = None
+    """First and last of the messages that came too slowly for longest, and how many."""
+    slow_now: tuple[int, int] = (0, 0)
 
     def see(self, stamp_ns: int, pauses: Spans) -> None:
         """Take the next message."""
@@ -184,10 +191,27 @@ class Presence:
         if stamp_ns <= last_ns:
             return
         self.last_ns = stamp_ns
+        self._see_rate(last_ns, stamp_ns - last_ns)
         if stamp_ns - last_ns > self.longest_ns:
             silent_ns = _silence_ns(last_ns, stamp_ns, pauses)
             if silent_ns > self.longest_ns:
                 self.longest_ns, self.longest_at_ns = silent_ns, last_ns
+
+    def _see_rate(self, last_ns: int, gap_ns: int) -> None:
+        """Learn the usual gap, and follow gaps that are far longer in a regular stream."""
+        usual_ns = self.usual_ns
+        is_steady = self.messages > REGULAR_MESSAGES and self.spread_ns < usual_ns / 2
+        if is_steady and gap_ns > SLOW * usual_ns:
+            first_ns, count = self.slow_now if self.slow_now[1] else (last_ns, 0)
+            self.slow_now = (first_ns, count + 1)
+            before = self.slow[1] - self.slow[0] if self.slow else 0
+            if count and last_ns + gap_ns - first_ns > max(before, SLOW_NS):
+                self.slow = (first_ns, last_ns + gap_ns, count + 1)
+            return
+        self.slow_now = (0, 0)
+        part = 1 / min(self.messages - 1, REGULAR_MESSAGES)
+        self.usual_ns += (gap_ns - usual_ns) * part
+        self.spread_ns += (abs(gap_ns - self.usual_ns) - self.spread_ns) * part
 
     @property
     def is_regular(self) -> bool:
@@ -228,6 +252,8 @@ class TopicReport:
     tail: str
     """``known``, or ``unknown``: it fell silent, and nobody knows what was sent after."""
     breaches: tuple[str, ...] = ()
+    slow: tuple[int, int, int] | None = None
+    """From when to when it came too slowly [ns], and how many; None: never, or a contract says."""
 
 
 def judge(
@@ -245,9 +271,6 @@ def judge(
             silence of their publisher.
         by_habit: Judge topics without a rule by what they did before. Not for a stand-in cell:
             its clock is not the wall's, and may stand.
-
-    Returns:
-        A report for each topic that was there or was promised.
     """
     rules, absent = contract.topics if contract else {}, Presence()
     total_ns = _silence_ns(span.start_ns, span.end_ns, span.pauses)
@@ -270,8 +293,14 @@ def judge(
             expected=None if rate_hz is None else round(rate_hz * s_from_ns(total_ns)),
             tail="unknown" if is_silent else "known",
             breaches=tuple(found),
+            slow=presence.slow if by_habit and rule is None and not _is_rare(topic) else None,
         )
     return reports
+
+
+def _is_rare(topic: str) -> bool:
+    """Whether messages come when something happens."""
+    return is_latched(topic) or topic.endswith(EVENT)
 
 
 def _fell_silent(
@@ -280,8 +309,8 @@ def _fell_silent(
     if rule is not None:
         limit_s = rule.silence_s
         return limit_s is not None and presence.messages > 0 and s_from_ns(tail_ns) > limit_s
-    if not by_habit or is_latched(topic) or topic.endswith(EVENT) or not presence.is_regular:
-        return False  # events come when something happens, the recorder's own notes too
+    if not by_habit or _is_rare(topic) or not presence.is_regular:
+        return False
     return s_from_ns(tail_ns) > max(LEAST_SILENCE_S, HABIT * s_from_ns(presence.longest_ns))
 
 
@@ -290,7 +319,7 @@ def _breaches(
 ) -> Iterable[str]:
     if not presence.messages:
         if rule.required:
-            yield f"{topic}: no message, and the contract requires it"
+            yield "no message, and the contract requires it"
         return
     dropped = f" ({lost} messages of it were dropped)" if lost else ""
     limit_s = rule.silence_s
@@ -300,12 +329,12 @@ def _breaches(
         tail_s = s_from_ns(_silence_ns(presence.last_ns, span.end_ns, span.pauses))
         longest_s = s_from_ns(presence.longest_ns)
         if head_s > limit_s and rule.required:
-            yield f"{topic}: silent for the first {head_s:.1f} s; {allowed}"
+            yield f"silent for the first {head_s:.1f} s; {allowed}"
         if longest_s > limit_s:
             at_s = s_from_ns(presence.longest_at_ns - span.start_ns)
-            yield f"{topic}: silent for {longest_s:.1f} s from {at_s:.1f} s on; {allowed}"
+            yield f"silent for {longest_s:.1f} s from {at_s:.1f} s on; {allowed}"
         if tail_s > limit_s:
-            yield f"{topic}: silent for the last {tail_s:.1f} s; {allowed}"
+            yield f"silent for the last {tail_s:.1f} s; {allowed}"
     yield from _rate_breach(topic, presence, rule, span, lost)
 
 
@@ -318,23 +347,32 @@ def _rate_breach(
     found_hz = (presence.messages + lost - 1) / there_s
     if abs(found_hz - rule.rate_hz) > rule.tolerance * rule.rate_hz:
         yield (
-            f"{topic}: {found_hz:.1f} messages a second; the contract says {rule.rate_hz:g} "
+            f"{found_hz:.1f} messages a second; the contract says {rule.rate_hz:g} "
             f"± {100 * rule.tolerance:g} %"
         )
 
 
-def breaches_of(reports: Mapping[str, TopicReport]) -> list[str]:
-    """Every place where the contract was broken, in words."""
-    return [text for report in reports.values() for text in report.breaches]
-
-
-def unknown_tails(reports: Mapping[str, TopicReport]) -> list[str]:
-    """Sentences on topics that fell silent before the end."""
-    return [
-        f"{topic}: tail unknown, nothing came in the last {report.tail_s:.1f} s"
-        for topic, report in reports.items()
-        if report.tail == "unknown"
-    ]
+def findings_of(
+    reports: Mapping[str, TopicReport], presences: Mapping[str, Presence], end_ns: int
+) -> Iterator[HealthFinding]:
+    """Say where a contract was broken, what fell silent, and whose rate fell."""
+    for topic, report in reports.items():
+        presence = presences.get(topic, Presence())
+        span = {"first_ns": presence.first_ns, "last_ns": presence.last_ns}
+        for text in report.breaches:
+            yield HealthFinding(name="contract_broken", about=topic, text=text, **span)
+        if report.tail == "unknown":
+            text = f"nothing came in the last {report.tail_s:.1f} s"
+            span = {"first_ns": presence.last_ns, "last_ns": end_ns}
+            yield HealthFinding(name="tail_unknown", about=topic, text=text, **span)
+        if report.slow is not None:
+            first_ns, last_ns, count = report.slow
+            text = (
+                f"{count / s_from_ns(last_ns - first_ns):.1f} messages a second instead of "
+                f"{NS_PER_S / presence.usual_ns:.1f}"
+            )
+            span = {"first_ns": first_ns, "last_ns": last_ns}
+            yield HealthFinding(name="rate_collapsed", about=topic, text=text, count=count, **span)
 
 
 def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
@@ -346,17 +384,13 @@ def unseen_losses(unnumbered: Mapping[str, int]) -> list[str]:
     ]
 
 
-def presence_lines(record: Mapping[str, Any]) -> list[str]:
-    """Sentences on what an episode lacks without a number missing.
-
-    Args:
-        record: A ``presence`` record, or the answer to a stop; anything else says nothing.
-    """
-    breaches, tails = record.get("breaches"), record.get("unknown_tails")
+def health_lines(record: Mapping[str, Any], start_ns: int = 0) -> list[str]:
+    """Sentences on what the records ``health`` and ``presence``, or the answer to a stop, say."""
+    old = [record.get("breaches"), record.get("unknown_tails")]  # of earlier editions
     unnumbered = record.get("unnumbered")
     return [
-        *(f"contract: {text}" for text in (breaches if isinstance(breaches, list) else [])),
-        *(str(text) for text in (tails if isinstance(tails, list) else [])),
+        *(found.line(start_ns) for found in parsed(record.get("findings"))),
+        *(str(text) for texts in old if isinstance(texts, list) for text in texts),
         *unseen_losses(unnumbered if isinstance(unnumbered, dict) else {}),
     ]
 

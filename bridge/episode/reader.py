@@ -1,8 +1,8 @@
 """Read one episode, split or whole: metadata, topics, raw messages; ``streams`` decodes them."""
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -69,7 +69,8 @@ def _follow(first: McapFile, episode_id: str, index: int) -> Parts:
             files.append(file)
             continue
         if highest is None:  # a hole: is there anything behind it?
-            highest = _highest_part(first.path, episode_id)
+            names = map(name_of_part, first.path.parent.glob(f"{episode_id}.*.mcap"))
+            highest = max((name.number for name in names if name is not None), default=1)
         if index > highest:
             if not _was_cut_off(files[-1]) or path.exists():
                 missing.append(path)
@@ -89,17 +90,8 @@ def _open_later(path: Path, *, of: McapFile) -> McapFile | None:
     return file if len(ids - {None}) < 2 else None
 
 
-def _highest_part(path: Path, episode_id: str) -> int:
-    names = map(name_of_part, path.parent.glob(f"{episode_id}.*.mcap"))
-    return max((name.number for name in names if name is not None), default=1)
-
-
 def record_of(file: McapFile, name: str) -> dict[str, Any]:
-    """Return a metadata record of one file with its values parsed, empty where there is none.
-
-    Args:
-        name: Of the record, such as ``episode`` or ``outcome``; the last of that name counts.
-    """
+    """Return a metadata record of one file with its values parsed, empty where there is none."""
     values: dict[str, Any] = {}
     for record in file.metadata:
         if record.name == name:
@@ -146,8 +138,11 @@ class TopicSummary:
 
     topic: str
     type_name: str
+    """Of most of its messages."""
     message_encoding: str
     count: int
+    types: Mapping[str, int] = field(default_factory=dict)
+    """Messages of each type; of a topic that carries several."""
 
 
 class Episode:
@@ -268,20 +263,26 @@ class Episode:
         return dict(self._topics)
 
     def _summed_up(self) -> dict[str, TopicSummary]:
-        topics: dict[str, TopicSummary] = {}
+        found: dict[str, dict[tuple[str, str], int]] = {}
         for file in self.files:
             statistics = file.summary.statistics
             counts = statistics.channel_message_counts if statistics else {}
             for channel in file.summary.channels.values():
-                record = file.schema_of(channel)
-                before = topics.get(channel.topic)
-                topics[channel.topic] = TopicSummary(
-                    topic=channel.topic,
-                    type_name=record.name if record else "",
-                    message_encoding=channel.message_encoding,
-                    count=counts.get(channel.id, 0) + (before.count if before else 0),
-                )
-        return dict(sorted(topics.items()))
+                record, kinds = file.schema_of(channel), found.setdefault(channel.topic, {})
+                kind = (record.name if record else "", channel.message_encoding)
+                kinds[kind] = kinds.get(kind, 0) + counts.get(channel.id, 0)
+        topics = {}
+        for topic, kinds in sorted(found.items()):
+            type_name, encoding = max(kinds, key=lambda kind: kinds[kind])
+            types = {name: count for (name, _), count in kinds.items() if count}
+            topics[topic] = TopicSummary(
+                topic=topic,
+                type_name=type_name,
+                message_encoding=encoding,
+                count=sum(kinds.values()),
+                types=types if len(types) > 1 else {},
+            )
+        return topics
 
     def topics_of_type(self, type_name: str) -> list[str]:
         """Topics that carry one message type; stand-in truth is never among them."""
@@ -298,14 +299,9 @@ class Episode:
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[RawMessage]:
-        """Yield messages in log order with CRCs checked, optionally of some topics only.
+        """Yield messages in log order with CRCs checked, from ``start_ns`` to before ``end_ns``.
 
         Chunks without a wanted topic are not read; few are held in memory at a time.
-
-        Args:
-            topics: Topics wanted; None for all.
-            start_ns: First log time wanted, included [ns since 1970]; None: from the start.
-            end_ns: Log time to stop before, excluded; None: to the end.
         """
         wanted = None if topics is None else frozenset(topics)
         if wanted is not None and not wanted:

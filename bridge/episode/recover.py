@@ -7,6 +7,7 @@ or a finished one is there, and it can be run again.
 
 import os
 import shutil
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -57,7 +58,8 @@ def recover(path: Path) -> RecoveryReport:
             _drop_journal(path, finished)
             return finished
         if shutil.disk_usage(path.parent).free < source.size + SPARE_BYTES:
-            raise _no_room(path, source.size)
+            size = f"{path} needs {source.size / 1e6:.0f} MB beside it for a copy."
+            raise RecoveryError(f"{size} Free some space, or move it to another disk.")
         with _journal_of(path) as journal:
             report = _recover_copy(path, source, journal)
         _drop_journal(path, report)
@@ -129,7 +131,10 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
     data = finished_data(source)
     if data is None:
         return None
-    if not data.is_proved and _has_faults(path):  # then its indexes may be wrong all the same
+    faults = Faults()
+    if not data.is_proved:  # then its indexes may be wrong all the same
+        deque(FileCheck(path, faults).messages(), maxlen=0)
+    if faults.count:
         return None
     tally = RecoveryTally()
     for found in scan(source):
@@ -138,13 +143,6 @@ def _report_finished(path: Path, source: RecordFile) -> RecoveryReport | None:
         return None
     output = _publish(path) if path.name.endswith(PART) else path
     return tally.report(path, output, finished=True)
-
-
-def _has_faults(path: Path) -> bool:
-    faults = Faults()
-    for _ in FileCheck(path, faults).messages():
-        pass
-    return bool(faults.count)
 
 
 def _recover_copy(path: Path, source: RecordFile, journal: RecordFile | None) -> RecoveryReport:
@@ -228,10 +226,3 @@ def _free_name(path: Path, *, taken: bool) -> Path:
         output = path.with_name(f"{base}{suffix}{dot}{rest}")
         taken, number = False, number + 1
     return output
-
-
-def _no_room(path: Path, size: int) -> RecoveryError:
-    return RecoveryError(
-        f"{path} needs {size / 1e6:.0f} MB beside it for a copy. Free some space, or move it to "
-        "another disk."
-    )

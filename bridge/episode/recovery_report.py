@@ -135,11 +135,7 @@ class RecoveryTally:
         return "; ".join(parts)
 
     def report(self, path: Path, output: Path | None, *, finished: bool) -> RecoveryReport:
-        """Say what was done with a file.
-
-        Args:
-            output: The finished episode; None when there is none.
-        """
+        """Say what was done with a file."""
         counts: dict[str, int] = {}
         last: dict[str, int] = {}
         for channel_id, count in self.messages.items():

@@ -28,11 +28,7 @@ def check_episode_id(episode_id: str) -> str:
 
 
 def part_name(episode_id: str, index: int) -> str:
-    """Return the file name of one part of an episode; the first, number 1, carries the bare id.
-
-    Args:
-        index: Number of the part, from 1.
-    """
+    """Return the file name of one part of an episode; the first, number 1, carries the bare id."""
     return f"{episode_id}.mcap" if index == 1 else f"{episode_id}.{index}.mcap"
 
 

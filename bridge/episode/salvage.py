@@ -44,21 +44,21 @@ def key_of(found: Chunk | CutChunk) -> tuple[int, int]:
 
 
 def scan_with_journal(source: RecordFile, journal: RecordFile | None) -> Iterator[Found]:
-    """Return what a part holds, then the chunks that only its journal holds.
+    """Return what a part holds, each chunk once, then the chunks that only its journal holds.
 
     A chunk torn at the end of the part is left out where the journal has it whole.
     """
-    if journal is None:
-        yield from scan(source)
-        return
-    kept = {key_of(found) for found in scan(journal) if isinstance(found, Chunk)}
+    written = list(scan(journal)) if journal is not None else []
+    kept = {key_of(found) for found in written if isinstance(found, Chunk)}
     there: set[tuple[int, int]] = set()
     for found in scan(source):
         if isinstance(found, Chunk):
+            if found.head.crc and key_of(found) in there:
+                continue
             there.add(key_of(found))
         if not (isinstance(found, CutChunk) and key_of(found) in kept):
             yield found
-    for found in scan(journal):
+    for found in written:
         if isinstance(found, Chunk) and key_of(found) not in there:
             there.add(key_of(found))
             yield found

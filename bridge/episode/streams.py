@@ -151,11 +151,7 @@ def camera_info(episode: Episode, camera_id: str, stream: str = "color") -> Came
 def rgbd_frames(
     episode: Episode, camera_id: str, tree: TransformTree | None = None
 ) -> Iterator[RgbdFrame]:
-    """Yield posed frames in time order; colour without depth nearby is passed over.
-
-    Args:
-        tree: The episode's frames where they are known; None reads them from it.
-    """
+    """Yield posed frames in time order; colour without depth nearby is passed over."""
     tree = transform_tree(episode) if tree is None else tree
     color_info = camera_info(episode, camera_id, "color")
     depth_info = camera_info(episode, camera_id, "depth")
@@ -203,7 +199,8 @@ def joint_track(episode: Episode, ending: str = JOINT_STATES) -> JointTrack:
     topics = [
         topic for topic in episode.topics_of_type(schema.JOINT_STATE) if topic.endswith(ending)
     ]
-    track = joint_track_of([message.data for message in episode.messages(topics)])
+    messages = (m for m in episode.messages(topics) if m.type_name == schema.JOINT_STATE)
+    track = joint_track_of([message.data for message in messages])
     if track is None:
         raise EpisodeError(
             path=episode.path,
@@ -230,17 +227,12 @@ def joint_track_of(payloads: Sequence[bytes]) -> JointTrack | None:
     samples.sort(key=lambda sample: sample.stamp_ns)
     names = max((sample.names for sample in samples), key=len)
     complete = [sample for sample in samples if set(names) <= set(sample.names)]
+    rows = [sample.position[[sample.names.index(name) for name in names]] for sample in complete]
     return JointTrack(
         names=names,
         stamps_ns=np.array([sample.stamp_ns for sample in complete], dtype=np.int64),
-        position=np.stack([_in_order(sample, names) for sample in complete]),
+        position=np.stack(rows),
     )
-
-
-def _in_order(sample: JointSample, names: tuple[str, ...]) -> Float[np.ndarray, " num_joints"]:
-    if sample.names == names:
-        return sample.position
-    return sample.position[[sample.names.index(name) for name in names]]
 
 
 def plans(episode: Episode) -> list[tuple[int, Plan]]:
@@ -348,11 +340,7 @@ def robot_description(episode: Episode) -> str | None:
 
 
 def task_file(episode: Episode, name: str = "") -> TaskFile:
-    """Find the task file an episode was recorded with.
-
-    Args:
-        episode: Recorded, or derived from one; its run's ``tasks/`` lies beside its folder.
-    """
+    """Find the task file an episode was recorded with."""
     info = episode.info
     attached = Attached(info.task_sha256, episode.attachment(ATTACHMENT), episode.path.name)
     tasks_dir = RunFolder(episode.path.absolute().parent.parent).tasks_dir

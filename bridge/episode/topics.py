@@ -97,20 +97,12 @@ def cell_topic(cell: str, ending: str) -> str:
 
 
 def camera_topic(cell: str, camera_id: str, ending: str = "") -> str:
-    """Name a topic of a camera: ``COLOR_IMAGE``, ``DEPTH_INFO`` ...; "" is what all begin with.
-
-    Args:
-        ending: What follows the camera, with its leading slash; "" for the common beginning.
-    """
+    """Name a topic of a camera: ``COLOR_IMAGE``, ``DEPTH_INFO`` ...; "" is what all begin with."""
     return f"/{cell}{CAMERAS}{camera_id}{ending}"
 
 
 def object_topic(cell: str, object_id: str, what: Literal["pose", "nodes"]) -> str:
-    """Name the topic of an object's pose or, of a soft one, of its points.
-
-    Args:
-        what: ``pose`` of the body, or ``nodes``, the points of a soft one.
-    """
+    """Name the topic of an object's pose or, of a soft one, of its points."""
     return f"/{cell}{OBJECTS}{object_id}/{what}"
 
 

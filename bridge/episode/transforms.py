@@ -82,22 +82,14 @@ class TransformTree:
         return stamps
 
     def T_root_frame(self, frame: str, stamp_ns: int) -> Float[np.ndarray, "4 4"]:
-        """Pose of a frame in its root at one instant.
-
-        Args:
-            frame: Name of the frame.
-        """
+        """Pose of a frame in its root at one instant."""
         T: Float[np.ndarray, "4 4"] = self.Ts_root_frame(frame, np.array([stamp_ns]))[0]
         return T
 
     def Ts_root_frame(
         self, frame: str, stamps_ns: Int[np.ndarray, " num_stamps"]
     ) -> Float[np.ndarray, "num_stamps 4 4"]:
-        """Poses of a frame in its root at many instants; raises as ``T_root_frame``.
-
-        Args:
-            frame: Name of the frame.
-        """
+        """Poses of a frame in its root at many instants; raises as ``T_root_frame``."""
         root = self.root_of(frame)
         Ts = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         while frame != root:

@@ -133,11 +133,7 @@ _HEAD_BYTES = 512
 
 
 def is_large(type_name: str, length: int) -> bool:
-    """Say whether a message of this many bytes belongs to a stream with chunks of its own.
-
-    Args:
-        length: Of this message [bytes].
-    """
+    """Say whether a message of this many bytes belongs to a stream with chunks of its own."""
     return type_name in _LARGE_TYPES or length >= LARGE_BYTES
 
 
@@ -265,9 +261,7 @@ class EpisodeWriter:
     ) -> None:
         """Append one serialised message of a type this project knows.
 
-        Args:
-            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
-            sequence: The publisher's number of it; None counts on from the message before.
+        Without a time it was sent when it was logged; without a number it counts on.
         """
         known = schema.schema_for(type_name)
         if known is None:
@@ -293,13 +287,7 @@ class EpisodeWriter:
         sequence: int | None = None,
         about: About = (),
     ) -> None:
-        """Append one message with the given schema, or none; the bytes are kept as they are.
-
-        Args:
-            schema_record: What it is; None where nobody knows.
-            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
-            sequence: The publisher's number of it; None counts on from the message before.
-        """
+        """Append one message with the given schema, or none; the bytes are kept as they are."""
         channel = self._channels.find(topic, schema_record, message_encoding, about)
         length = num_bytes(data) if isinstance(data, Buffer) else sum(map(num_bytes, data))
         if self._pending or self._file.failed:
@@ -384,11 +372,7 @@ class EpisodeWriter:
         log_time_ns: int,
         publish_time_ns: int | None = None,
     ) -> None:
-        """Append one JSON record.
-
-        Args:
-            publish_time_ns: When it was sent [ns since 1970]; None: the log time.
-        """
+        """Append one JSON record."""
         data = json.dumps(record, separators=(",", ":")).encode()
         self.write(
             topic,
@@ -399,11 +383,7 @@ class EpisodeWriter:
         )
 
     def attach(self, name: str, data: bytes, *, media_type: str, log_time_ns: int) -> None:
-        """Add an attachment, for example ``robot.urdf``; it is in the file at once.
-
-        Args:
-            log_time_ns: When it was recorded [ns since 1970]; taken as the time it was made, too.
-        """
+        """Add an attachment, for example ``robot.urdf``; it is in the file at once."""
         self.wait_for_disk()
         self._section.add_attachment(
             name,
@@ -425,12 +405,7 @@ class EpisodeWriter:
         outcome: metadata.Outcome | None = None,
         derived: metadata.Derived | None = None,
     ) -> None:
-        """Add the ``episode`` and ``software`` records, and the others where given.
-
-        Args:
-            outcome: How it ended; None when that is not known yet.
-            derived: What it was made from; None for a recording.
-        """
+        """Add the ``episode`` and ``software`` records, and the others where given."""
         self.add_metadata("episode", metadata.to_strings(info))
         self.add_metadata("software", provenance.software())
         if outcome is not None:

@@ -109,11 +109,7 @@ class TableKind:
     not_ending: tuple[str, ...] = field(default=())
 
     def takes(self, topic: str, type_name: str) -> bool:
-        """Say whether a topic's messages belong into this file.
-
-        Args:
-            topic: With its leading slash; the truth of a stand-in cell never belongs into a file.
-        """
+        """Say whether a topic's messages belong into this file."""
         return (
             type_name == self.type_name
             and topic.endswith(self.ending)
@@ -314,7 +310,7 @@ def _write_messages(name: str, episode: Episode, sheets: dict[str, _Sheet]) -> N
         topic: kind
         for topic, summary in episode.topics().items()
         for kind in TABLES
-        if kind.takes(topic, summary.type_name)
+        if any(kind.takes(topic, name) for name in summary.types or (summary.type_name,))
     }
     for kind, cells in _rows(name, episode, taken):
         sheets[kind.name].write(cells)

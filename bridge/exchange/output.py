@@ -8,20 +8,17 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.reader import Episode
 from bridge.errors import BridgeError, EpisodeError, UsageError
+from bridge.terminal import Output
 
 
 @contextmanager
 def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
-    """Name the message in whatever goes wrong in the block; ``number`` counts from 1.
-
-    Args:
-        number: The message's place among those read, from 1.
-    """
+    """Name the message in whatever goes wrong in the block; ``number`` counts from 1."""
     try:
         yield
     except BridgeError as error:
@@ -30,6 +27,24 @@ def message_named(episode: Episode, topic: str, number: int) -> Iterator[None]:
             found=f"message {number} of {topic}: {error}",
             hint="robot-gst check lists everything that is wrong with it.",
         ) from error
+
+
+class Unused(NamedTuple):
+    """Something that came in and that no command will use."""
+
+    what: str
+    why: str
+    is_needed: bool = False
+    """Whether a later command asks for what it would have been."""
+
+
+def tell_unused(output: Output, unused: Iterable[Unused]) -> int:
+    """Say what was not used; return 3 where a later command needs some of it, else 0."""
+    code = 0
+    for item in unused:
+        output.say(f"  not used: {item.what}: {item.why}")
+        code = 3 if item.is_needed else code
+    return code
 
 
 NOTE_NAME = "robot_gst_export.json"
@@ -93,11 +108,7 @@ def _sync(folder: Path) -> None:
 
 
 def write_note(folder: Path, *, made_by: str, sources: list[Path], choices: dict[str, Any]) -> None:
-    """Write what the folder is made of: sources with their hashes, software, every choice.
-
-    Args:
-        choices: Whatever else decided about the result; must be JSON.
-    """
+    """Write what the folder is made of: sources with their hashes, software, every choice."""
     record = {
         "made_by": made_by,
         "software": software(),

@@ -111,9 +111,6 @@ def save_review(
     """Save a label, or take it away, unless somebody else changed it meanwhile.
 
     It is on disk when this returns. Processes and threads that save at once wait for each other.
-
-    Args:
-        review: The label; None takes it away.
     """
     path = _path(run_path, trial_id, rater)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -74,11 +74,7 @@ def export_tum(
     force: bool,
     advance: Advance,
 ) -> list[CameraReport]:
-    """Write one camera into ``out`` itself, several into one folder each.
-
-    Args:
-        camera: Only this camera; None for all.
-    """
+    """Write one camera into ``out`` itself, several into one folder each."""
     known = camera_ids(episode)
     wanted = known if camera is None else [camera]
     if not wanted or not set(wanted) <= set(known):

@@ -9,7 +9,7 @@ how often a topic was silent) is kept in the metadata record ``source``. Layout 
 import heapq
 import json
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from bridge.episode.provenance import hash_file
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import EpisodeError, MissingDependencyError, PathNotFoundError
-from bridge.exchange.output import is_of_stand_in
+from bridge.exchange.driver_names import mapped
+from bridge.exchange.output import Unused, is_of_stand_in
 from bridge.exchange.rosbag2_storage import (
     SQLITE_MAGIC,
     BagFormatError,
@@ -53,6 +54,9 @@ class ImportReport:
     files: list[str]
     messages: int
     topics: dict[str, int]
+    names: dict[str, str]
+    """New names of topics that had those of a camera's driver."""
+    unused: list[Unused]
 
 
 def find_files(source: Path) -> list[Path]:
@@ -132,6 +136,7 @@ def import_bag(
     *,
     episode_id: str,
     task: str = "",
+    remap: Sequence[str] = (),
     advance: Callable[[int, str], None] = lambda done, note: None,
 ) -> ImportReport:
     """Write a bag as one episode, a trial where it is of a task; on any error none is left.
@@ -139,6 +144,7 @@ def import_bag(
     Args:
         source: A file, or a folder with ``metadata.yaml`` or several files.
         task: Name of the task it is a trial of; "": it is not known to be one.
+        remap: OLD=NEW of topics; without any, those of known camera drivers are renamed.
     """
     check_episode_id(episode_id)
     sources = find_files(source)
@@ -147,7 +153,7 @@ def import_bag(
         try:
             stand_in = is_of_stand_in(source)
             info = imported_info(episode_id, task, tags=("rosbag2",), stand_in=stand_in)
-            return _import(bag, sources, run, info, advance)
+            return _import(bag, sources, run, info, mapped(bag.types(), remap), advance)
         finally:
             bag.close()
 
@@ -157,16 +163,19 @@ def _import(
     sources: list[Path],
     run: RunFolder,
     info: EpisodeInfo,
+    names: dict[str, str],
     advance: Callable[[int, str], None],
 ) -> ImportReport:
     writer = EpisodeWriter(run.episodes_dir / f"{info.id}.mcap")
     counts: dict[str, int] = {}
+    unread: dict[str, Unused] = {}
     try:
         writer.describe(info)
         bag.copy_attachments(writer)
         for done, item in enumerate(bag.messages(), start=1):
+            topic = names.get(item.topic, item.topic)
             writer.write_foreign(
-                item.topic,
+                topic,
                 item.data,
                 schema_record=item.record,
                 message_encoding=item.message_encoding,
@@ -174,22 +183,39 @@ def _import(
                 publish_time_ns=item.publish_time_ns,
                 sequence=item.sequence,
             )
-            counts[item.topic] = counts.get(item.topic, 0) + 1
+            if topic not in counts and (why := _why_unread(item)):
+                unread[topic] = why
+            counts[topic] = counts.get(topic, 0) + 1
             if done % 1000 == 0:
-                advance(done, item.topic)
+                advance(done, topic)
         about = bag.copy_metadata(writer)
         about["files"] = [
             {"name": path.name, "sha256": hash_file(path), **more}
             for path, more in zip(sources, about["files"], strict=True)
         ]
+        about["renamed"] = names
         values = {name: json.dumps(value) for name, value in about.items()}
         writer.add_metadata("source", values)
         path = writer.close()
     except BaseException:
         writer.discard()
         raise
-    names = [path.name for path in sources]
-    return ImportReport(path=path, files=names, messages=sum(counts.values()), topics=counts)
+    unused = [why._replace(what=f"{topic} ({counts[topic]})") for topic, why in unread.items()]
+    return ImportReport(
+        path=path, files=[path.name for path in sources], messages=sum(counts.values()),
+        topics=counts, names=names, unused=unused,
+    )  # fmt: skip
+
+
+def _why_unread(item: BagMessage) -> Unused | None:
+    """Why no command reads a topic, by its first message."""
+    if item.message_encoding == "ros1":
+        why = "ROS 1 messages are kept and not read; convert the recording with rosbags-convert"
+        return Unused(item.topic, why, is_needed=True)
+    name = item.record.name if item.record else ""
+    if not name or schema.schema_for(name) is None:
+        return Unused(item.topic, f"kept; no command reads {name or 'messages without a type'}")
+    return None
 
 
 def count_messages(source: Path) -> int:
@@ -205,8 +231,11 @@ def count_messages(source: Path) -> int:
 
 def _open_bag(paths: list[Path]) -> "_McapBag | _SqliteBags":
     with paths[0].open("rb") as stream:
-        is_database = stream.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
-    return _SqliteBags(paths) if is_database else _McapBag(paths)
+        start = stream.read(len(SQLITE_MAGIC))
+    if start.startswith(b"#ROSBAG"):
+        hint = f"Convert it: rosbags-convert --src {paths[0]} --dst {paths[0].stem}"
+        raise BagFormatError(path=paths[0], found="a ROS 1 bag", hint=hint)
+    return _SqliteBags(paths) if start == SQLITE_MAGIC else _McapBag(paths)
 
 
 def _open_mcap(path: Path) -> McapFile:
@@ -234,6 +263,10 @@ class _SqliteBags:
         yield from heapq.merge(
             *(bag.messages() for bag in self._bags), key=lambda item: item.log_time_ns
         )
+
+    def types(self) -> dict[str, str]:
+        topics = (topic for bag in self._bags for topic in bag.topics.values())
+        return {topic.name: topic.record.name for topic in topics}
 
     def copy_attachments(self, writer: EpisodeWriter) -> None:
         """A database has none."""
@@ -264,7 +297,7 @@ class _McapBag:
         for item in merged(self._files, Selection()):
             key = (id(item.file), item.channel.id)
             if key not in schemas:
-                schemas[key] = _schema_of(item.file, item.channel)
+                schemas[key] = schema_of(item.file, item.channel)
             is_cdr = item.channel.message_encoding == "cdr"
             yield BagMessage(
                 item.channel.topic,
@@ -276,14 +309,39 @@ class _McapBag:
                 unpack_message(item.file.path, item.data) if is_cdr else item.data,
             )
 
+    def types(self) -> dict[str, str]:
+        found = ((f, channel) for f in self._files for channel in f.summary.channels.values())
+        return {
+            channel.topic: record.name
+            for file, channel in found
+            if (record := file.schema_of(channel)) is not None
+        }
+
     def copy_attachments(self, writer: EpisodeWriter) -> None:
-        _copy_attachments(self._files, writer)
+        copy_attachments(self._files, writer)
 
     def copy_metadata(self, writer: EpisodeWriter) -> dict[str, Any]:
-        return _copy_metadata(self._files, writer)
+        files = self._files
+        for file in files:
+            for record in file.metadata:
+                prefix = "source." if record.name in OWN_RECORDS else ""
+                writer.add_metadata(prefix + record.name, record.metadata)
+        headers = [(file.header.profile, file.header.library) for file in files]
+        return {
+            "format": "rosbag2 MCAP",
+            "files": [{"profile": profile, "library": library} for profile, library in headers],
+            "channels": {
+                channel.topic: channel.metadata
+                for file in files
+                for channel in file.summary.channels.values()
+                if channel.metadata
+            },
+            "silent_topics": sorted(_silent(files)),
+        }
 
 
-def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
+def schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None:
+    """What a channel of a file carries; None where nobody says."""
     record = file.schema_of(channel)
     if record is None:
         return None
@@ -295,7 +353,8 @@ def _schema_of(file: McapFile, channel: records.Channel) -> schema.Schema | None
     )
 
 
-def _copy_attachments(files: list[McapFile], writer: EpisodeWriter) -> None:
+def copy_attachments(files: Sequence[McapFile], writer: EpisodeWriter) -> None:
+    """Copy what is attached to some files into an episode."""
     for file in files:
         try:
             for item in file.attachments():
@@ -304,26 +363,6 @@ def _copy_attachments(files: list[McapFile], writer: EpisodeWriter) -> None:
                 )
         except DAMAGE as error:
             raise damaged(file.path, error) from error
-
-
-def _copy_metadata(files: list[McapFile], writer: EpisodeWriter) -> dict[str, Any]:
-    for file in files:
-        for record in file.metadata:
-            prefix = "source." if record.name in OWN_RECORDS else ""
-            writer.add_metadata(prefix + record.name, record.metadata)
-    return {
-        "format": "rosbag2 MCAP",
-        "files": [
-            {"profile": file.header.profile, "library": file.header.library} for file in files
-        ],
-        "channels": {
-            channel.topic: channel.metadata
-            for file in files
-            for channel in file.summary.channels.values()
-            if channel.metadata
-        },
-        "silent_topics": sorted(_silent(files)),
-    }
 
 
 def _silent(files: list[McapFile]) -> set[str]:

@@ -21,6 +21,7 @@ from bridge.episode.topics import is_latched, is_truth
 from bridge.episode.writer import EpisodeWriter
 from bridge.errors import UsageError
 from bridge.exchange.output import new_folder, write_note
+from bridge.exchange.rosbag2 import copy_attachments, schema_of
 
 ROS_TEXTS = ("ros2msg", "ros2idl")
 BAG_VERSION = 8
@@ -76,7 +77,7 @@ def export_bag(
     with new_folder(out, force=force) as folder:
         name = f"{out.name}_0.mcap"
         with EpisodeWriter(folder / name) as writer:
-            _copy_attachments(episode, writer)
+            copy_attachments(episode.files, writer)
             bag = _copy_messages(episode, writer, channels, advance)
         for (topic, _), channel in bag.items():
             report.topics[topic] = report.topics.get(topic, 0) + channel.count
@@ -130,26 +131,15 @@ def _channel(file: McapFile, channel: records.Channel, left_out: dict[str, str])
     """What a channel is in the bag; None where it has no place in one, and why is noted."""
     if is_truth(channel.topic):
         return None
-    record = file.schema_of(channel)
+    record = schema_of(file, channel)
     if channel.message_encoding != "cdr":
         left_out[channel.topic] = f"{channel.message_encoding or 'bytes'}, not ROS 2"
         return None
-    if record is None or record.encoding not in ROS_TEXTS or not record.data:
+    if record is None or record.schema_encoding not in ROS_TEXTS:  # no text: a type without fields
         named = record.name if record else "a type without a name"
         left_out[channel.topic] = f"no definition of {named}"
         return None
-    made = schema.Schema(
-        name=record.name, schema_encoding=record.encoding, message_encoding="cdr", data=record.data
-    )
-    return _Channel(topic=channel.topic, record=made, profile=_profile(channel.topic))
-
-
-def _copy_attachments(episode: Episode, writer: EpisodeWriter) -> None:
-    for file in episode.files:
-        for item in file.attachments():
-            writer.attach(
-                item.name, item.data, media_type=item.media_type, log_time_ns=item.log_time
-            )
+    return _Channel(topic=channel.topic, record=record, profile=_profile(channel.topic))
 
 
 def _metadata(name: str, bag: Bag) -> Iterator[str]:

@@ -96,11 +96,7 @@ class SourceRow:
         return (self.values.get(name) or "").strip()
 
     def refuse(self, found: str, hint: str) -> TableError:
-        """Build the error that names this row.
-
-        Args:
-            found: What is wrong, such as ``unit 'trial' in task 'a'``.
-        """
+        """Build the error that names this row."""
         return TableError(path=self.path, row=self.row, found=found, hint=hint)
 
     def whole(self, name: str) -> int | None:
@@ -332,11 +328,7 @@ def _refuse_slips(table: TableText, known: Sequence[str]) -> None:
 
 
 def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> TableText:
-    """Refuse a table that lacks a column.
-
-    Args:
-        required: Columns that must be there.
-    """
+    """Refuse a table that lacks a column."""
     if not table.header:
         hint = f"Columns: {', '.join(known)}"
         raise TableError(path=table.path, row=None, found="empty", hint=hint)
@@ -355,11 +347,7 @@ def require(table: TableText, required: Sequence[str], known: Sequence[str]) -> 
 def read_rows(
     path: Path, required: Sequence[str], known: Sequence[str], options: TableOptions = AS_SAVED
 ) -> list[SourceRow]:
-    """Read a table with a header.
-
-    Args:
-        required: Columns that must be there.
-    """
+    """Read a table with a header."""
     return rows_of(require(open_table(path, known, options), required, known))
 
 

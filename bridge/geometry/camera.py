@@ -25,16 +25,7 @@ class Camera:
     def from_ros(
         *, width: int, height: int, fx: float, fy: float, cx: float, cy: float
     ) -> "Camera":
-        """Read intrinsics whose pixel centres are at whole numbers (ROS, OpenCV).
-
-        Args:
-            width: Of the image [pixels].
-            height: Of the image [pixels].
-            fx: Focal length along x [pixels].
-            fy: Focal length along y [pixels].
-            cx: Principal point along x, 0 at the centre of the first column [pixels].
-            cy: Principal point along y, 0 at the centre of the first row [pixels].
-        """
+        """Read intrinsics whose pixel centres are at whole numbers (ROS, OpenCV)."""
         return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5)
 
     def to_ros(self) -> tuple[float, float, float, float]:

@@ -15,12 +15,7 @@ from bridge.errors import InvalidRecordError
 def transform_from(
     q_wxyz: Float[np.ndarray, "*batch 4"], p_m: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Build ``T_a_b`` from the rotation ``q_a_b_wxyz`` and the origin ``p_a_b`` [m].
-
-    Args:
-        q_wxyz: Rotation of frame b in frame a, of unit length.
-        p_m: Origin of frame b in frame a [m].
-    """
+    """Build ``T_a_b`` from the rotation ``q_a_b_wxyz`` and the origin ``p_a_b`` [m]."""
     T = np.zeros((*q_wxyz.shape[:-1], 4, 4))
     T[..., :3, :3] = rotation_from_quaternion(q_wxyz)
     T[..., :3, 3] = p_m
@@ -101,12 +96,7 @@ def invert(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"
 def apply(
     T_a_b: Float[np.ndarray, "4 4"], p_b: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Carry points from frame b to frame a [m].
-
-    Args:
-        T_a_b: Pose of frame b in frame a.
-        p_b: Points in frame b [m].
-    """
+    """Carry points from frame b to frame a [m]."""
     return np.asarray(p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
@@ -129,13 +119,7 @@ def interpolate_quaternion(
     q_end_wxyz: Float[np.ndarray, "*batch 4"],
     fraction: Float[np.ndarray, "*batch"],
 ) -> Float[np.ndarray, "*batch 4"]:
-    """Interpolate along the shorter arc at constant angular speed (Shoemake 1985).
-
-    Args:
-        q_start_wxyz: Rotation at fraction 0, of unit length.
-        q_end_wxyz: Rotation at fraction 1, of unit length.
-        fraction: Share of the way, 0 to 1.
-    """
+    """Interpolate along the shorter arc at constant angular speed (Shoemake 1985)."""
     dot = np.sum(q_start_wxyz * q_end_wxyz, axis=-1)
     q_end = np.where(dot[..., None] < 0, -q_end_wxyz, q_end_wxyz)
     angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))

@@ -24,9 +24,6 @@ def lag_of_least_cost(
     """Choose the lag at which two signals differ least [s].
 
     Of lags that fit equally well the smallest is taken: a motion that hardly moves has none.
-
-    Args:
-        equal: Costs above the least one by at most this count as equal to it.
     """
     near = lags_s[costs <= costs.min() + equal]
     return float(near[np.argmin(np.abs(near))])

@@ -45,12 +45,6 @@ def encode_jpeg(
 ) -> bytes:
     """Compress an sRGB image as JPEG.
 
-    Args:
-        image_u8: The image; its rows may lie apart in memory.
-        quality: 1 to 100.
-        layout: Order of the channels: RGB, BGR, RGBA, BGRA or GRAY.
-        subsampling: Of colour: 444 keeps all of it, 420 halves it in both directions.
-
     Raises:
         ValueError: The image is larger than JPEG allows (65500), or empty.
     """
@@ -84,7 +78,10 @@ def decode_color(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     if data[:2] == JPEG_MAGIC:
         return _decode_jpeg(data)
     with open_image(data) as image:
-        return np.asarray(image.convert("RGB"))
+        if not image.mode.startswith("I"):
+            return np.asarray(image.convert("RGB"))
+        grey = np.rint(np.asarray(image).astype(np.float32) / 257).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=2)
 
 
 @contextmanager

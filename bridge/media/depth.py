@@ -9,6 +9,7 @@ from jaxtyping import Float32, UInt8, UInt16
 from bridge.errors import BridgeError
 from bridge.media.color import MAX_PIXELS, UnreadableImageError, open_image
 
+_BITS = {"L": "8 bits", "P": "8 bits and a palette", "RGB": "8 bits in 3 channels", "1": "1 bit"}
 ROTATED_ENCODING = "rotated3"
 """The bits of each value are rotated right by three (APC 2016 files)."""
 
@@ -17,7 +18,8 @@ def decode_depth_png(data: bytes) -> UInt16[np.ndarray, "height width"]:
     """Decode a 16-bit greyscale PNG to its stored numbers."""
     with open_image(data) as image:
         if not image.mode.startswith("I"):
-            raise UnreadableImageError(found=f"depth image has mode {image.mode}, need 16 bit")
+            found = f"depth has {_BITS.get(image.mode, image.mode)}"
+            raise UnreadableImageError(found=found, expected="a 16-bit PNG of one channel")
         return np.asarray(image).astype(np.uint16)
 
 
@@ -33,11 +35,7 @@ def to_millimetres(
     invalid_values: Iterable[int] = (0,),
     encoding: str = "",
 ) -> UInt16[np.ndarray, "height width"]:
-    """Apply a folder's decode rules; every invalid code becomes 0.
-
-    Args:
-        encoding: ``ROTATED_ENCODING`` where bits are rotated; "" for plain numbers.
-    """
+    """Apply a folder's decode rules; every invalid code becomes 0."""
     values = undo_rotation(stored) if encoding == ROTATED_ENCODING else stored
     invalid = np.isin(stored, list(invalid_values)) | (values == 0)
     millimetres = np.rint(values * (unit_m * 1e3))
@@ -57,7 +55,7 @@ def from_metres(
     return np.where(is_valid, millimetres, 0).astype(np.uint16)
 
 
-# Every image starts with 12 bytes that matter to 32-bit depth only (an int32 and two float32).
+# Every image starts with 12 bytes: an int32, and two float32 that matter to depth in metres only.
 # RVL then states its columns and rows (int32) before the nibble stream; PNG follows as a file.
 # RVL is Wilson, "Fast lossless depth image compression" (2017): runs of zeros and of measurements
 # alternate; each run is its length, each measurement the zigzag difference to the one before it;
@@ -93,7 +91,7 @@ def pack_rvl(rows: UInt8[np.ndarray, "height row"], *, swap_bytes: bool = False)
 
 
 def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]:
-    """Decode a compressed depth image to its stored numbers.
+    """Decode a compressed depth image to its stored numbers; metres become millimetres.
 
     Args:
         image_format: As the CompressedImage states it; without ``rvl`` it is PNG. A bare PNG file
@@ -103,11 +101,15 @@ def unpack(image_format: str, data: bytes) -> UInt16[np.ndarray, "height width"]
         return _unpack_png(data)
     encoding, _, transport = image_format.partition(";")
     kind = transport.replace("compressedDepth", "").strip()
-    if encoding.strip() not in ("16UC1", "mono16") or kind not in ("rvl", "png", ""):
+    if encoding.strip() not in ("16UC1", "mono16", "32FC1") or kind not in ("rvl", "png", ""):
         raise _unreadable(f"format {image_format[:80]!r}")
-    if kind == "rvl":
-        return _unpack_rvl(data)
-    return _unpack_png(data[len(_CONFIG) :])
+    stored = _unpack_rvl(data) if kind == "rvl" else _unpack_png(data[len(_CONFIG) :])
+    if encoding.strip() != "32FC1":
+        return stored
+    _, scale, shift = struct.unpack_from("<iff", data)  # stored is scale / metres + shift
+    with np.errstate(divide="ignore"):
+        depth_m = np.float32(scale) / (stored.astype(np.float32) - np.float32(shift))
+    return from_metres(np.where(stored == 0, np.float32(0), depth_m))
 
 
 def _unpack_png(data: bytes) -> UInt16[np.ndarray, "height width"]:

@@ -54,11 +54,6 @@ def psnr_db(
     The replayed axes carry their own names, so that a wrong size gets our message.
 
     Range: 0 dB and up for images in 0..1, higher is better. Undefined when: the images are equal.
-
-    Args:
-        recorded: In 0..1.
-        replayed: In 0..1.
-        mask: Pixels that count; None: all.
     """
     check_same_shape(recorded, replayed)
     squared = (recorded - replayed) ** 2
@@ -80,13 +75,7 @@ def aligned(
     ),
     alignment: Alignment,
 ) -> Float[np.ndarray, "height width 3"]:
-    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets.
-
-    Args:
-        recorded_u8: The one to come near to: 8 bits, or numbers in 0..1.
-        replayed_u8: The one to brighten: 8 bits, or numbers in 0..1.
-        alignment: ``raw`` changes nothing, ``gain`` fits a factor.
-    """
+    """Brighten the replayed image, channel by channel, as near to the recorded one as it gets."""
     check_same_shape(recorded_u8, replayed_u8)
     replayed = as_float(replayed_u8)
     if alignment == "raw":
@@ -168,11 +157,7 @@ class SsimMaps:
     def mean(
         self, padding: Padding, *, mask: Bool[np.ndarray, "height width"] | None = None
     ) -> float:
-        """Average over pixels and channels; with a mask, over window centres inside it.
-
-        Args:
-            mask: Pixels whose windows count; None: all.
-        """
+        """Average over pixels and channels; with a mask, over window centres inside it."""
         values = {"valid": self.valid, "zero": self.zero, "reflect": self.reflect}[padding]
         if mask is not None:
             inside = mask[BORDER:-BORDER, BORDER:-BORDER] if padding == "valid" else mask
@@ -192,10 +177,6 @@ def ssim_maps(
 
     Gaussian window of 11 x 11 pixels with sigma 1.5, C1 1e-4, C2 9e-4 for images in 0..1,
     population covariance, each channel alone.
-
-    Args:
-        recorded: In 0..1.
-        replayed: In 0..1.
     """
     _refuse_small(recorded, replayed)
     return SsimMaps(

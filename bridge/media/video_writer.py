@@ -37,11 +37,6 @@ class VideoWriter:
     ) -> None:
         """Create the file; sizes that are odd get full chroma, for the usual one needs even.
 
-        Args:
-            path: The file; its folder is made where needed.
-            width: Of every frame [px].
-            height: Of every frame [px].
-
         Raises:
             MissingDependencyError: Without PyAV, or with one that has no encoder for this.
         """
@@ -63,11 +58,7 @@ class VideoWriter:
         self._stream.pix_fmt = self.pix_fmt
 
     def write(self, pixels: np.ndarray, *, first: bool) -> None:
-        """Append one frame; the first of an episode can be decoded without those before it.
-
-        Args:
-            pixels: RGB, height x width x 3 of uint8.
-        """
+        """Append one frame; the first of an episode can be decoded without those before it."""
         frame = self._frame_class.from_ndarray(pixels, format=RGB)
         if first:
             frame.pict_type = self._intra

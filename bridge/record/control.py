@@ -38,11 +38,7 @@ class RecorderClient:
         self._timeout_s = timeout_s
 
     def ask(self, verb: str, request: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Send one command and return the recorder's answer.
-
-        Args:
-            request: Fields of the command; None for none.
-        """
+        """Send one command and return the recorder's answer."""
         key = control_key(self._recorder, verb)
         payload = json.dumps(request or {}).encode()
         answer = json.loads(self._session.query(key, payload, timeout_s=self._timeout_s))
@@ -58,12 +54,7 @@ class RecorderClient:
         *,
         anyway: bool = False,
     ) -> dict[str, Any]:
-        """Begin an episode, with its task file where there is one.
-
-        Args:
-            info: Fields of ``EpisodeInfo`` other than the id; None for a trial of which no more is
-                known.
-        """
+        """Begin an episode, with its task file where there is one."""
         sent = {} if task is None else {"task_file": task.data.decode()}
         request = {"id": episode_id, "info": info or {}, "anyway": anyway, **sent}
         return self.ask("start", request)
@@ -71,11 +62,7 @@ class RecorderClient:
     def stop(
         self, outcome: dict[str, Any] | None = None, *, discard: bool = False
     ) -> dict[str, Any]:
-        """Finish it after everything this session has sent so far.
-
-        Args:
-            outcome: Fields of ``Outcome``; None leaves it as it was labelled.
-        """
+        """Finish it after everything this session has sent so far."""
         return self.ask("stop", {"outcome": outcome, "discard": discard})
 
     def status(self) -> dict[str, Any]:
@@ -187,13 +174,7 @@ def _text(request: dict[str, Any]) -> str:
 
 
 def parse_info(episode_id: Any, info: Any) -> metadata.EpisodeInfo:
-    """Build the episode's description from a request; unknown fields are refused.
-
-    Args:
-        episode_id: As it arrived; must be a string that can name a file.
-        info: As it arrived; a JSON object with fields of ``EpisodeInfo``, ``kind`` a trial if left
-            out.
-    """
+    """Build the episode's description from a request; unknown fields are refused."""
     if not isinstance(episode_id, str):
         raise ControlError(f"start needs an episode id as a string, got {episode_id!r:.80}.")
     check_episode_id(episode_id)

@@ -16,12 +16,14 @@ from bridge.episode.cdr.images import (
     COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
     FLOAT_DEPTH,
+    check_image,
     depth_to_compact,
     image_header,
     image_to_jpeg,
 )
+from bridge.episode.topics import COLOR_TOPIC
 from bridge.record.config import RecorderConfig
-from bridge.record.inspection import GOOD, MessageState, fits, inspect
+from bridge.record.inspection import GOOD, MessageState, inspect
 from bridge.record.queue import REDUCED_QUALITY, Item, LoadShedding
 from bridge.wire.session import WireSample
 
@@ -53,10 +55,9 @@ class ImageEncoder:
             return
         try:
             header = image_header(sample.data)
-            item.finding = GOOD if fits(header) else MessageState.UNDECODABLE
-            if item.finding is GOOD:
-                item.image_encoding = header.encoding
-                self._transcode(item, header.encoding)
+            check_image(sample.topic, header)
+            item.finding, item.image_encoding = GOOD, header.encoding
+            self._transcode(item, header.encoding)
         except MalformedMessageError:
             item.finding = MessageState.UNDECODABLE
 
@@ -69,7 +70,7 @@ class ImageEncoder:
                 if self._shed() >= LoadShedding.COLOR_QUALITY and quality > REDUCED_QUALITY:
                     quality, reduced = REDUCED_QUALITY, True
                 data = image_to_jpeg(item.sample.data, quality)
-        elif encoding in DEPTH_ENCODINGS:
+        elif encoding in DEPTH_ENCODINGS and not COLOR_TOPIC.search(topic):
             self.kinds[topic] = "depth"
             if self._config.depth == "compact":
                 data = depth_to_compact(item.sample.data)

@@ -3,29 +3,36 @@
 import contextlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.episode import metadata, schema
+from bridge.episode import health, metadata, schema
 from bridge.episode.contract import (
     PRESENCE_RECORD,
     RECORD_NAME,
     Contract,
     Span,
     TopicReport,
-    breaches_of,
+    findings_of,
     judge,
-    unknown_tails,
 )
+from bridge.episode.health import ContentWatch, HealthFinding, in_order, of_event
 from bridge.episode.run_folder import SUFFIX
 from bridge.episode.topics import CLOCKS, DROPS, EVENT, cell_topic
 from bridge.episode.writer import EpisodeWriter, WriterConfig
 from bridge.errors import BridgeError, MissingDependencyError
 from bridge.record.clocks import StampJumps
 from bridge.record.config import RecorderConfig
-from bridge.record.inspection import MessageState, inspector, resolve_type, stamp_reader
+from bridge.record.inspection import (
+    GOOD,
+    MessageState,
+    inspector,
+    resolve_type,
+    stamp_reader,
+    why_unreadable,
+)
 from bridge.record.ledger import Ledger
 from bridge.record.presence import News
 from bridge.record.queue import Command, Dropped, Item, second_of
@@ -48,6 +55,7 @@ class Channel:
     """Shared by the channels of a topic."""
     stamp_ns: Callable[[bytes], int | None] | None
     """Reads the time in a message itself, where its type has one."""
+    content: ContentWatch
 
     def later(self, stamp_ns: int) -> int:
         """Log times of a topic never run backwards, also when two threads deliver at once."""
@@ -63,11 +71,7 @@ class Channels:
     def __init__(
         self, max_topics: int, warn: Callable[[str], None], msg_folder: Path | None = None
     ) -> None:
-        """Start empty.
-
-        Args:
-            max_topics: Further ones are refused.
-        """
+        """Start empty."""
         self._msg_folder = msg_folder
         self._max_topics = max_topics
         self._warn = warn
@@ -77,11 +81,7 @@ class Channels:
         self._hashes: dict[str, str] = {}
 
     def of(self, sample: WireSample, type_name: str) -> Channel | None:
-        """Return the channel of a message, or None when there are too many.
-
-        Args:
-            type_name: The type after ``resolve_type``; "" where nobody knows it.
-        """
+        """Return the channel of a message, or None when there are too many."""
         is_defined = sample.definition is not None
         key = (sample.topic, type_name, sample.message_encoding, sample.type_hash, is_defined)
         channel = self._channels.get(key)
@@ -90,12 +90,7 @@ class Channels:
         return channel
 
     def later(self, topic: str, stamp_ns: int) -> int:
-        """Return a log time for a record of our own.
-
-        Args:
-            stamp_ns: Wanted log time [ns since 1970]; a later one is returned rather than one step
-                back.
-        """
+        """Return a log time for a record of our own."""
         last_ns = self._last_ns.setdefault(topic, [0])
         last_ns[0] = max(last_ns[0], stamp_ns)
         return last_ns[0]
@@ -111,7 +106,19 @@ class Channels:
             )
         look = inspector("" if is_strange else type_name, sample.message_encoding)
         last_ns = self._last_ns.setdefault(topic, [0])
-        return Channel(record, look, last_ns, stamp_reader(record))
+        content = ContentWatch(topic, type_name)
+        return Channel(record, look, last_ns, stamp_reader(record), content)
+
+    def findings(self) -> Iterator[HealthFinding]:
+        """What the messages of all topics hold, and which topics carry several types."""
+        types: dict[str, set[str]] = {}
+        for (topic, type_name, *_), channel in list(self._channels.items()):
+            types.setdefault(topic, set()).add(type_name)
+            yield from list(channel.content.findings.values())
+        for topic, names in types.items():
+            if len(names) > 1:
+                text = " and ".join(sorted(name or "no type" for name in names))
+                yield HealthFinding(name="mixed_types", about=topic, text=text)
 
     def _schema(self, sample: WireSample, type_name: str) -> tuple[schema.Schema | None, bool]:
         """The schema to register: a known one, one with a name only, or none; and if it is strange.
@@ -174,19 +181,18 @@ class EpisodeRecording:
         task: TaskFile | None = None,
         clocks: Iterable[dict[str, Any]] = (),
     ) -> None:
-        """Create the episode file and say in it who and what it is.
-
-        Args:
-            others: What else goes into the ``recorder`` record, by name; asked at the end.
-        """
+        """Create the episode file and say in it who and what it is."""
         self.info = info
         self.ledger = Ledger(config.queues.max_topics)
         self.start_ns = start_ns
         self.outcome: metadata.Outcome | None = None
         self.presence: dict[str, TopicReport] = {}
         """By topic, when it was there; known at the end."""
+        self._of_presence: tuple[HealthFinding, ...] = ()
         self.news: list[News] = []
         """What it noticed and a person should hear of."""
+        self._noted: list[HealthFinding] = []
+        self._unreadable: dict[str, str] = {}
         self._jumps = StampJumps()
         self._contract = contract
         self._config = config
@@ -264,13 +270,43 @@ class EpisodeRecording:
         if channel is None:
             self.ledger.count_refused(item)
             return
-        finding = item.finding or channel.inspect(item.sample.data)
+        is_known = channel.content.knows(item.sample.data)
+        finding = GOOD if is_known else item.finding or channel.inspect(item.sample.data)
+        self._look(channel, item, finding, is_known=is_known)
         try:
             self._append(channel, item.sample, item.sample.received_ns, item.image_encoding)
         except OSError:
             self.ledger.count_refused(item)
             raise
         self.ledger.count_received(item, finding)
+
+    def _look(self, channel: Channel, item: Item, finding: MessageState, *, is_known: bool) -> None:
+        """Tell of what is wrong with a message, once for each topic and kind."""
+        topic, data = item.sample.topic, item.sample.data
+        if finding is MessageState.UNDECODABLE and topic not in self._unreadable:
+            why = self._unreadable[topic] = why_unreadable(topic, item.type_name, data)
+            text = f"{topic}: messages cannot be read: {why}"
+            told = {"kind": "unreadable", "topic": topic}
+            self.news.append(News(text=text, data=told, warns=True))
+        if channel.content.is_of_use and finding is GOOD:
+            found = channel.content.see(data, item.sample.received_ns, is_known=is_known)
+            if found is not None:
+                told = {"kind": found.name, "topic": topic}
+                self.news.append(News(text=found.line(), data=told, warns=True))
+
+    def findings(self) -> list[HealthFinding]:
+        """What is wrong with the episode so far; of presence at the end only."""
+        found = [*self._channels.findings(), *self._noted]
+        for topic, tally in self.ledger.totals().items():
+            if tally.lost:
+                found.append(
+                    HealthFinding(name="drops_logged", about=topic, text=f"{tally.lost} messages")
+                )
+            if tally.undecodable:
+                count = f"{tally.undecodable} of {tally.received} messages"
+                text = f"{count} cannot be read: {self._unreadable.get(topic, '')}"
+                found.append(HealthFinding(name="unreadable", about=topic, text=text))
+        return in_order([*found, *self._of_presence])
 
     def _append(
         self, channel: Channel, sample: WireSample, stamp_ns: int, image_encoding: str = ""
@@ -327,14 +363,7 @@ class EpisodeRecording:
         outcome: metadata.Outcome | None = None,
         data: dict[str, Any] | None = None,
     ) -> None:
-        """Append a mark or a label to the cell's events; a label is the outcome from now on.
-
-        Args:
-            kind: One of the types of the event schema, such as ``mark`` or ``label``.
-            text: Free text; "" for none.
-            outcome: Of a label; None leaves the episode's outcome as it is.
-            data: Fields of this kind of event; None for none.
-        """
+        """Append a mark or a label to the cell's events; a label is the outcome from now on."""
         record: dict[str, Any] = {"schema_version": 1, "stamp_ns": stamp_ns, "type": kind}
         if text:
             record["text"] = text
@@ -342,17 +371,13 @@ class EpisodeRecording:
             record["data"] = data
         if outcome is not None:
             record["outcome"] = asdict(outcome)
+        self._noted += of_event(record)
         topic = cell_topic(self.info.cell or "recorder", EVENT)
         self._write_json(topic, record, schema.EVENT, stamp_ns)
         self.outcome = outcome or self.outcome
 
     def note_clock_step(self, step_ns: int, *, stamp_ns: int) -> None:
-        """Write down that the system clock has jumped; log times have not.
-
-        Args:
-            step_ns: How far it jumped, forwards positive.
-            stamp_ns: When that was seen, on the clock that does not jump [ns since 1970].
-        """
+        """Write down that the system clock has jumped; log times have not."""
         self._clock_steps_ns.append(step_ns)
         self.write_event("clock_step", stamp_ns=stamp_ns, data={"step_ns": step_ns})
 
@@ -389,9 +414,6 @@ class EpisodeRecording:
         """Write the accounts, finish the file and give it its final name.
 
         May be called again after an OSError, when there is space.
-
-        Args:
-            outcome: How it ended; None: as it was labelled last.
         """
         self._write_ledger(None, end_ns, health)
         if not self._is_summed_up:
@@ -425,14 +447,16 @@ class EpisodeRecording:
         self.presence = judge(
             self.ledger.presences, self._contract, span, lost, by_habit=not self.info.stand_in
         )
+        presences = self.ledger.presences
+        self._of_presence = tuple(findings_of(self.presence, presences, span.end_ns))
         record = {
             "topics": {topic: asdict(report) for topic, report in self.presence.items()},
-            "breaches": breaches_of(self.presence),
-            "unknown_tails": unknown_tails(self.presence),
             "unnumbered": self.ledger.unnumbered(),
         }
         values = {name: json.dumps(value) for name, value in record.items()}
         self._writer.add_metadata(PRESENCE_RECORD, values)
+        told = json.dumps([asdict(finding) for finding in self.findings()])
+        self._writer.add_metadata(health.RECORD_NAME, {"findings": told})
 
     def discard(self) -> None:
         """Remove the file: the take was not wanted."""

@@ -12,10 +12,12 @@ from functools import lru_cache
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr import codec
-from bridge.episode.cdr.images import DEPTH_ENCODINGS, FLOAT_DEPTH, ImageHeader, image_header
+from bridge.episode.cdr.images import check_image, image_header
 from bridge.episode.topics import type_of_topic
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+IMAGE_STARTS = (_JPEG_START, b"\x89P", b"RI", b"II", b"MM", b"BM")
+"""Of JPEG, PNG, WebP, TIFF and BMP."""
 _TAIL_BYTES = 64
 """Cameras may pad a JPEG behind its end mark."""
 
@@ -33,31 +35,18 @@ GOOD = MessageState.GOOD
 
 
 def resolve_type(topic: str, type_name: str) -> str:
-    """Trust the publisher's type name; without one, go by the topic.
-
-    Args:
-        type_name: As the publisher says; "" for unknown.
-    """
+    """Trust the publisher's type name; without one, go by the topic."""
     return type_name or type_of_topic(topic) or ""
 
 
 def inspect(type_name: str, message_encoding: str, data: bytes) -> MessageState:
-    """Check a message without building anything from it.
-
-    Args:
-        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
-    """
+    """Check a message without building anything from it."""
     return inspector(type_name, message_encoding)(data)
 
 
 @lru_cache(maxsize=4096)
 def inspector(type_name: str, message_encoding: str) -> Callable[[bytes], MessageState]:
-    """Return the check for the messages of one type.
-
-    Args:
-        type_name: As ``resolve_type`` gives it; "" for unknown.
-        message_encoding: As the publisher says, such as ``cdr``; "" for unknown.
-    """
+    """Return the check for the messages of one type."""
     known = schema.schema_for(type_name) if type_name else None
     if known is None:
         return lambda data: MessageState.UNKNOWN_TYPE
@@ -90,24 +79,29 @@ def _header_stamp_ns(data: bytes) -> int | None:
 def _inspect_cdr(type_name: str, data: bytes) -> MessageState:
     try:
         if type_name == schema.IMAGE:
-            return GOOD if fits(image_header(data)) else MessageState.UNDECODABLE
+            check_image("", image_header(data))
+            return GOOD
         message = codec.decode(type_name, data)
     except codec.MalformedMessageError:
         return MessageState.UNDECODABLE
     if type_name == schema.COMPRESSED_IMAGE:
         image = message["data"]
         is_cut = image[:2] == _JPEG_START and _JPEG_END not in bytes(image[-_TAIL_BYTES:])
-        return MessageState.UNDECODABLE if is_cut else GOOD
+        is_known = image[:2] in IMAGE_STARTS or "compressedDepth" in message["format"]
+        return GOOD if is_known and not is_cut else MessageState.UNDECODABLE
     return GOOD
 
 
-def fits(header: ImageHeader) -> bool:
-    """Say whether an image has as many bytes as its size and step ask for."""
-    if len(header.pixels) != header.height * header.step:
-        return False
-    pixel_bytes = 4 if header.encoding == FLOAT_DEPTH else 2
-    is_depth = header.encoding in (*DEPTH_ENCODINGS, FLOAT_DEPTH)
-    return not is_depth or header.step >= pixel_bytes * header.width
+def why_unreadable(topic: str, type_name: str, data: bytes) -> str:
+    """Say what is wrong with a message that was found undecodable."""
+    try:
+        if type_name == schema.IMAGE:
+            check_image(topic, image_header(data))
+        elif type_name in schema.DEFINITIONS:
+            codec.decode(type_name, data)
+    except codec.MalformedMessageError as error:
+        return str(error)
+    return f"not what {type_name} says"
 
 
 def _inspect_json(newest: int, data: bytes) -> MessageState:

@@ -167,11 +167,7 @@ class Ledger:
             self.warn(text)
 
     def close_seconds(self, before: int | None = None) -> Iterator[dict[str, Any]]:
-        """Yield a drops record for each topic and second that is over, and forget it.
-
-        Args:
-            before: Close seconds earlier than this; None closes all.
-        """
+        """Yield a drops record for each topic and second that is over, and forget it."""
         for second, topic in sorted(self._open):
             if before is not None and second >= before:
                 continue

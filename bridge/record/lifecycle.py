@@ -7,12 +7,13 @@ import tempfile
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from bridge.clock import ns_from_s, s_from_ns
 from bridge.episode import metadata
-from bridge.episode.contract import Contract, breaches_of, unknown_tails
+from bridge.episode.contract import Contract
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.record.config import BYTES_PER_MB, RecorderConfig
@@ -84,11 +85,7 @@ class PreRoll:
     """Holds messages as they would be written; what falls out at the old end is passed on."""
 
     def __init__(self, *, seconds: float, max_bytes: int, passed: Callable[[Item], None]) -> None:
-        """Set the bounds.
-
-        Args:
-            seconds: How far back it reaches [s]; 0 holds nothing.
-        """
+        """Set the bounds."""
         self._span_ns = ns_from_s(seconds)
         self._max_bytes = max_bytes
         self._passed = passed
@@ -277,12 +274,7 @@ class Lifecycle:
     def start(
         self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
     ) -> Answer:
-        """Begin an episode, with the pre-roll if there is one.
-
-        Args:
-            info: What the episode is; its id must be new in the run.
-            command: When it was asked for, which is when the episode begins but for its pre-roll.
-        """
+        """Begin an episode, with the pre-roll if there is one."""
         self._refuse_start(info.id)
         held = self.ring.held(command.received_ns)
         self.take = self._open(info, held, command, task)
@@ -294,11 +286,7 @@ class Lifecycle:
     def snapshot(
         self, info: metadata.EpisodeInfo, command: Command, task: TaskFile | None = None
     ) -> Answer:
-        """Write the pre-roll as an episode of its own; it is kept as well.
-
-        Args:
-            info: What the episode is; its id must be new in the run.
-        """
+        """Write the pre-roll as an episode of its own; it is kept as well."""
         if not self.ring.is_on:
             raise LifecycleError("there is no pre-roll. Start the recorder with --preroll-s 10.")
         self._refuse_start(info.id)
@@ -380,11 +368,7 @@ class Lifecycle:
         discard: bool,
         reason: str,
     ) -> Answer:
-        """Finish the episode, or throw it away.
-
-        Args:
-            outcome: How it ended; None: as it was labelled last.
-        """
+        """Finish the episode, or throw it away."""
         take = self._open_take()
         end_ns = command.received_ns
         self.is_finishing = True
@@ -402,13 +386,7 @@ class Lifecycle:
     def event(
         self, kind: str, command: Command, text: str, outcome: metadata.Outcome | None
     ) -> Answer:
-        """Note this instant in the episode.
-
-        Args:
-            kind: One of the types of the event schema: ``mark`` or ``label``.
-            text: Free text; "" for none.
-            outcome: Of a label; None leaves the episode's outcome as it is.
-        """
+        """Note this instant in the episode."""
         take = self._open_take()
         take.write_event(kind, stamp_ns=command.received_ns, text=text, outcome=outcome)
         return {"ok": True, "episode": take.info.id}
@@ -483,6 +461,5 @@ def counts(take: EpisodeRecording) -> Answer:
         "unknown_type": total.unknown_type,
         "shed": total.shed,
         "unnumbered": take.ledger.unnumbered(),
-        "breaches": breaches_of(take.presence),
-        "unknown_tails": unknown_tails(take.presence),
+        "findings": [asdict(finding) for finding in take.findings()],
     }

@@ -47,11 +47,7 @@ class Previews:
     def __init__(
         self, session: WireSession, recorder: str, rate_hz: float, shed: Callable[[], LoadShedding]
     ) -> None:
-        """Publish nothing yet.
-
-        Args:
-            rate_hz: At most this many a second for each camera; 0 makes none.
-        """
+        """Publish nothing yet."""
         self._session = session
         self._recorder = recorder
         self._period_s = 1 / rate_hz if rate_hz else None
@@ -89,11 +85,7 @@ class Previews:
         return name
 
     def show(self, sample: WireSample, kind: str) -> None:
-        """Send a small copy of an image, if somebody looks and it is time for one.
-
-        Args:
-            kind: ``color``, ``depth`` (never shown) or "" for unknown.
-        """
+        """Send a small copy of an image, if somebody looks and it is time for one."""
         topic = sample.topic
         if topic not in self._watched or kind == "depth" or self._shed() >= LoadShedding.PREVIEWS:
             return
@@ -120,8 +112,7 @@ def small_picture(sample: WireSample) -> CompressedColor | None:
         if header.encoding not in COLOR_LAYOUTS:
             return None
         layout, channels = COLOR_LAYOUTS[header.encoding]
-        rows = pixel_rows(header, channels)
-        pixels = rows.reshape(header.height, header.width, channels)
+        pixels = pixel_rows(header).reshape(header.height, header.width, channels)
         stamp_ns, frame_id = header.stamp_ns, header.frame_id
     step = -(-pixels.shape[1] // WIDTH)
     data = encode_jpeg(pixels[::step, ::step], QUALITY, layout=layout)

@@ -299,11 +299,7 @@ class Heartbeat:
         monitor: PresenceMonitor,
         say: Callable[[str], None],
     ) -> None:
-        """Begin to beat.
-
-        Args:
-            session: The recorder's, which must hear.
-        """
+        """Begin to beat."""
         self._monitor = monitor
         self._ended = threading.Event()
         self._loopback: WireSession | None = None

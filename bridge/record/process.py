@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bridge.episode.contract import presence_lines
+from bridge.episode.contract import health_lines
 from bridge.episode.metadata import EpisodeInfo, Outcome
 from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
@@ -110,7 +110,7 @@ class Keys:
 
 def _summary(answer: dict[str, Any]) -> str:
     line = f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost"
-    return "\n  ".join([line, *presence_lines(answer)])
+    return "\n  ".join([line, *health_lines(answer)])
 
 
 STATUS_PERIOD_S = 5.0

@@ -122,11 +122,7 @@ REDUCED_QUALITY = 60
 
 
 def next_level(level: LoadShedding, fill: float) -> LoadShedding:
-    """Return the level that belongs to a fill of 0 to 1, given the level so far.
-
-    Args:
-        fill: Share of the budget for bulk that is taken, 0 to 1.
-    """
+    """Return the level that belongs to a fill of 0 to 1, given the level so far."""
     wanted = max(item for item in LoadShedding if fill >= BEGINS_AT[item])
     if wanted < level and fill >= BEGINS_AT[level] * ENDS_BELOW:
         return level
@@ -134,11 +130,7 @@ def next_level(level: LoadShedding, fill: float) -> LoadShedding:
 
 
 def keep_every(level: LoadShedding, kind: str) -> int:
-    """Return n when only every n-th image of a kind (color, depth or "") is to be kept.
-
-    Args:
-        kind: ``color``, ``depth``, or "" for what no encoder knows as an image.
-    """
+    """Return n when only every n-th image of a kind (color, depth or "") is to be kept."""
     if kind == "color":
         return {LoadShedding.COLOR_RATE: 2, LoadShedding.DEPTH_RATE: 4}.get(level, 1)
     if kind == "depth":
@@ -258,11 +250,7 @@ class InputQueue:
     def __init__(
         self, limits: QueueConfig, hand_over: Callable[[Item], None], kinds: Mapping[str, str]
     ) -> None:
-        """Set the budgets.
-
-        Args:
-            hand_over: Called with each image; it comes back through ``put_image``.
-        """
+        """Set the budgets."""
         self._limits = limits
         self._bulk_budget = limits.camera_queue_mb * BYTES_PER_MB
         self._small_budget = limits.small_queue_mb * BYTES_PER_MB

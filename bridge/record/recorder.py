@@ -224,11 +224,7 @@ class Recorder:
         discard: bool = False,
         reason: str = "command",
     ) -> Answer:
-        """Finish the episode, or throw it away, after everything received so far.
-
-        Args:
-            outcome: How it ended; None: as it was labelled last.
-        """
+        """Finish the episode, or throw it away, after everything received so far."""
 
         def act(command: Command) -> Answer:
             self.presence.end()
@@ -270,13 +266,7 @@ class Recorder:
     def label(
         self, *, text: str = "", outcome: metadata.Outcome | None = None, episode: str | None = None
     ) -> Answer:
-        """Say how the open episode went, or, by its id, a finished one (kept under notes/).
-
-        Args:
-            text: Free text; "" for none.
-            outcome: How it went; None for text alone.
-            episode: Id of an episode; None: the open one, else the last.
-        """
+        """Say how the open episode went, or, by its id, a finished one (kept under notes/)."""
 
         def act(command: Command) -> Answer:
             take = self._life.take
@@ -428,8 +418,9 @@ class Recorder:
             if step_ns := self._steps.step_ns():
                 self._status.clock_steps += 1
                 self._life.note_clock_step(step_ns, now_ns)
-            for news in self._life.take_news():  # of clocks that were set, by the stamps
-                if not self.clocks.has_named(news.data["topics"], news.data["by_ns"]):
+            for news in self._life.take_news():
+                told = news.data
+                if "topics" not in told or not self.clocks.has_named(told["topics"], told["by_ns"]):
                     self.note(news)
             if not self._life.may_ask_disk:
                 return

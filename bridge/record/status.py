@@ -5,7 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge.clock import s_from_ns
-from bridge.episode.contract import presence_lines
+from bridge.episode.contract import health_lines
+from bridge.episode.health import in_words
 from bridge.episode.run_folder import RunFolder
 from bridge.record.config import RecorderConfig
 from bridge.record.errors import in_short
@@ -120,6 +121,9 @@ def describe_status(status: dict[str, Any], rate_hz: float | None = None) -> str
         for name in ("undecodable", "unknown_type")
         if status[name]
     )
+    if status.get("findings"):
+        found = [f"{in_words(each['name'])} on {each['about']}" for each in status["findings"]]
+        flags += f", {in_short(found)}"
     if status["shedding"] != "nothing":
         flags += f", shedding {status['shedding'].replace('_', ' ')}"
     return (
@@ -160,7 +164,7 @@ def describe_answer(answer: dict[str, Any]) -> str:
             f"{answer['episode']}: {answer['messages']} messages, {answer['lost']} lost, "
             f"{answer['undecodable']} undecodable, {answer['duration_s']:.1f} s"
         )
-        return "\n  ".join([line, *presence_lines(answer)])
+        return "\n  ".join([line, *health_lines(answer)])
     remark = f"; {text}" if (text := answer.get("task_remark")) else ""
     if answer.get("missing"):
         remark += f", although {in_short(answer['missing'])}"

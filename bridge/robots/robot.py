@@ -135,7 +135,7 @@ class Robot:
     """What plans move: between the pads of a gripper."""
     gripper: Gripper = Gripper()
     held: tuple[str, ...] = ()
-    """Joints of the URDF that do not move: they become fixed, at 0."""
+    """Joints of the URDF that do not move: they, and what mimics them, become fixed, at 0."""
     may_overlap: tuple[tuple[str, str], ...] = ()
     """Pairs of links whose hulls overlap without touching."""
     home_rad: tuple[float, ...] | None = None
@@ -185,7 +185,8 @@ class Robot:
         if self.prefix:
             _put_before(self.prefix, arm)
         for joint in arm.findall("joint"):
-            if joint.get("name") in self.held:
+            mimics = [m for m in joint.findall("mimic") if not number_of(m.get("offset", "0"))]
+            if {joint.get("name"), *(m.get("joint") for m in mimics)} & set(self.held):
                 joint.set("type", "fixed")
         arm.set("name", self.name)
         return ET.tostring(arm, encoding="unicode")
@@ -205,8 +206,14 @@ class Robot:
 
     def _parsed(self, uri: str) -> ET.Element:
         path = self._file(uri)
+        text = path.read_text()
+        if "<xacro:" in text:
+            raise UsageError(
+                f"{path} is a xacro file; expand it first: xacro {path} > {path.stem}.urdf, and "
+                "name that."
+            )
         try:
-            root = ET.parse(path).getroot()
+            root = ET.fromstring(text)
         except ET.ParseError as error:
             raise UsageError(f"{path} is not XML ({error}).") from error
         if root.tag != "robot":
@@ -273,7 +280,7 @@ def read_robot(name: str) -> Robot:
         table = tomllib.loads(path.read_text())
         if table.pop("schema_version", None) != SCHEMA_VERSION:
             raise ValueError(f"schema_version is not {SCHEMA_VERSION}")
-        return replace(_robot_from(table), folder=path.parent)
+        return replace(_robot_from(table), folder=path.absolute().parent)
     except _ODD as error:
         raise UsageError(f"{path} is not a robot file: {error}. See docs/robots.md.") from error
 
@@ -316,7 +323,7 @@ def mimics_of(urdf: str) -> tuple[Mimic, ...]:
         element = joint.find("mimic")
         if element is not None:
             numbers = (element.get("multiplier", "1"), element.get("offset", "0"))
-            multiplier, offset = map(_number, numbers)
+            multiplier, offset = map(number_of, numbers)
             found.append(
                 Mimic(
                     joint=joint.get("name", ""),
@@ -328,7 +335,8 @@ def mimics_of(urdf: str) -> tuple[Mimic, ...]:
     return tuple(found)
 
 
-def _number(text: str) -> float:
+def number_of(text: str) -> float:
+    """Read an attribute; other text becomes NaN."""
     try:
         return float(text)
     except ValueError:
@@ -472,7 +480,7 @@ def resolve_mesh(uri: str) -> Path:
             "Say where it lies under mesh_folders in the robot file."
         )
     if not path.is_file():
-        raise UsageError(f"mesh {uri!r} is not there ({path}).")
+        raise UsageError(f"{uri!r} is not there ({path}).")
     return path
 
 

@@ -138,11 +138,7 @@ class Announcer:
         self._queue.put(_Entry(message, None))
 
     def fact(self, key: object, message: StampedMessage) -> None:
-        """Send now and every few seconds, until another fact takes the key.
-
-        Args:
-            key: Names the fact, not None; a later one with an equal key takes its place.
-        """
+        """Send now and every few seconds, until another fact takes the key."""
         self._queue.put(_Entry(message, key))
 
     def close(self) -> None:

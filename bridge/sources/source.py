@@ -40,11 +40,7 @@ class Source(Protocol):
 def run_source(
     source: Source, wire: WireConfig, output: Output, *, duration_s: float | None = None
 ) -> dict[str, Any]:
-    """Run a source until it ends, SIGINT or SIGTERM arrives, or the time is over.
-
-    Args:
-        duration_s: Stop after this long [s]; None: never.
-    """
+    """Run a source until it ends, SIGINT or SIGTERM arrives, or the time is over."""
     from bridge.wire.session import open_session  # noqa: PLC0415  # zenoh only when live
 
     output.detail(f"{source.name} publishes {', '.join(source.topics)}")

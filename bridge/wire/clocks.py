@@ -30,11 +30,7 @@ class ClockAnswer(NamedTuple):
 
 
 def announce(session: WireSession, *prefixes: str) -> None:
-    """Let everybody see that a source is there, and ask its clock, until the session closes.
-
-    Args:
-        prefixes: Beginnings of the source's topics without slash, such as ``lab/cam/side``.
-    """
+    """Let everybody see that a source is there, and ask its clock, until the session closes."""
 
     def answer(request: bytes) -> bytes:
         received_ns = session.now_ns()

@@ -104,12 +104,7 @@ def read_definition_key(key: str) -> tuple[str, str, str] | None:
 
 
 def encoding_of(type_name: str, message_encoding: str) -> str:
-    """Name a type in a zenoh encoding.
-
-    Args:
-        type_name: Such as ``sensor_msgs/msg/JointState``; "" for unknown.
-        message_encoding: Such as ``cdr`` or ``json``; of one not known nothing is said.
-    """
+    """Name a type in a zenoh encoding."""
     kind = f"application/{message_encoding}"
     if kind not in _ENCODINGS:
         kind = _BYTES

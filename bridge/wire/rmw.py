@@ -25,11 +25,7 @@ NAME_PARTS = 3
 
 
 def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = None) -> Schema | None:
-    """Return the ``ros2msg`` schema of a type, or None when no definition is known.
-
-    Args:
-        type_hash: The definition must have this RIHS01 hash; "" takes the newest.
-    """
+    """Return the ``ros2msg`` schema of a type, or None when no definition is known."""
     text = _definition(type_name, type_hash, folder)
     if text is None:
         return None
@@ -40,20 +36,12 @@ def ros_schema(type_name: str, *, type_hash: str = "", folder: Path | None = Non
 
 @cache
 def type_hash_of(type_name: str, *, folder: Path | None = None) -> str | None:
-    """Return the RIHS01 hash of the newest definition of a type, or None when none is known.
-
-    Args:
-        folder: Message definitions of the user's own, looked at as well; None for none.
-    """
+    """Return the RIHS01 hash of the newest definition of a type, or None when none is known."""
     return next(_hashes(type_name, folder), (None, None))[0]
 
 
 def is_known_definition(type_name: str, type_hash: str, *, folder: Path | None = None) -> bool:
-    """Say whether any release, or the folder, has the type with exactly this hash.
-
-    Args:
-        folder: Message definitions of the user's own, looked at as well; None for none.
-    """
+    """Say whether any release, or the folder, has the type with exactly this hash."""
     return any(found == type_hash for found, _ in _hashes(type_name, folder))
 
 

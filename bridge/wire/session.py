@@ -146,11 +146,7 @@ def copy_sample(
     max_bytes: int = sys.maxsize,
     definitions: Mapping[tuple[str, str], schema.Schema] = NO_DEFINITIONS,
 ) -> WireSample:
-    """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory.
-
-    Args:
-        max_bytes: A larger payload is left out, its size stands in ``oversize_bytes``.
-    """
+    """Read a zenoh sample. Its payload is copied: a kept one would pin the sender's memory."""
     size = len(sample.payload)
     is_oversize = size > max_bytes
     named = keys.read_key(str(sample.key_expr))
@@ -272,12 +268,7 @@ class WireSession:
         *,
         max_bytes: int = sys.maxsize,
     ) -> Subscriber:
-        """Receive what matches, for example ``standin/**``, on the network thread.
-
-        Args:
-            key_expression: zenoh keys, where ``*`` stands for one part and ``**`` for any number.
-            callback: Gets each message, in order; must be quick.
-        """
+        """Receive what matches, for example ``standin/**``, on the network thread."""
 
         def on_sample(sample: Any) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
@@ -364,11 +355,7 @@ class WireSession:
         max_waiting: int = MAX_WAITING,
         side_by_side: int = 1,
     ) -> Service:
-        """Answer requests on a key; a ``GstError`` of the handler goes back as the answer.
-
-        Args:
-            max_waiting: Requests that may wait for their turn; further ones are refused.
-        """
+        """Answer requests on a key; a ``GstError`` of the handler goes back as the answer."""
         service = Service(key, handler, max_waiting, side_by_side)
         callback = zenoh.handlers.Callback(service.take, indirect=False)
         try:

@@ -192,9 +192,6 @@ def calibrate_cameras(run: RunFolder, config: CalibrateConfig, output: Output) -
 
     A camera is found from pose pairs of a target where there are some, otherwise, when it stands
     still, from the robot in its depth images.
-
-    Args:
-        config: Which camera (empty: all), and mounting.
     """
     episodes = _readable(run, output)
     where = placement(episodes)
@@ -269,12 +266,7 @@ def _from_target(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[s
 
 
 def target_record(found: TargetCamera, pairs: PosePairs, link: str, base: str) -> dict[str, Any]:
-    """Say what pose pairs gave.
-
-    Args:
-        pairs: What it was found from; its source is recorded.
-        base: The robot's base frame.
-    """
+    """Say what pose pairs gave."""
     solution = found.solution
     in_hand = found.mount == "hand"
     return {

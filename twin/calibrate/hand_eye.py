@@ -29,9 +29,6 @@ def motions(
     """Motions P and Q between pairs of poses, for which P X = X Q.
 
     From A_i X = Z B_i for two poses: P = A_j^-1 A_i and Q = B_j^-1 B_i.
-
-    Args:
-        Ts_a: Poses A of the pairs; see the module.
     """
     first, second = np.triu_indices(len(Ts_a), 1)
     if len(first) > MAX_MOTIONS:

@@ -177,12 +177,7 @@ class JudgedTasks:
     """The run's folder of task files."""
 
     def find(self, name: str, sha256: str) -> Task:
-        """Return the task that somebody names.
-
-        Args:
-            name: Of the task; "" for the gate's only one.
-            sha256: Of its file; "" where the asker does not know, which the only one forgives.
-        """
+        """Return the task that somebody names."""
         if self.only is None:
             if not name or not sha256:
                 raise UndecidedError(
@@ -283,10 +278,6 @@ class Gate:
         """Say where the objects are now, seen and found as for a verdict; for the planner.
 
         Bounded like a verdict. What hinders a verdict hinders this: the answer is then undecided.
-
-        Args:
-            task_name: Of the task whose objects are asked for; "" for the gate's only one.
-            task_sha256: Of its file; "" where the asker does not know.
         """
         ends_s = time.monotonic() + self._config.deadline_s
         if not self._turn.acquire(timeout=self._config.deadline_s):
@@ -362,12 +353,7 @@ class Gate:
             return no_verdict(plan, f"internal error: {type(error).__name__}: {error}")
 
     def _where_the_arm_is(self, arrived_ns: int, robot: Robot) -> Joints:
-        """The arm's joints as the cell said last, in their order [rad].
-
-        Args:
-            arrived_ns: When the plan came, on the receiver's clock.
-            robot: Whose joints they must be.
-        """
+        """The arm's joints as the cell said last, in their order [rad]."""
         heard = self._perception.joints()
         topic = cell_topic(self._config.cell, JOINT_STATES)
         if heard is None:
@@ -527,12 +513,7 @@ def _newest(frames: Any) -> int:
 
 
 def no_verdict(plan: Plan, reason: str) -> Verdict:
-    """The answer when nothing can be decided: accepted null, with the reason.
-
-    Args:
-        plan: The plan that was asked about; only its id is used.
-        reason: Why nothing can be decided, as the operator reads it.
-    """
+    """The answer when nothing can be decided: accepted null, with the reason."""
     undecided = Factor(value=None)
     return Verdict(
         plan_id=plan.id,

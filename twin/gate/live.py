@@ -104,12 +104,7 @@ class LiveCell:
     def poses(
         self, camera_id: str, color: str, depth: str, stamps_ns: Int[np.ndarray, " num_stamps"]
     ) -> CameraPoses:
-        """Where a camera was: where it was calibrated, else where ``/tf`` says.
-
-        Args:
-            color: Frame of its colour images.
-            depth: Frame of its depth images.
-        """
+        """Where a camera was: where it was calibrated, else where ``/tf`` says."""
         mount = self.mounts.get(camera_id)
         if mount is None:
             known = set(self.tree.frames())

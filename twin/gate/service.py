@@ -133,12 +133,7 @@ def watch_cell(
     cell: str,
     take: Callable[[str, bytes, int, str], None],
 ) -> None:
-    """Hand the cell's images, joints, transforms, description and events to ``take``.
-
-    Args:
-        take: Called with topic, payload, time of arrival [ns] and type name, from the session's
-            threads.
-    """
+    """Hand the cell's images, joints, transforms, description and events to ``take``."""
 
     def on_sample(sample: Any) -> None:
         take(sample.topic, sample.data, sample.received_ns, sample.type_name)

@@ -236,12 +236,7 @@ class TwinProcess:
         return None
 
     def localise(self, frames: Any, task: Task, ends_s: float) -> Mapping[str, Any]:
-        """Find a task's objects.
-
-        Args:
-            frames: What the cameras saw at rest, as ``LiveView.frames`` gives them.
-            ends_s: When to be done, on the monotonic clock.
-        """
+        """Find a task's objects."""
         item = Look(run_path=self._run_path, frames=frames, task=task)
         found: Mapping[str, Any] = self._do("localisation", look, item, ends_s)
         return found
@@ -255,12 +250,7 @@ class TwinProcess:
         start_rad: Float[np.ndarray, " num_joints"],
         ends_s: float,
     ) -> Verdict:
-        """Replay a plan from where its objects were found and the arm stands.
-
-        Args:
-            found: The task's objects as localised, by name.
-            ends_s: When to be done, on the monotonic clock.
-        """
+        """Replay a plan from where its objects were found and the arm stands."""
         self._config.refuse_soft(task.soft_objects)
         question = Question(
             run_path=self._run_path,

@@ -272,12 +272,7 @@ class Arm:
         )
 
     def reset(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Put the robot into a posture at rest, without simulating."""
         for index, value in zip(self._arm, joints_rad, strict=True):
             pybullet.resetJointState(
                 self.id, index, float(value), 0.0, physicsClientId=self._client

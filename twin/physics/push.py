@@ -33,12 +33,7 @@ class PushWorld:
         T_world_box: Float[np.ndarray, "4 4"],
         table_height_m: float,
     ) -> None:
-        """Put table, box and hand into an empty world.
-
-        Args:
-            config: Rates and frictions; the fingers' is the hand's.
-            hulls_m: Convex pieces of the hand, in its frame [m].
-        """
+        """Put table, box and hand into an empty world."""
         self._config = config
         self._client = open_client(config)
         T_table = np.eye(4)
@@ -103,11 +98,7 @@ class PushWorld:
         velocity_m_s: Float[np.ndarray, "3"],
         turning_rad_s: Float[np.ndarray, "3"],
     ) -> Float[np.ndarray, "7"]:
-        """Advance by one step from a pose of the hand; returns the box: position [m], wxyz.
-
-        Args:
-            turning_rad_s: Its angular velocity, world axes.
-        """
+        """Advance by one step from a pose of the hand; returns the box: position [m], wxyz."""
         w, x, y, z = q_hand_wxyz.tolist()
         position, orientation = p_hand_m.tolist(), [x, y, z, w]
         velocity = velocity_m_s.tolist()

@@ -332,11 +332,7 @@ class SoftModel:
 
 
 def shape_of(model: ObjectModel, arrays: Mapping[str, np.ndarray] | None) -> SoftModel:
-    """The lattice that a scene found of an object; without one the task's mesh, filled.
-
-    Args:
-        arrays: Of the object's ``soft.npz``, object frame.
-    """
+    """The lattice that a scene found of an object; without one the task's mesh, filled."""
     if arrays is None:
         return SoftModel.from_task(model)
     return SoftModel.from_lattice(arrays, model)

@@ -52,11 +52,7 @@ def box_piece(size_m: Float[np.ndarray, "3"], T_owner_box: Float[np.ndarray, "4 
 
 
 def link_pieces(urdf: str, mesh_hulls_m: Hulls) -> dict[str, list[ConvexPiece]]:
-    """Return the pieces of each link that has any, in the link's frame.
-
-    Args:
-        mesh_hulls_m: Per link, hulls that stand for its collision meshes [m].
-    """
+    """Return the pieces of each link that has any, in the link's frame."""
     found = {}
     for link in ET.fromstring(urdf).findall("link"):
         name = link.get("name", "")

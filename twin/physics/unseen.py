@@ -44,10 +44,6 @@ EVEN = Unseen()
 
 
 def box_inertia(size_m: Float[np.ndarray, "3"], mass_kg: float) -> tuple[float, float, float]:
-    """Principal moments of inertia of an even box about its middle [kg m^2].
-
-    Args:
-        mass_kg: Spread evenly over the box.
-    """
+    """Principal moments of inertia of an even box about its middle [kg m^2]."""
     x, y, z = (np.asarray(size_m) ** 2).tolist()
     return mass_kg / 12 * (y + z), mass_kg / 12 * (x + z), mass_kg / 12 * (x + y)

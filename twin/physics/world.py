@@ -104,11 +104,7 @@ class World:
         self._solids: list[Callable[[SoftBodies], None]] = []
 
     def add_static(self, boxes: Sequence[Box], T_base_owner: Float[np.ndarray, "4 4"]) -> list[int]:
-        """Add solid boxes that never move, one body each; returns the body ids.
-
-        Args:
-            boxes: Centre and whole edge lengths of each [m], in the owner's frame.
-        """
+        """Add solid boxes that never move, one body each; returns the body ids."""
         ids = []
         for centre, extents in boxes:
             T_owner_box = np.eye(4)
@@ -230,12 +226,7 @@ class World:
         )
 
     def reset_robot(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Put the robot into a posture at rest, without simulating.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Put the robot into a posture at rest, without simulating."""
         self.robot.reset(joints_rad, width_m)
         if self._soft is not None:
             self._soft.place_links()

@@ -1,5 +1,8 @@
 """Look at a robot file before anything is recorded with it: what it says, and what is missing."""
 
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +13,22 @@ from bridge.robots.robot import Gripper, read_robot
 from twin.robot.collision import RobotHulls
 from twin.robot.config import IkConfig
 from twin.robot.inverse import UrInverse, solve_ik
-from twin.robot.model import RobotModel, check_dynamics
+from twin.robot.model import RobotModel, numbers_in, without_dynamics
 
 _POSES, _SEED = 20, 0
+_MOST_RAD = 8 * np.pi
+"""No arm turns more than four times to one side; degrees look like it."""
+_UNFELT_KG, _LONGEST_M, _ROUNDED = 0.01, 10.0, 1e-3
+_INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
-    """Read a robot file, build all that replays need of it, and say what was found.
-
-    Args:
-        name: Name in ``datasets/robots``, or path of a robot file.
-        urdf_out: Where the description goes that carries the record; None: nowhere.
-    """
+    """Read a robot file, build all that replays need of it, and say what was found."""
     record = read_robot(name)
     try:
         text = record.description()
         robot = RobotModel(text)
         hulls = RobotHulls(robot)
-        check_dynamics(robot)
     except GstError as error:
         raise UsageError(f"{record.name}: {error}") from error
     if urdf_out is not None:
@@ -60,6 +61,9 @@ def check_robot(name: str, *, urdf_out: Path | None = None) -> dict[str, Any]:
         "inverse": "closed form" if UrInverse.for_robot(robot) is not None else "iteration",
         "reached": f"{_reached(robot)} of {_POSES} random poses",
         "limits": _limits_of_use(robot, hulls),
+        "findings": [
+            {"level": level, "found": found} for level, found in _findings(robot, hulls, text)
+        ],
     }
 
 
@@ -106,6 +110,39 @@ def _limits_of_use(robot: RobotModel, hulls: RobotHulls) -> list[str]:
     return found
 
 
+def _findings(robot: RobotModel, hulls: RobotHulls, text: str) -> Iterator[tuple[str, str]]:
+    """Say of each link and joint what it cannot be used for: kinematic, dynamic or gate."""
+    names, low, high = robot.joints, robot.lower_rad, robot.upper_rad
+    for name, *ends in zip(names, low, high, strict=True):
+        if max(map(abs, ends)) > _MOST_RAD:
+            told = " to ".join(f"{end:g}" for end in ends)
+            yield "kinematic", f"the joint {name!r} is limited to {told} rad; are these degrees?"
+    for name, speed in zip(names, robot.velocity_limit_rad_s, strict=True):
+        if not speed > 0:
+            yield "gate", f"the joint {name!r} has a speed of 0; set velocity_rad_s"
+    for lacking in without_dynamics(robot):
+        yield "dynamic", f"the URDF gives {lacking}"
+    watched = Counter(hull.link for hull in hulls.hulls)
+    for link in ET.fromstring(text).findall("link"):
+        name, mass = link.get("name", ""), link.find("inertial/mass")
+        weighs = mass is not None and max(numbers_in(mass, "value"), default=0) > _UNFELT_KG
+        shapes = len(link.findall("collision"))
+        seen = weighs or link.find("visual") is not None
+        if watched[name] < shapes or (seen and not shapes):
+            told = f"{watched[name]} of its {shapes} collision shapes are read"
+            yield "gate", f"the link {name!r} is not watched: {told}"
+        for inertia in link.findall("inertial/inertia"):
+            xx, yy, zz, xy, xz, yz = numbers_in(inertia, *_INERTIA)
+            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            if not moments[0] + moments[1] >= moments[2] * (1 - _ROUNDED):
+                yield "dynamic", f"the inertia of the link {name!r} is no body's: A + B < C"
+    for hull in hulls.hulls:
+        length_m = float(np.ptp(hull.points_m, axis=0).max())
+        if length_m > _LONGEST_M:
+            told = f"{length_m:.0f} m long; is it in millimetres? Set scale"
+            yield "gate", f"a collision shape of the link {hull.link!r} is {told}"
+
+
 def describe_robot(found: dict[str, Any]) -> str:
     """What a person should look at."""
     lines = [
@@ -129,6 +166,7 @@ def describe_robot(found: dict[str, Any]) -> str:
         f"{found['hulls']} collision hulls; inverse kinematics by {found['inverse']}, "
         f"{found['reached']} reached"
     )
+    lines += [f"{finding['level']}: {finding['found']}" for finding in found["findings"]]
     lines += [f"note: {text}" for text in found["limits"]]
     return "\n".join(lines)
 

@@ -61,13 +61,18 @@ def link_hulls(robot: RobotModel) -> list[LinkHull]:
         points = _points(item) @ T_link_shape.rotation.T + T_link_shape.translation
         if not _has_volume(points):
             raise RobotDescriptionError(
-                found=f"has a collision shape without volume at {item.name}",
+                found=f"has a collision shape without volume at the link {frame.name!r}",
                 hint="Give it three extents above zero, or leave it out.",
             )
         shape = convex_hull(points)
         corners = np.array(shape.points())
         from_mesh = isinstance(item.geometry, coal.BVHModelBase)
         hulls.append(LinkHull(link=frame.name, points_m=corners, shape=shape, from_mesh=from_mesh))
+    if not hulls:
+        raise RobotDescriptionError(
+            found="gives no link a collision shape",
+            hint="Give each link <collision>, or nothing would be watched.",
+        )
     return hulls
 
 
@@ -149,13 +154,6 @@ def signed_distance(
     """Distance between two convex shapes [m], negative by the depth when they overlap.
 
     A fresh ``result`` is filled with the nearest points and the direction between them.
-
-    Args:
-        first: One shape, in its own frame.
-        T_first: Where it is, in any frame.
-        second: The other shape, in its own frame.
-        T_second: Where that is, in the same frame as the first.
-        result: Receives nearest points and direction; None: they are not wanted.
     """
     result = coal.DistanceResult() if result is None else result
     distance_m = float(coal.distance(first, T_first, second, T_second, _SIGNED, result))
@@ -190,12 +188,7 @@ class RobotHulls:
         self.pairs = self._pairs()
 
     def place(self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float) -> None:
-        """Move all hulls to a posture.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Move all hulls to a posture."""
         robot = self.robot
         pin.framesForwardKinematics(
             robot.model, robot.data, robot.configuration(joints_rad, width_m)

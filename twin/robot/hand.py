@@ -22,11 +22,7 @@ class Hand:
     """One arm with what hangs on its hand link."""
 
     def __init__(self, urdf: Path, joints: tuple[str, ...], hand_link: str) -> None:
-        """Read a description; meshes are looked for beside it.
-
-        Args:
-            joints: The arm's, base to hand.
-        """
+        """Read a description; meshes are looked for beside it."""
         if not urdf.is_file():
             raise RobotDescriptionError(
                 found=f"is not at {urdf}", hint="Import the data set again, with its robot folder."

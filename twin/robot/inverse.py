@@ -44,11 +44,7 @@ def pose_error(
     joints_rad: Float[np.ndarray, " num_joints"],
     T_base_tcp: Float[np.ndarray, "4 4"],
 ) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between where joints put the tool and a wanted pose.
-
-    Args:
-        joints_rad: Of the arm, from base to hand.
-    """
+    """Distance [m] and angle [rad] between where joints put the tool and a wanted pose."""
     error = pin.SE3(robot.T_base_tcp(joints_rad)).actInv(pin.SE3(T_base_tcp))
     return float(np.linalg.norm(error.translation)), float(np.linalg.norm(pin.log3(error.rotation)))
 

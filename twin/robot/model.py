@@ -7,7 +7,7 @@ scratch memory: use it from one thread at a time.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -16,7 +16,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from bridge.episode.topics import ROBOT_DESCRIPTION
-from bridge.robots.robot import Mimic, Robot, mimics_of, resolve_mesh, robot_of
+from bridge.robots.robot import Mimic, Robot, mimics_of, number_of, resolve_mesh, robot_of
 from twin.errors import TwinError
 
 
@@ -57,11 +57,7 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
 
 
 def with_absolute_meshes(urdf: str, *, keep_visuals: bool = False) -> str:
-    """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted.
-
-    Args:
-        keep_visuals: Leave what is drawn in; collision elements always stay.
-    """
+    """Replace ``package://`` URIs by paths; visuals are dropped unless they are wanted."""
     root = parse_description(urdf)
     for link in root.findall("link"):
         if not keep_visuals:
@@ -106,27 +102,59 @@ def _check_names(root: ET.Element) -> None:
             )
 
 
+def numbers_in(element: ET.Element, *keys: str) -> list[float]:
+    """Read the numbers of attributes; what is none becomes NaN."""
+    return [number_of(word) for key in keys for word in element.get(key, "").split()]
+
+
+def _refusals(root: ET.Element) -> Iterator[str]:
+    """Name every joint and link that no engine can take, not the first one only."""
+    for joint in root.findall("joint"):
+        kind, axis, name = joint.get("type", ""), joint.find("axis"), joint.get("name")
+        if kind not in _KINDS:
+            yield f"the joint {name!r} of the type {kind!r}"
+        elif kind != "fixed" and axis is not None:
+            length = float(np.linalg.norm(numbers_in(axis, "xyz")))
+            if not length > 0:
+                yield f"the joint {name!r} with an axis of length {length:g}"
+    for link in root.findall("link"):
+        for shape in link.findall("collision/geometry/*"):
+            sizes = numbers_in(shape, "size", "radius", "length")
+            if not all(size > 0 for size in sizes):
+                told = " ".join(f"{size:g}" for size in sizes)
+                yield f"the link {link.get('name')!r} with a {shape.tag} of size {told}"
+
+
+def _replace_capsules(root: ET.Element) -> bool:
+    """Put the cylinder around each capsule of collision, which readers of URDF pass over."""
+    capsules = [shape for link in root for shape in link.findall("collision/geometry/capsule")]
+    for shape in capsules:
+        radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
+        shape.tag = "cylinder"
+        shape.set("length", repr(length + 2 * radius))
+    return bool(capsules)
+
+
 _SAME_FRAME = 1e-6
 _TURNS_RAD = 2 * np.pi
 """Limit, to both sides, of a joint that turns without end."""
 _ROOT = "gst_root"
 """Link that is put above the root of a description whose base lies elsewhere."""
-_REFUSED = ("floating", "planar")
-_KINDS = ("fixed", "revolute", "prismatic", "continuous", *_REFUSED)
+_KINDS = ("fixed", "revolute", "prismatic", "continuous")
 
 
 def _with_limits(urdf: str, record: Robot) -> str:
     """Write the record's limits into a description; the arm's endless joints get two turns."""
     root = parse_description(urdf)
+    refused = list(_refusals(root))
+    if refused:
+        raise RobotDescriptionError(
+            found=f"has {'; '.join(refused)}",
+            hint="A serial arm on a fixed base is needed, of joints with one axis each and of "
+            "shapes with three extents above 0.",
+        )
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    for name, joint in joints.items():
-        kind = joint.get("type", "")
-        if kind in _REFUSED or kind not in _KINDS:
-            raise RobotDescriptionError(
-                found=f"has the joint {name!r} of the type {kind!r}",
-                hint="A serial arm on a fixed base is needed, of joints with one axis each.",
-            )
-    changed = False
+    changed = _replace_capsules(root)
     for index, name in enumerate(record.joints):
         found = joints.get(name)
         if found is None:
@@ -311,7 +339,7 @@ class RobotModel:
                     raise RobotDescriptionError(
                         found=f"lets the joint {item.joint!r} mimic {item.leader!r}, and {name!r} "
                         "is fixed or turns without end",
-                        hint="Make both revolute or prismatic, with limits.",
+                        hint="Make both revolute or prismatic, with limits, or list both as held.",
                     )
 
     def _T_root_base(self) -> Float[np.ndarray, "4 4"]:
@@ -373,12 +401,7 @@ class RobotModel:
     def configuration(
         self, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, " num_values"]:
-        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Put arm joints and what the gripper width makes of its fingers into pinocchio's order."""
         if width_m != self._opened_m:  # along a path it seldom changes
             self._opened_m = width_m
             for index, finger in self._fingers:
@@ -413,12 +436,7 @@ class RobotModel:
     def T_base_link(
         self, link: str, joints_rad: Float[np.ndarray, " num_joints"], width_m: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:
-        """Pose of any link or frame.
-
-        Args:
-            joints_rad: Of the arm, from base to hand.
-            width_m: Distance between the finger pads.
-        """
+        """Pose of any link or frame."""
         if not self.model.existFrame(link):
             names = ", ".join(frame.name for frame in self.model.frames)
             raise RobotDescriptionError(found=f"lacks {link!r}", hint=f"It has: {names}.")
@@ -429,21 +447,26 @@ class RobotModel:
 
 def check_dynamics(robot: RobotModel) -> None:
     """Refuse an arm whose motors or masses nobody knows: it cannot be simulated."""
+    lacking = list(without_dynamics(robot))
+    if lacking:
+        raise RobotDescriptionError(
+            found=f"gives {'; '.join(lacking)}",
+            hint="Give links <inertial> with a mass and an inertia above 0, and joints "
+            "<limit effort=...>, the torque of the motor in Nm.",
+        )
+
+
+def without_dynamics(robot: RobotModel) -> Iterator[str]:
+    """Name each joint whose motor, or what it moves, cannot be simulated."""
     model = robot.model
     for name in (*robot.joints, *robot.record.finger_joints, *(m.joint for m in robot.followers)):
         joint = model.getJointId(name)
         inertia = model.inertias[joint]
         moved = [frame.name for frame in model.frames if frame.parentJoint == joint]
         if not inertia.mass > 0 or not np.linalg.eigvalsh(inertia.inertia).min() > 0:
-            raise RobotDescriptionError(
-                found=f"gives no inertia to what {name!r} moves: {', '.join(moved[1:])}",
-                hint="Give its links <inertial> with a mass and an inertia above 0.",
-            )
+            yield f"no inertia to what {name!r} moves: {', '.join(moved[1:])}"
         if name in robot.joints and not model.effortLimit[robot.effort_id(name)] > 0:
-            raise RobotDescriptionError(
-                found=f"gives the joint {name!r} no effort",
-                hint="Set <limit effort=...> to the torque of its motor in Nm.",
-            )
+            yield f"the joint {name!r} no effort"
 
 
 @lru_cache(maxsize=4)

@@ -116,11 +116,7 @@ class PostureTrack:
 def distinct_postures(
     joints_rad: Float[np.ndarray, "num_postures num_joints"], count: int
 ) -> list[int]:
-    """Choose at most so many postures far from each other, farthest first, until none is new.
-
-    Args:
-        joints_rad: Postures to choose from; the first is always chosen.
-    """
+    """Choose at most so many postures far from each other, farthest first, until none is new."""
     chosen = [0]
     far = np.abs(joints_rad - joints_rad[0]).max(axis=1)
     while len(chosen) < count and far.max() > APART_RAD:

@@ -110,11 +110,7 @@ class PosedSurface:
     def near_box(
         self, p_base: Float[np.ndarray, "num_points 3"], margin_m: float
     ) -> Int64[np.ndarray, " num_near"]:
-        """Which points lie in the bounding box of a shape grown by a margin; others are far.
-
-        Args:
-            p_base: Points in the base frame [m].
-        """
+        """Which points lie in the bounding box of a shape grown by a margin; others are far."""
         lows, highs = (np.array(ends) for ends in zip(*self._boxes, strict=True))
         around = (p_base > lows.min(axis=0) - margin_m) & (p_base < highs.max(axis=0) + margin_m)
         candidates = np.flatnonzero(around.all(axis=1))

@@ -3,6 +3,7 @@
 The file is the one that other splat viewers read (SuperSplat, Rerun).
 """
 
+import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -189,11 +190,7 @@ def write_ply(path: Path, cloud: GaussianCloud) -> None:
     Scales are natural logarithms, opacities logits, rotations wxyz, colours the constant
     spherical harmonic with the higher ones as ``f_rest_0..8``, ``..23`` or ``..44`` where the cloud
     has them. Metres, in the frame that ``scene.json`` names. A last column ``completed``, 0 or 1,
-    where some are; other viewers pass it over.
-
-    Args:
-        path: Of the PLY file; one that is there is replaced.
-        cloud: What is written, with rotations of any length.
+    where some are; other viewers pass it over. A file that is there is replaced.
     """
     quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
     table = np.concatenate(
@@ -220,11 +217,11 @@ def read_ply(path: Path) -> GaussianCloud:
         hint = "robot-gst rebuild RUN makes it."
         raise PathNotFoundError(path=path, what="splat file", hint=hint)
     data = path.read_bytes()
-    end = data.find(b"end_header\n")
-    if not data.startswith(b"ply\n") or end < 0:
+    head = re.match(rb"ply\r?\n.*?\bend_header\r?\n", data, re.DOTALL)
+    if head is None:
         raise UnreadablePlyError(path=path, found="no PLY header")
-    names, count = _header(path, data[:end].decode("ascii", "replace").splitlines())
-    body = data[end + len(b"end_header\n") :]
+    names, count = _header(path, head[0].decode("ascii", "replace").splitlines())
+    body = data[head.end() :]
     if len(body) != count * len(names) * 4:
         found = f"{len(body)} bytes of data for {count} rows of {len(names)} floats"
         raise UnreadablePlyError(path=path, found=found)

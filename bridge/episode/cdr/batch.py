@@ -5,6 +5,7 @@ not alike is left to be read one by one, with the same result. A ``MessageTempla
 messages, byte for byte as one by one (tests compare both).
 """
 
+import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -34,11 +35,7 @@ class MessageTemplate:
     def __init__(
         self, type_name: str, build: Callable[[Stamp, list[float]], dict[str, Any]], count: int
     ) -> None:
-        """Serialise once and remember where the numbers went.
-
-        Args:
-            build: Makes the message from a stamp and ``count`` numbers.
-        """
+        """Serialise once and remember where the numbers went."""
         marks = [2.0**-30 * (3 * number + 1) for number in range(count)]
         self._bytes = codec.encode(type_name, build(_STAMP_MARK, marks))
         self._stamp_at = self._place(_STAMP_FIELDS.pack(*_STAMP_MARK.values()))
@@ -124,12 +121,7 @@ def joint_messages(
     names: Sequence[str],
     position: Float[np.ndarray, "num_messages num_joints"],
 ) -> Iterator[bytes]:
-    """Yield sensor_msgs/JointState messages with positions alone.
-
-    Args:
-        names: Joints, in the order of the columns of ``position``.
-        position: One row for each message [rad; m for a gripper's width].
-    """
+    """Yield sensor_msgs/JointState messages with positions alone."""
     return joint_template(names).fill_all(stamps_ns, position)
 
 
@@ -138,11 +130,7 @@ def pose_messages(
     frame_id: str,
     Ts_frame_body: Float[np.ndarray, "num_messages 4 4"],
 ) -> Iterator[bytes]:
-    """Yield geometry_msgs/PoseStamped messages.
-
-    Args:
-        frame_id: The frame the poses are expressed in.
-    """
+    """Yield geometry_msgs/PoseStamped messages."""
     q, p = se3.split(Ts_frame_body)
     numbers = np.concatenate([p, q[:, 1:], q[:, :1]], axis=1)
     return pose_template(frame_id).fill_all(stamps_ns, numbers)
@@ -203,14 +191,51 @@ def joints_of(
     rows = _rows(payloads)
     if rows is None:
         return None
+    layout = joint_layout(payloads[0])
+    if layout is None or not _differ_only_in(rows, (_STAMP, *layout.numbers)):
+        return None
+    return layout.names, _stamps_ns(rows), _numbers(rows, layout.numbers[0])
+
+
+class JointLayout:
+    """Where the numbers of one message of joints lie; those alike differ from it in them only."""
+
+    def __init__(self, data: bytes) -> None:
+        """Read a message; raises as ``JointSample.from_cdr`` does."""
+        first = JointSample.from_cdr(data)
+        self.names, count = first.names, len(first.position)
+        start = np.frombuffer(data, np.uint8).ctypes.data
+        at = first.position.ctypes.data - start if count else len(data)
+        ends = [at + 8 * count]
+        for values in (first.velocity, first.effort):
+            ends.append(_aligned(ends[-1] + 4, 8) + values.nbytes if len(values) else ends[-1] + 4)
+        velocity, effort, end = ends
+        self.numbers: tuple[Span, ...] = (
+            *((at, velocity), (effort - first.velocity.nbytes, effort)),
+            (end - first.effort.nbytes, end),
+        )
+        self.is_of_use = data[1] == _LITTLE_ENDIAN and count > 0
+        self._fixed = ((0, 4), (12, at), (velocity, velocity + 4), (effort, effort + 4))
+        self._size, self._bytes = len(data), [data[a:b] for a, b in self._fixed]
+        self._unpack = struct.Struct(f"<{count}d").unpack_from
+
+    def is_like(self, data: bytes) -> bool:
+        """Whether another message holds the same joints at the same places."""
+        return len(data) == self._size and [data[a:b] for a, b in self._fixed] == self._bytes
+
+    def has_nan(self, data: bytes) -> bool:
+        """Whether a position of a message that is like it is not a number."""
+        total: float = sum(self._unpack(data, self.numbers[0][0]))
+        return not math.isfinite(total)
+
+
+def joint_layout(data: bytes) -> JointLayout | None:
+    """Find out where the numbers lie; None where there are none, or not as expected."""
     try:
-        first = JointSample.from_cdr(payloads[0])
-        position, *others = _joint_spans(payloads[0])
-    except (BridgeError, struct.error):
+        layout = JointLayout(data)
+    except BridgeError:
         return None
-    if not len(first.position) or not _differ_only_in(rows, (_STAMP, position, *others)):
-        return None
-    return first.names, _stamps_ns(rows), _numbers(rows, position)
+    return layout if layout.is_of_use else None
 
 
 def _rows(payloads: Sequence[bytes]) -> UInt8[np.ndarray, "num_messages num_bytes"] | None:
@@ -231,23 +256,6 @@ def _differ_only_in(
     for first, last in spans:
         fixed[first:last] = False
     return bool((rows[:, fixed] == rows[0, fixed]).all())
-
-
-def _joint_spans(payload: bytes) -> tuple[Span, Span, Span]:
-    """Where position, velocity and effort lie, behind the frame and the names."""
-    at = _aligned(_behind_text(payload, _FRAME_AT), 4)
-    (count,) = struct.unpack_from("<I", payload, at)
-    at += 4
-    for _ in range(count):
-        at = _behind_text(payload, _aligned(at, 4))
-    spans: list[Span] = []
-    for _ in range(3):
-        at = _aligned(at, 4)
-        (count,) = struct.unpack_from("<I", payload, at)
-        at = _aligned(at + 4, 8) if count else at + 4
-        spans.append((at, at + 8 * count))
-        at += 8 * count
-    return spans[0], spans[1], spans[2]
 
 
 def _behind_text(payload: bytes, at: int) -> int:

@@ -293,26 +293,30 @@ def _least_bytes(type_name: str) -> int:
     )
 
 
+OTHER_CDR = {2: "a parameter list (PL_CDR)", 3: "a parameter list (PL_CDR)"} | dict.fromkeys(
+    range(6, 12), "CDR version 2"
+)
+"""Encapsulations of XTypes that ROS does not use, by the second byte."""
 ENCAPSULATION_LE = b"\x00\x01\x00\x00"
 
 
 class MalformedMessageError(BridgeError):
     """The bytes are not a CDR message of the stated type."""
 
-    def __init__(self, *, type_name: str, found: str) -> None:
+    def __init__(
+        self,
+        *,
+        type_name: str,
+        found: str,
+        hint: str = "The publisher sends another type or broken CDR.",
+    ) -> None:
         """Remember the type that was expected."""
         self.type_name = type_name
-        super().__init__(
-            f"not a valid {type_name}: {found}. The publisher sends another type or broken CDR."
-        )
+        super().__init__(f"not a valid {type_name}: {found}. {hint}")
 
 
 def encode(type_name: str, message: Mapping[str, Any]) -> bytes:
-    """Serialise a message; fields left out take their ROS default (0, empty).
-
-    Args:
-        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-    """
+    """Serialise a message; fields left out take their ROS default (0, empty)."""
     out = bytearray()
     _write(out, type_name, message)
     return ENCAPSULATION_LE + bytes(out)
@@ -375,9 +379,6 @@ def decode(type_name: str, data: Buffer) -> Message:
     Arrays look into ``data``, in its byte order, and are not copied. What is made is never larger
     than a fixed multiple of ``data``, whatever lengths it claims.
 
-    Args:
-        type_name: One of ``ros2_definitions``, such as ``sensor_msgs/msg/JointState``.
-
     Raises:
         KeyError: When the type is none of ``ros2_definitions``.
     """
@@ -393,10 +394,19 @@ def decode(type_name: str, data: Buffer) -> Message:
 
 
 def _byte_order(type_name: str, data: Buffer) -> str:
+    refuse_other_cdr(type_name, data)
     if len(data) < ORIGIN or data[1] not in (0, 1):
         found = f"{len(data)} bytes without a CDR encapsulation header"
         raise MalformedMessageError(type_name=type_name, found=found)
     return "<" if data[1] == 1 else ">"
+
+
+def refuse_other_cdr(type_name: str, data: Buffer) -> None:
+    """Name an encapsulation of XTypes that is not ROS's; any other bytes pass."""
+    if len(data) >= ORIGIN and not data[0] and data[1] in OTHER_CDR:
+        found = f"{OTHER_CDR[data[1]]} (header 00 {data[1]:02x}) cannot be read"
+        hint = "Have the publisher send plain CDR of version 1."
+        raise MalformedMessageError(type_name=type_name, found=found, hint=hint)
 
 
 _FIRST_IS_HEADER = re.compile(rb"(?:\s*(?:#[^\n]*)?\n)*\s*std_msgs/(?:msg/)?Header\s+header\b")
@@ -418,11 +428,7 @@ def header_stamp(data: Buffer) -> tuple[int, int] | None:
 
 
 def with_header_stamp(data: Buffer, sec: int, nanosec: int) -> bytes:
-    """Put another time into the header a message begins with.
-
-    Args:
-        sec: Whole seconds since 1970.
-    """
+    """Put another time into the header a message begins with."""
     out = bytearray(data)
     _STAMPS["<" if data[1] else ">"].pack_into(out, ORIGIN, sec, nanosec)
     return bytes(out)

@@ -6,6 +6,7 @@ nothing else; an encoding that is no business of the function gives None.
 """
 
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +15,15 @@ from jaxtyping import UInt8
 from bridge.clock import join_ns
 from bridge.episode import schema
 from bridge.episode.cdr.codec import ENCAPSULATION_LE, Buffer, MalformedMessageError, decode
+from bridge.episode.topics import COLOR_TOPIC, DEPTH_IMAGE
 from bridge.media.color import JPEG_QUALITY, MAX_PIXELS, encode_jpeg
 from bridge.media.depth import RVL_FORMAT, pack_rvl
+from bridge.media.pixels import COLORS, YUV420, YUV422, num_rows, pixel_bytes
 
-COLOR_LAYOUTS = {
-    "rgb8": ("RGB", 3),
-    "bgr8": ("BGR", 3),
-    "rgba8": ("RGBA", 4),
-    "bgra8": ("BGRA", 4),
-    "mono8": ("GRAY", 1),
+COLOR_LAYOUTS = {"mono8": ("GRAY", 1)} | {
+    f"{name}8": (name.upper(), len(name)) for name in ("rgb", "bgr", "rgba", "bgra")
 }
-"""Colour encodings of sensor_msgs/Image: the order of their channels, and how many."""
+"""Colour encodings that JPEG takes as they are: the order of their channels, and how many."""
 SUBSAMPLING = "420"
 """Half the work and the size of full colour; cameras interpolate their colour anyway."""
 DEPTH_ENCODINGS = ("16UC1", "mono16")
@@ -72,38 +71,46 @@ def image_header(data: Buffer) -> ImageHeader:
     )
 
 
-def pixel_rows(header: ImageHeader, pixel_bytes: int) -> UInt8[np.ndarray, "rows row"]:
-    """View the pixels of a message, row padding cut off; nothing is copied.
-
-    Args:
-        pixel_bytes: Bytes of one pixel in the header's encoding: 3 for ``rgb8``, 2 for ``16UC1``.
-    """
-    height, width, step = header.height, header.width, header.step
-    row = width * pixel_bytes
+def pixel_rows(header: ImageHeader) -> UInt8[np.ndarray, "rows row"]:
+    """View the pixels of a message, row padding cut off; nothing is copied."""
+    height, width, step, encoding = header.height, header.width, header.step, header.encoding
+    depth_bytes = 4 if encoding == FLOAT_DEPTH else 2
+    row = width * (pixel_bytes(encoding) if encoding in COLORS else depth_bytes)
+    rows = num_rows(encoding, height)
     if not 0 < height * width <= MAX_PIXELS:
         raise _malformed(f"an image of {width} x {height} pixels")
+    if (encoding in YUV422 and width % 2) or (encoding in YUV420 and (width % 2 or height % 2)):
+        raise _malformed(f"{width} x {height} pixels of {encoding}, which come in pairs")
     if step < row:
-        raise _malformed(f"a step of {step} bytes for rows of {width} {header.encoding} pixels")
-    if len(header.pixels) != step * height:
-        raise _malformed(f"{len(header.pixels)} bytes for {height} rows of {step}")
-    return np.frombuffer(header.pixels, np.uint8).reshape(height, step)[:, :row]
+        raise _malformed(f"a step of {step} bytes for rows of {width} {encoding} pixels")
+    if len(header.pixels) != step * rows:
+        raise _malformed(f"{len(header.pixels)} bytes for {rows} rows of {step}")
+    return np.frombuffer(header.pixels, np.uint8).reshape(rows, step)[:, :row]
+
+
+def check_image(topic: str, header: ImageHeader) -> None:
+    """Refuse an image that nobody could read: of a strange encoding, or of another size."""
+    depths = (*DEPTH_ENCODINGS, FLOAT_DEPTH)
+    known = depths if topic.endswith(DEPTH_IMAGE) else COLORS if COLOR_TOPIC.search(topic) else None
+    if header.encoding not in (known or (*COLORS, *depths)):
+        raise no_encoding(header.encoding, known or (*COLORS, *depths))
+    pixel_rows(header)
+
+
+def no_encoding(encoding: str, known: Iterable[str]) -> MalformedMessageError:
+    """Say that an encoding cannot be read here, and which can."""
+    hint = f"Have the camera send one of {', '.join(known)}."
+    found = f"encoding {encoding!r} cannot be read"
+    return MalformedMessageError(type_name=schema.IMAGE, found=found, hint=hint)
 
 
 def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
-    """Compress a raw colour image; an alpha channel is dropped.
-
-    Args:
-        quality: JPEG quality, 1 to 100.
-
-    Returns:
-        CDR of a sensor_msgs/CompressedImage with the same stamp and frame, or None when the
-        encoding is none of ``COLOR_LAYOUTS``.
-    """
+    """Make a raw image of ``COLOR_LAYOUTS`` a CompressedImage; None of another encoding."""
     header = image_header(data)
     if header.encoding not in COLOR_LAYOUTS:
         return None
     layout, channels = COLOR_LAYOUTS[header.encoding]
-    rows = pixel_rows(header, channels)
+    rows = pixel_rows(header)
     image_u8 = rows.reshape(header.height, header.width, channels)
     try:
         jpeg = encode_jpeg(image_u8, quality, layout=layout, subsampling=SUBSAMPLING)
@@ -113,16 +120,11 @@ def image_to_jpeg(data: Buffer, quality: int = JPEG_QUALITY) -> bytes | None:
 
 
 def depth_to_compact(data: Buffer) -> bytes | None:
-    """Compress a raw depth image without loss (RVL).
-
-    Returns:
-        CDR of a sensor_msgs/CompressedImage of format ``RVL_FORMAT`` with the same stamp and
-        frame, or None when the encoding is not 16 bit.
-    """
+    """Make a raw depth image of 16 bits a CompressedImage without loss; None of another one."""
     header = image_header(data)
     if header.encoding not in DEPTH_ENCODINGS:
         return None
-    rows = pixel_rows(header, 2)
+    rows = pixel_rows(header)
     return _compressed_image(header, RVL_FORMAT, pack_rvl(rows, swap_bytes=header.is_bigendian))
 
 

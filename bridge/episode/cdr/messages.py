@@ -14,17 +14,21 @@ from bridge.episode import schema
 from bridge.episode.cdr import codec
 from bridge.episode.cdr.codec import Message
 from bridge.episode.cdr.images import (
-    COLOR_LAYOUTS,
     DEPTH_ENCODINGS,
     FLOAT_DEPTH,
     image_header,
     image_to_jpeg,
+    no_encoding,
     pixel_rows,
 )
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media import depth
-from bridge.media.color import decode_color
+from bridge.media.color import decode_color, encode_jpeg
+from bridge.media.pixels import COLORS, rgb_from
+
+FISHEYES = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4", "ftheta", "f-theta")
+"""Distortion models that bend straight lines whatever their numbers are."""
 
 
 def _header(stamp_ns: int, frame_id: str) -> dict[str, object]:
@@ -104,6 +108,12 @@ class CompressedColor:
             data=bytes(message["data"]),
         )
 
+    def decoded(self) -> np.ndarray:
+        """Decode whatever it holds, colour or depth; raises ``UnreadableImageError``."""
+        if "compressedDepth" in self.format:
+            return depth.unpack(self.format, self.data)
+        return self.image_u8()
+
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
         """Decode to sRGB; raises ``UnreadableImageError``."""
         return decode_color(self.data)
@@ -111,61 +121,54 @@ class CompressedColor:
 
 @dataclass(frozen=True, kw_only=True)
 class RawColor:
-    """An uncompressed colour image: pixels in the order that ``encoding`` states."""
+    """An uncompressed colour image, in bytes as ``encoding`` states."""
 
     stamp_ns: int
     frame_id: str
     encoding: str
-    pixels: UInt8[np.ndarray, "height width channels"]
+    rows: UInt8[np.ndarray, "rows row"]
+    swap_bytes: bool = False
 
     @staticmethod
     def from_cdr(data: bytes) -> "RawColor":
-        """Read a sensor_msgs/Image of 8-bit colour or grey; refuses other encodings."""
+        """Read a sensor_msgs/Image of colour or grey; refuses other encodings."""
         header = image_header(data)
-        if header.encoding not in COLOR_LAYOUTS:
-            raise _no_color(header.encoding)
-        channels = COLOR_LAYOUTS[header.encoding][1]
-        rows = pixel_rows(header, channels)
+        if header.encoding not in COLORS:
+            raise no_encoding(header.encoding, COLORS)
         return RawColor(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
             encoding=header.encoding,
-            pixels=rows.reshape(header.height, header.width, channels),
+            rows=pixel_rows(header),
+            swap_bytes=header.is_bigendian,
         )
 
     def image_u8(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Put the channels in order; grey becomes three equal ones, alpha is dropped."""
-        layout, channels = COLOR_LAYOUTS[self.encoding]
-        order = [0, 0, 0] if channels == 1 else [layout.index(channel) for channel in "RGB"]
-        return self.pixels[..., order]
-
-
-def _no_color(encoding: str) -> codec.MalformedMessageError:
-    found = f"encoding {encoding!r}, expected one of {', '.join(COLOR_LAYOUTS)}"
-    return codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
+        """Convert to sRGB of 8 bits; alpha is dropped."""
+        try:
+            return rgb_from(self.rows, self.encoding, swap_bytes=self.swap_bytes)
+        except ValueError as error:
+            found = str(error)
+            raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found) from error
 
 
 def color_from_message(type_name: str, data: bytes) -> CompressedColor | RawColor:
-    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``.
-
-    Args:
-        type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-    """
+    """Read a colour image, compressed or raw; both have ``stamp_ns`` and ``image_u8()``."""
     return (RawColor if type_name == schema.IMAGE else CompressedColor).from_cdr(data)
 
 
 def color_file_from_message(type_name: str, data: bytes) -> CompressedColor:
-    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw.
-
-    Args:
-        type_name: ``sensor_msgs/msg/Image`` is made a JPEG; any other is read as CompressedImage.
-    """
+    """Read a colour image as a file to show: as it was recorded, or as JPEG when it is raw."""
     if type_name != schema.IMAGE:
         return CompressedColor.from_cdr(data)
     jpeg = image_to_jpeg(data)
-    if jpeg is None:
-        raise _no_color(image_header(data).encoding)
-    return CompressedColor.from_cdr(jpeg)
+    if jpeg is not None:
+        return CompressedColor.from_cdr(jpeg)
+    color = RawColor.from_cdr(data)
+    shown = encode_jpeg(color.image_u8())
+    return CompressedColor(
+        stamp_ns=color.stamp_ns, frame_id=color.frame_id, format="jpeg", data=shown
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +201,7 @@ class DepthImage:
         """
         header = image_header(data)
         if header.encoding == FLOAT_DEPTH:
-            rows = np.ascontiguousarray(pixel_rows(header, 4))
+            rows = np.ascontiguousarray(pixel_rows(header))
             depth_m = rows.view(">f4" if header.is_bigendian else "<f4").astype(np.float32)
             return DepthImage(
                 stamp_ns=header.stamp_ns,
@@ -206,9 +209,8 @@ class DepthImage:
                 depth_mm=depth.from_metres(depth_m),
             )
         if header.encoding not in DEPTH_ENCODINGS:
-            found = f"encoding {header.encoding!r}, expected '16UC1' or '{FLOAT_DEPTH}'"
-            raise codec.MalformedMessageError(type_name=schema.IMAGE, found=found)
-        rows = np.ascontiguousarray(pixel_rows(header, 2))
+            raise no_encoding(header.encoding, (*DEPTH_ENCODINGS, FLOAT_DEPTH))
+        rows = np.ascontiguousarray(pixel_rows(header))
         return DepthImage(
             stamp_ns=header.stamp_ns,
             frame_id=header.frame_id,
@@ -217,11 +219,7 @@ class DepthImage:
 
     @staticmethod
     def from_message(type_name: str, data: bytes) -> "DepthImage":
-        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG.
-
-        Args:
-            type_name: ``sensor_msgs/msg/Image`` is read as raw; any other as CompressedImage.
-        """
+        """Read depth in any form an episode may hold: raw, or compressed as RVL or PNG."""
         if type_name == schema.IMAGE:
             return DepthImage.from_cdr(data)
         image = CompressedColor.from_cdr(data)
@@ -263,12 +261,14 @@ class CameraInfo:
     def from_cdr(data: bytes) -> "CameraInfo":
         """Read a sensor_msgs/CameraInfo; refuses lens distortion instead of ignoring it."""
         message = codec.decode(schema.CAMERA_INFO, data)
-        if np.any(np.asarray(message["d"]) != 0):
-            raise codec.MalformedMessageError(
-                type_name=schema.CAMERA_INFO,
-                found="lens distortion is not zero; publish rectified images",
-            )
-        k = message["k"]
+        k, model = message["k"], str(message["distortion_model"])
+        found = ""
+        if np.any(np.asarray(message["d"]) != 0) or model.lower() in FISHEYES:
+            found = f"lens distortion ({model or 'no model'}) is not zero; publish rectified images"
+        elif not (np.isfinite(k).all() and min(k[0], k[4]) > 0):
+            found = f"focal lengths of {k[0]:g} and {k[4]:g} pixels; calibrate the camera"
+        if found:
+            raise codec.MalformedMessageError(type_name=schema.CAMERA_INFO, found=found)
         camera = Camera.from_ros(
             width=message["width"],
             height=message["height"],
@@ -388,11 +388,7 @@ def joint_trajectory_to_cdr(
     times_ns: list[int],
     positions_rad: Float[np.ndarray, "num_points num_joints"],
 ) -> bytes:
-    """Serialise as trajectory_msgs/JointTrajectory, for viewers.
-
-    Args:
-        names: Joints, in the order of the columns of ``positions_rad``.
-    """
+    """Serialise as trajectory_msgs/JointTrajectory, for viewers."""
     points = []
     for t_ns, row in zip(times_ns, positions_rad, strict=True):
         sec, nanosec = split_ns(t_ns)

@@ -213,12 +213,7 @@ def walk_records(data: Buffer) -> Contents:
 
 
 def unpack_front(head: ChunkHead, data: bytes) -> bytes:
-    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified.
-
-    Args:
-        head: What the chunk's record claims of itself; the size claimed bounds what is unpacked.
-        data: Its data, still packed, from the front; the end may be missing.
-    """
+    """Return as many records of a chunk as its data, perhaps cut, holds; nothing is verified."""
     if head.compression == "":
         return data
     limit = min(head.uncompressed_size or MAX_CHUNK_BYTES, MAX_CHUNK_BYTES)

@@ -182,10 +182,6 @@ class OpenChunk:
     ) -> None:
         """Append one message whose payload has ``length`` bytes.
 
-        Args:
-            sequence: The publisher's number of the message, 0 to 2^32 - 1.
-            data: The payload; without ``gather`` it must not change before the chunk is written.
-
         Raises:
             struct.error: When a number does not fit its field; nothing is appended then.
         """
@@ -350,11 +346,7 @@ class DataSection:
 
 
 def index_records(index: dict[int, list[int]], start: int) -> tuple[bytes, dict[int, int]]:
-    """Return a chunk's message index records and where each lies, the first at ``start``.
-
-    Args:
-        index: By channel id: log time and offset of each message, one after the other.
-    """
+    """Return a chunk's message index records and where each lies, the first at ``start``."""
     records = [mcap_format.message_index(*item) for item in index.items()]
     offsets = {}
     for channel_id, encoded in zip(index, records, strict=True):

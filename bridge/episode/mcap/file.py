@@ -72,11 +72,7 @@ def metadata_entry(place: RecordSpan, record: records.Metadata) -> records.Metad
 def attachment_entry(
     place: RecordSpan, record: records.Attachment, data_size: int
 ) -> records.AttachmentIndex:
-    """Make the index entry of an attachment.
-
-    Args:
-        data_size: Of the data [bytes].
-    """
+    """Make the index entry of an attachment."""
     return records.AttachmentIndex(
         offset=place.offset,
         length=place.end - place.offset,
@@ -112,11 +108,7 @@ class Seen:
         self.end_ns = max(self.end_ns, head.log_time_ns)
 
     def define(self, place: RecordSpan, record: records.McapRecord | None) -> Iterator[str]:
-        """Take a schema, channel or metadata record; yields what is wrong with it.
-
-        Args:
-            record: What was read there; None, and any other kind of record, is passed over.
-        """
+        """Take a schema, channel or metadata record; yields what is wrong with it."""
         if isinstance(record, records.Metadata):
             self.metadata.append(metadata_entry(place, record))
         elif isinstance(record, records.Schema):
@@ -211,11 +203,7 @@ class LooseMessages:
 
 
 def damaged(path: Path, error: BaseException) -> EpisodeError:
-    """Make one message of what reading a file's bytes raised.
-
-    Args:
-        error: What went wrong; of its text 120 characters are kept.
-    """
+    """Make one message of what reading a file's bytes raised."""
     return EpisodeError(
         path=path,
         found=f"damaged ({type(error).__name__}: {str(error)[:120]})",
@@ -337,11 +325,7 @@ def read_footer(stream: ByteStream) -> tuple[records.Footer, int]:
 
 
 def read_summary(stream: ByteStream, footer: records.Footer, footer_at: int) -> Summary | None:
-    """Read the summary section with its CRC checked, None where there is none.
-
-    Args:
-        footer: The last record, with the summary's place and CRC (0: not checked).
-    """
+    """Read the summary section with its CRC checked, None where there is none."""
     if not footer.summary_start:
         return None
     stream.seek(footer.summary_start)
@@ -362,10 +346,8 @@ _SHARED_BYTES = 1 << 14
 """Longer definitions are not remembered."""
 
 
-@lru_cache(maxsize=1024)
-def _parse_once(opcode: int, body: bytes) -> records.McapRecord | None:
-    """Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
-    return parse(opcode, body)
+_parse_once = lru_cache(maxsize=1024)(parse)
+"""Thousands of episodes repeat the same schemas and channels; nobody changes a record."""
 
 
 def _add(summary: Summary, record: records.McapRecord | None) -> None:

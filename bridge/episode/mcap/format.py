@@ -80,13 +80,7 @@ def header(profile: str, library: str) -> bytes:
 
 
 def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
-    """Encode a schema; ids start at 1.
-
-    Args:
-        schema_id: 1 to 65535, once in a file.
-        encoding: How ``data`` is written, such as ``ros2msg`` or ``jsonschema``; "" for no schema
-            text.
-    """
+    """Encode a schema; ids start at 1."""
     size = struct.pack("<I", len(data))
     return record(SCHEMA, struct.pack("<H", schema_id), text(name), text(encoding), size, data)
 
@@ -98,13 +92,7 @@ def channel(
     message_encoding: str,
     about: Mapping[str, str] = MappingProxyType({}),
 ) -> bytes:
-    """Encode a channel with its metadata; schema id 0 is none.
-
-    Args:
-        channel_id: 0 to 65535, once in a file.
-        schema_id: Of a schema before it in the file, or 0.
-        message_encoding: Such as ``cdr`` or ``json``.
-    """
+    """Encode a channel with its metadata; schema id 0 is none."""
     ids = struct.pack("<HH", channel_id, schema_id)
     return record(CHANNEL, ids, text(topic), text(message_encoding), text_map(about))
 
@@ -112,11 +100,7 @@ def channel(
 def chunk_head(
     *, start_ns: int, end_ns: int, size: int, crc: int, compression: str, data_size: int
 ) -> bytes:
-    """Encode everything of a chunk that stands before its data.
-
-    Args:
-        compression: Empty, lz4 or zstd.
-    """
+    """Encode everything of a chunk that stands before its data."""
     fields = CHUNK_FIELDS.pack(start_ns, end_ns, size, crc) + text(compression)
     fields += struct.pack("<Q", data_size)
     return RECORD_HEAD.pack(CHUNK, len(fields) + data_size) + fields

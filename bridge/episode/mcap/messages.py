@@ -286,11 +286,7 @@ _Entry = tuple[int, int, int, _Source]
 
 
 def merged(files: Sequence[McapFile], select: Selection) -> Iterator[Stored]:
-    """Yield the wanted messages in order of log time, then of file, then of place in the file.
-
-    Args:
-        files: The parts of an episode; their order decides between equal log times.
-    """
+    """Yield the wanted messages in order of log time, then of file, then of place in the file."""
     opened = [_OpenFile(file, number, select) for number, file in enumerate(files)]
     heap: list[_Entry] = []
     for file in opened:

@@ -98,11 +98,7 @@ class PartFile:
         sync_folder(final_path.parent)
 
     def truncate(self, offset: int, crc: int) -> None:
-        """Drop everything from ``offset`` on; ``crc`` is that of what stays.
-
-        Args:
-            offset: The new length of the file [bytes].
-        """
+        """Drop everything from ``offset`` on; ``crc`` is that of what stays."""
         os.ftruncate(self._descriptor, offset)
         self.offset, self.crc = offset, crc
 
@@ -178,11 +174,7 @@ class BackgroundSync:
 
 
 def open_part(path: Path, *, replace_dead: bool) -> PartFile:
-    """Create ``<path>.part``, locked, for an episode that is not there yet.
-
-    Args:
-        replace_dead: Remove a part whose writer died, instead of refusing.
-    """
+    """Create ``<path>.part``, locked, for an episode that is not there yet."""
     part_path = path.with_name(path.name + ".part")
     if path.exists():
         raise _exists(path)
@@ -240,6 +232,15 @@ def lock_dead(path: Path, *, write: bool = True) -> int | None:
         raise
     os.close(descriptor)
     return None
+
+
+def told_unfinished(path: Path) -> tuple[str, bool]:
+    """Name a file that is not finished and what to do, and say whether its writer is alive."""
+    descriptor = lock_dead(path, write=False)
+    if descriptor is None:
+        return f"{path} is being written", True
+    os.close(descriptor)
+    return f"{path} is not finished: its writer was killed; robot-gst recover {path}", False
 
 
 def sync_folder(folder: Path) -> None:

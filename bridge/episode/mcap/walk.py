@@ -77,11 +77,7 @@ class RecordSpan(NamedTuple):
 
 
 def walk(stream: ByteStream, start: int, end: int) -> Iterator[RecordSpan]:
-    """Yield the places of all records between two offsets; the stream may be used in between.
-
-    Args:
-        end: Where the last one must end.
-    """
+    """Yield the places of all records between two offsets; the stream may be used in between."""
     at = start
     while at < end:
         stream.seek(at)
@@ -191,11 +187,7 @@ class FoundAttachment(NamedTuple):
 
 
 def attachment_of(stream: ByteStream, place: RecordSpan, *, keep: bool = True) -> FoundAttachment:
-    """Read an attachment record and check its CRC; without ``keep`` its data is left empty.
-
-    Args:
-        keep: Hold the data in memory; without it, it is read in pieces for the CRC and forgotten.
-    """
+    """Read an attachment record and check its CRC; without ``keep`` its data is left empty."""
     stream.seek(place.offset + RECORD_HEAD.size)
     fields = _Fields(stream.read(min(place.length, PIECE_BYTES)))
     try:
@@ -321,11 +313,7 @@ class MessageHead(NamedTuple):
 
 
 def message_head(data: bytes | memoryview, at: int, where: int) -> MessageHead:
-    """Read the front of the message record at ``at``; ``where`` becomes its ``at``.
-
-    Args:
-        where: Its place as the caller counts it: in the chunk, or in the file [bytes].
-    """
+    """Read the front of the message record at ``at``; ``where`` becomes its ``at``."""
     _, length, channel_id, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, at)
     if length < MESSAGE_FIELDS:
         raise BrokenRecordError(f"a message record of {length} bytes")

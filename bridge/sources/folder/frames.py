@@ -78,11 +78,7 @@ class FolderIndex:
 def checked_rotation(
     path: Path, R: Float[np.ndarray, "3 3"], where: str
 ) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation nearest to a matrix written with few digits.
-
-    Args:
-        R: The matrix as read; each singular value within ``ROTATION_TOLERANCE`` of 1.
-    """
+    """Return the rotation nearest to a matrix written with few digits."""
     singular = np.linalg.svd(R, compute_uv=False)
     if np.any(np.abs(singular - 1) > ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
         raise FolderError(
@@ -141,11 +137,7 @@ def read_stored_depth(path: Path) -> UInt16[np.ndarray, "height width"]:
 
 
 def require_image(path: Path, *, what: str, named_by: str) -> Path:
-    """Return the path if the file is there.
-
-    Args:
-        named_by: Who says that it exists, for the error: ``rgb.txt line 3 names it``.
-    """
+    """Return the path if the file is there."""
     if not path.is_file():
         raise PathNotFoundError(
             path=path,
@@ -163,12 +155,7 @@ def camera_of(
     option: str,
     path: Path,
 ) -> Camera:
-    """Make a camera from ``(fx, fy, cx, cy)`` [px, pixel centres at whole numbers].
-
-    Args:
-        intrinsics: As given by the user, or None.
-        nominal: Documented values, valid for 640 x 480 images only.
-    """
+    """Make a camera from ``(fx, fy, cx, cy)`` [px, pixel centres at whole numbers]."""
     if intrinsics is None and size != VGA:
         raise FolderError(
             path=path,

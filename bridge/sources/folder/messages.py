@@ -93,11 +93,7 @@ INFO_PERIOD_S = 1.0
 
 
 def num_frames(index: FolderIndex, config: FolderConfig) -> int:
-    """How many frames will be sent.
-
-    Args:
-        config: Its ``max_frames`` bounds the number; None: all.
-    """
+    """How many frames will be sent."""
     return min(len(index.frames), config.max_frames or len(index.frames))
 
 
@@ -108,9 +104,6 @@ def frame_times_ns(
 
     Real times are kept; moved so that the first is ``start_ns`` where that is given. A folder
     without times gets the configured rate, from ``start_ns`` or 0.
-
-    Args:
-        start_ns: Time of the first image [ns since 1970]; None: as the folder says, else 0.
 
     Raises:
         UsageError: When a rate is asked of a folder that has real times.
@@ -152,11 +145,7 @@ def describe_folder(index: FolderIndex, config: FolderConfig) -> dict[str, Any]:
 def folder_messages(
     index: FolderIndex, config: FolderConfig, start_ns: int | None
 ) -> Iterator[list[StampedMessage]]:
-    """Yield the messages of one frame after another.
-
-    Args:
-        start_ns: Stamp of the first frame; None keeps the folder's own times (0 without any).
-    """
+    """Yield the messages of one frame after another."""
     times = frame_times_ns(index, config, start_ns)
     shift_ns = times[0][0] - (index.frames[0].color_stamp_ns or 0)
     poses = _pose_messages(index, config, times, shift_ns)
@@ -307,11 +296,7 @@ def find_frames(folder: Path) -> list[Path]:
 
 
 def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
-    """Read a sequence folder.
-
-    Args:
-        config: Its intrinsics and unit of depth go before those of the folder and the data set.
-    """
+    """Read a sequence folder."""
     frames, num_unposed = [], 0
     for color_path in find_frames(folder):
         stem = color_path.name.split(".")[0]

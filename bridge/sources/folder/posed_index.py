@@ -8,7 +8,8 @@ backwards). Lenses that bend straight lines are refused.
 
 import json
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,9 @@ PARAMETERS = {
 }
 """COLMAP's models that are read, with the names of their numbers."""
 BENDING_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_READ = {"frames", "camera_model", "is_fisheye", "w", "h", "camera_angle_x", *BENDING_KEYS} | {
+    *("fl_x", "fl_y", "cx", "cy", "file_path", "transform_matrix")
+}
 STRAIGHTEN = "Straighten the images: colmap image_undistorter writes PINHOLE."
 MOST_PX = 65_500
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -62,6 +66,8 @@ class PosedIndex:
     sparse_range: tuple[float, float] | None
     """Distances of COLMAP's points along the optical axes; None without points."""
     assumed: dict[str, str] = field(default_factory=dict)
+    unused: tuple[tuple[str, str, bool], ...] = ()
+    """Keys that are not read, why, and whether a later command needs them."""
 
     def typical_distance(self) -> float:
         """How far the cameras are from what they look at, in the folder's own unit of length.
@@ -82,11 +88,7 @@ class PosedIndex:
 
 
 def read_posed_index(folder: Path) -> PosedIndex:
-    """Read whichever of the two layouts the folder has.
-
-    Args:
-        folder: Holds ``transforms.json``, or COLMAP's text model in itself or in ``sparse/0``.
-    """
+    """Read whichever of the two layouts the folder has."""
     if (folder / TRANSFORMS).is_file():
         return _read_transforms(folder)
     for place in COLMAP_FOLDERS:
@@ -227,9 +229,11 @@ def _read_transforms(folder: Path) -> PosedIndex:
     cameras: dict[str, Camera] = {}
     names: dict[Camera, str] = {}
     images, assumed = [], {}
+    keys = Counter(record.keys())
     for number, frame in enumerate(frames, start=1):
         if not isinstance(frame, dict):
             raise FolderError(path=path, found=f"frame {number} is no object")
+        keys.update(frame.keys())
         camera, centred = _frame_camera(path, number, {**record, **frame})
         if centred:
             assumed["principal point"] = "the centre of the image"
@@ -247,15 +251,25 @@ def _read_transforms(folder: Path) -> PosedIndex:
     ordered = tuple(sorted(images, key=lambda image: str(image.path)))
     return PosedIndex(
         path=path, layout=TRANSFORMS, name=folder.resolve().name, cameras=cameras, images=ordered,
-        sparse_range=None, assumed=assumed,
+        sparse_range=None, assumed=assumed, unused=tuple(_unused(keys)),
     )  # fmt: skip
+
+
+def _unused(keys: Counter[str]) -> Iterator[tuple[str, str, bool]]:
+    """Say which keys nobody reads, in how many frames."""
+    for key, count in keys.items():
+        if key in _READ:
+            continue
+        is_depth = key == "depth_file_path"
+        why = "depth is not read here; import rgbd reads it" if is_depth else "not read"
+        yield (f"{key} of {count} frames" if count > 1 else key), why, is_depth
 
 
 def _frame_camera(path: Path, number: int, record: dict[str, Any]) -> tuple[Camera, bool]:
     """The camera of one frame, and whether its principal point had to be assumed."""
     what = f"frame {number}"
     model = str(record.get("camera_model", "OPENCV"))
-    bent = [key for key in BENDING_KEYS if record.get(key)]
+    bent = [key for key in ("is_fisheye", *BENDING_KEYS) if record.get(key)]
     if bent or model not in (*PARAMETERS, "OPENCV"):
         found = f"{what} has {bent[0]}" if bent else f"{what} has the model {model!r}"
         raise FolderError(path=path, found=found, hint=STRAIGHTEN)

@@ -30,11 +30,7 @@ _KEYS_HINT = "docs/rgbd_folder.md lists the keys."
 
 
 def read_scene(folder: Path, config: FolderConfig) -> FolderIndex:
-    """Read and check ``scene.json``; every image file it names must exist.
-
-    Args:
-        folder: Holds ``scene.json``; the paths in it start here.
-    """
+    """Read and check ``scene.json``; every image file it names must exist."""
     path = folder / INDEX_NAME
     refuse_scale_without_use(config, path)
     record = _load(path)

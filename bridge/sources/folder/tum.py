@@ -62,12 +62,7 @@ def read_files(path: Path) -> list[StampedFile]:
 def associate(
     colors: Sequence[StampedFile], depths: Sequence[StampedFile]
 ) -> list[tuple[StampedFile, StampedFile]]:
-    """Pair each colour with a depth image of its own, the closest pairs first, within 20 ms.
-
-    Args:
-        colors: In the order of the result.
-        depths: Ascending in time.
-    """
+    """Pair each colour with a depth image of its own, the closest pairs first, within 20 ms."""
     stamps = [depth.stamp_ns for depth in depths]
     candidates = []
     for number, color in enumerate(colors):
@@ -178,11 +173,7 @@ def find_lists(folder: Path) -> list[Path]:
 
 
 def read_tum(folder: Path, config: FolderConfig) -> FolderIndex:
-    """Read a folder of the benchmark.
-
-    Args:
-        config: Its intrinsics and unit of depth go before those of the folder and the benchmark.
-    """
+    """Read a folder of the benchmark."""
     pairs, num_unpaired, path = _pairs(folder)
     pose_path = folder / POSE_LIST
     if not pose_path.is_file():

@@ -43,11 +43,7 @@ class Pace:
     """Says when a message is due."""
 
     def __init__(self, rate: float, *, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """Begin with the first message.
-
-        Args:
-            monotonic: The clock [s].
-        """
+        """Begin with the first message."""
         self._rate = rate
         self._monotonic = monotonic
         self._first: tuple[int, float] | None = None

@@ -1,6 +1,7 @@
 """Contracts of cells: what they may hold, what they are learned from, and when they are broken."""
 
 import itertools
+import random
 from pathlib import Path
 
 import pytest
@@ -14,15 +15,15 @@ from bridge.episode.contract import (
     ContractError,
     Presence,
     Span,
+    TopicReport,
     TopicRule,
-    breaches_of,
     contract_from,
     find_contract,
+    findings_of,
+    health_lines,
     judge,
     learn_contract,
-    presence_lines,
     read_contract,
-    unknown_tails,
     unseen_losses,
     write_contract,
 )
@@ -52,7 +53,15 @@ def broken(
     span = Span(NS_PER_S, NS_PER_S + round(end_s * NS_PER_S), pauses)
     presences = {} if presence is None else {JOINTS: presence}
     reports = judge(presences, Contract(topics={JOINTS: rule}), span, {JOINTS: lost})
-    return breaches_of(reports)
+    return told(reports, presences)
+
+
+def told(
+    reports: dict[str, TopicReport], presences: dict[str, Presence], name: str = "contract_broken"
+) -> list[str]:
+    """What is found under one name."""
+    found = findings_of(reports, presences, 11 * NS_PER_S)
+    return [f"{each.about}: {each.text}" for each in found if each.name == name]
 
 
 def test_a_contract_that_is_kept_is_not_broken() -> None:
@@ -123,15 +132,48 @@ def test_a_silence_is_told_exactly_when_one_is_longer_than_allowed(
 def test_without_a_contract_only_a_regular_stream_that_ends_early_has_an_unknown_tail(
     stamps: list[float], is_unknown: bool
 ) -> None:
-    reports = judge({JOINTS: seen(*stamps)}, None, Span(NS_PER_S, 11 * NS_PER_S), {})
-    assert bool(unknown_tails(reports)) == is_unknown
-    assert breaches_of(reports) == []
+    presences = {JOINTS: seen(*stamps)}
+    reports = judge(presences, None, Span(NS_PER_S, 11 * NS_PER_S), {})
+    assert bool(told(reports, presences, "tail_unknown")) == is_unknown
+    assert told(reports, presences) == []
 
 
 def test_events_promise_no_next_one_however_many_came() -> None:
     span = Span(NS_PER_S, 11 * NS_PER_S)
-    reports = judge({"/lab/event": seen(*steady(1.0, 4.0))}, None, span, {})
-    assert unknown_tails(reports) == []
+    presences = {"/lab/event": seen(*steady(1.0, 4.0), *steady(5.0, 11.0, 1.0))}
+    reports = judge(presences, None, span, {})
+    assert list(findings_of(reports, presences, span.end_ns)) == []
+
+
+@pytest.mark.parametrize(
+    ("stamps", "found"),
+    [
+        (
+            steady(1.0, 4.0, 30.0) + steady(5.0, 15.0, 1.6),
+            ["1.6 messages a second instead of 30.0"],
+        ),
+        (steady(1.0, 4.0, 30.0) + steady(5.0, 15.0, 10.0), []),  # a third of it: no collapse
+        (steady(1.0, 11.0, 1.6), []),  # it was never faster
+        ([*steady(1.0, 4.0, 30.0), 6.0, 6.03, 8.0, 8.03, 10.0], []),  # hiccups
+    ],
+)
+@pytest.mark.parametrize("jitter_s", [0.0, 0.005])
+def test_without_a_contract_a_rate_that_collapses_is_named(
+    stamps: list[float], found: list[str], jitter_s: float
+) -> None:
+    rng = random.Random(0)
+    moved = [stamp + rng.uniform(-jitter_s, jitter_s) for stamp in stamps]
+    presences = {JOINTS: seen(*moved)}
+    span = Span(NS_PER_S, 16 * NS_PER_S)
+    reports = judge(presences, None, span, {})
+    words = told(reports, presences, "rate_collapsed")
+    assert len(words) == len(found)
+    for text, expected in zip(words, found, strict=True):
+        first, last = (float(w) for w in (text.split()[1], text.split()[-1]))
+        assert first == pytest.approx(float(expected.split()[0]), rel=0.15)
+        assert last == pytest.approx(30.0, rel=0.05)
+    reports = judge(presences, Contract(topics={JOINTS: TopicRule()}), span, {})
+    assert told(reports, presences, "rate_collapsed") == []
 
 
 def test_a_contract_survives_its_file_and_its_record(tmp_path: Path) -> None:
@@ -205,11 +247,15 @@ def test_what_is_learned_is_kept_by_the_episode_it_was_learned_from() -> None:
         "/standin/truth/object/cube/pose",
         "/recorder/drops",
     }
-    assert breaches_of(judge(presences, contract, Span(NS_PER_S, 11 * NS_PER_S), {})) == []
+    reports = judge(presences, contract, Span(NS_PER_S, 11 * NS_PER_S), {})
+    assert told(reports, presences) == []
 
 
 def test_records_of_other_programs_are_no_sentences() -> None:
-    assert presence_lines({"breaches": 3, "unknown_tails": None, "unnumbered": [1]}) == []
+    odd = {"breaches": 3, "unknown_tails": None, "unnumbered": [1], "findings": [{"name": 1}]}
+    assert health_lines(odd) == []
+    old = {"breaches": ["/a: silent"], "unknown_tails": ["/b: tail unknown"]}
+    assert health_lines(old) == ["/a: silent", "/b: tail unknown"]
     assert unseen_losses({"/b": 2, "/a": 0}) == [
         "/b: 2 messages carry no sequence number; losses of it cannot be seen"
     ]

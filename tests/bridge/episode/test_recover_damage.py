@@ -11,7 +11,9 @@ from mcap_samples import read_all, some_messages, write_official, write_ours
 
 from bridge.episode import schema
 from bridge.episode.check import check_episode
+from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+from bridge.episode.mcap.scan import Chunk, scan
 from bridge.episode.mcap.walk import MAX_CHUNK_BYTES
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.recover import recover
@@ -230,3 +232,20 @@ def test_a_chunk_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
         report.output.unlink()
         if report.original is not None:
             report.original.unlink()
+
+
+@pytest.mark.parametrize("name", ["d.mcap.part", "d.mcap"])
+def test_a_chunk_that_stands_twice_is_kept_once(tmp_path: Path, name: str) -> None:
+    whole = write_ours(tmp_path / "w.mcap", MESSAGES, compress=False).read_bytes()
+    with (tmp_path / "w.mcap").open("rb") as stream:
+        chunks = [
+            found
+            for found in scan(RecordFile(stream.fileno()))
+            if isinstance(found, Chunk) and found.contents.num_messages
+        ]
+    second = bytes(chunks[1].raw)
+    at = whole.index(second) + len(second)
+    (tmp_path / name).write_bytes(whole[:at] + second + whole[at:])
+    report = recover(tmp_path / name)
+    assert report.output is not None
+    assert sorted(read_all(report.output)) == sorted(MESSAGES)

@@ -61,7 +61,7 @@ def test_a_bare_png_file_is_depth_too() -> None:
 
 
 @pytest.mark.parametrize(
-    "form", ["32FC1; compressedDepth rvl", "16UC1; compressedDepth zstd", "jpeg", ""]
+    "form", ["64FC1; compressedDepth rvl", "16UC1; compressedDepth zstd", "jpeg", ""]
 )
 def test_other_formats_are_refused_by_name(form: str) -> None:
     with pytest.raises(UnreadableImageError, match="Expected 16-bit depth as PNG or RVL"):

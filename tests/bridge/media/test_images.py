@@ -45,5 +45,5 @@ def test_arbitrary_bytes_are_no_image(data: bytes) -> None:
 
 
 def test_an_eight_bit_image_is_no_depth() -> None:
-    with pytest.raises(UnreadableImageError, match="16 bit"):
+    with pytest.raises(UnreadableImageError, match="16-bit"):
         decode_depth_png(png(np.zeros((4, 4), dtype=np.uint8)))

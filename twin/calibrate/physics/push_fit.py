@@ -66,11 +66,7 @@ def load_push(run_path: Path, episode_id: str) -> Push | None:
 
 
 def frictions(surface: float, hand: float, config: PhysicsConfig) -> PhysicsConfig:
-    """Set effective frictions; the engine multiplies both partners'.
-
-    Args:
-        config: Everything else, the object's own coefficient among it.
-    """
+    """Set effective frictions; the engine multiplies both partners'."""
     own = config.object_friction
     return replace(config, surface_friction=surface / own, finger_friction=hand / own)
 
@@ -125,22 +121,14 @@ Grid = Float[np.ndarray, "num_runs num_fingers num_surface num_hand"]
 
 
 def least(grid: Grid, runs: Sequence[int]) -> tuple[int, int, int]:
-    """Indices of the point with the least mean squared error over some runs.
-
-    Args:
-        grid: End point errors [m].
-    """
+    """Indices of the point with the least mean squared error over some runs."""
     cost = (grid[list(runs)] ** 2).mean(axis=0)
     a, b, c = np.unravel_index(int(cost.argmin()), cost.shape)
     return int(a), int(b), int(c)
 
 
 def resampled(grid: Grid, seed: int) -> np.ndarray:
-    """Points found again on resamples of the runs: ``RESAMPLES`` rows of three indices.
-
-    Args:
-        grid: End point errors [m].
-    """
+    """Points found again on resamples of the runs: ``RESAMPLES`` rows of three indices."""
     rng = np.random.default_rng(seed)
     draws = rng.integers(0, len(grid), size=(RESAMPLES, len(grid)))
     return np.array([least(grid, draw.tolist()) for draw in draws])

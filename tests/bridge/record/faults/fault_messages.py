@@ -11,6 +11,8 @@ from bridge.episode.cdr.messages import CompressedColor, DepthImage, JointSample
 
 STAMP = slice(4, 12)
 """Where a stamped CDR message holds its stamp; another one makes another message."""
+NUMBER = b"number: "
+"""In the comment of a JPEG: eight digits behind it make another picture of it."""
 JOINTS, GRIPPER = "/cell/joint_states", "/cell/gripper/state"
 COLOR, DEPTH, RAW = (
     "/cell/cam/a/color/image",
@@ -50,7 +52,8 @@ def jpeg(height: int = 480, width: int = 640) -> bytes:
     rng = np.random.default_rng(3)
     blocks = rng.integers(0, 255, (height // 8, width // 8, 3), np.uint8)
     stream = io.BytesIO()
-    Image.fromarray(blocks.repeat(8, axis=0).repeat(8, axis=1)).save(stream, "JPEG")
+    picture = Image.fromarray(blocks.repeat(8, axis=0).repeat(8, axis=1))
+    picture.save(stream, "JPEG", comment=NUMBER + b"0" * 8)
     return stream.getvalue()
 
 

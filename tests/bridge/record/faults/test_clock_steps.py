@@ -52,4 +52,6 @@ def test_a_clock_set_by_an_hour_and_back_reorders_nothing_and_is_noted(cell: Fau
     noted = [event["data"]["step_ns"] for event in events(Episode.open(path))]
     assert [round(step / HOUR_NS) for step in noted] == [1, -1]
     assert metadata(path, "recorder")["clock_steps_ns"] == noted
-    assert check_code(path) == 0
+    named = [(each["name"], each["text"][:15]) for each in answer["findings"]]
+    assert named == [("host_clock_jump", "set ahead by 36"), ("host_clock_jump", "set back by 360")]
+    assert check_code(path) == 3

@@ -122,7 +122,7 @@ def test_numbers_and_times_no_publisher_has_are_recorded_all_the_same(
     answer = live.stop()
     assert (answer["messages"], answer["lost"], answer["undecodable"]) == (2, 0, 0)
     assert [f.digest for f in read(live.path(name))] == [s.digest for s in live.sent()]
-    assert check_code(live.path(name)) == 0
+    assert check_code(live.path(name)) == (3 if source_ns > 2**62 else 0)  # no time of today
 
 
 ODD_TOPICS = (

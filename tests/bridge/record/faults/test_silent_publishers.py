@@ -77,8 +77,9 @@ def test_joints_that_stop_are_named_live_and_in_the_file(
     wait_until(asker, lambda now: now["silent"][0]["silent_s"] > 1.2, "a longer silence")
     answer = asker.ask("stop")["ok"]
     assert answer["lost"] == 0
-    (said,) = answer["unknown_tails"]
-    assert said.startswith(f"{JOINTS}: tail unknown, nothing came in the last ")
+    (found,) = answer["findings"]
+    assert (found["name"], found["about"]) == ("tail_unknown", JOINTS)
+    assert found["text"].startswith("nothing came in the last ")
     assert [data["topic"] for data in notes(cell, "silent")] == [JOINTS]
     presence = metadata(cell.path("t1"), "presence")
     assert presence["topics"][JOINTS]["tail"] == "unknown"
@@ -107,7 +108,9 @@ def test_a_required_topic_that_is_missing_refuses_a_start(cell: FaultCell) -> No
     answer = asker.ask("start", {"id": "t0", "anyway": True})["ok"]
     assert answer["missing"] == [f"{JOINTS} has not been seen"]
     answer = asker.ask("stop")["ok"]
-    assert answer["breaches"] == [f"{JOINTS}: no message, and the contract requires it"]
+    (found,) = answer["findings"]
+    assert (found["name"], found["about"]) == ("contract_broken", JOINTS)
+    assert found["text"] == "no message, and the contract requires it"
     assert check_code(cell.path("t0")) == 3
     flow.flow(60.0, "joints")
     wait_until(asker, lambda status: not status["missing"], "that nothing is missing")
@@ -115,7 +118,7 @@ def test_a_required_topic_that_is_missing_refuses_a_start(cell: FaultCell) -> No
     begun = wait_until(asker, lambda status: status.get("messages", 0) > 500, "500 messages")
     assert not begun["silent"]
     answer = asker.ask("stop")["ok"]
-    assert (answer["breaches"], answer["lost"]) == ([], 0)
+    assert (answer["findings"], answer["lost"]) == ([], 0)
     assert check_code(cell.path("t1")) == 0
     flow.kill()
     wait_until(asker, silent, "the silence while idle")
@@ -130,7 +133,7 @@ def test_a_recorder_that_starts_by_itself_waits_for_what_is_required(cell: Fault
     flow = cell.publisher()
     flow.flow(60.0, "joints")
     wait_until(flow_asker := cell.publisher(), lambda s: s.get("messages", 0) > 100, "messages")
-    assert flow_asker.ask("stop")["ok"]["breaches"] == []
+    assert flow_asker.ask("stop")["ok"]["findings"] == []
 
 
 def test_a_message_that_cannot_be_taken_in_does_not_end_the_hearing(cell: FaultCell) -> None:
@@ -188,6 +191,6 @@ def test_a_contract_is_learned_from_a_good_episode_and_holds_the_next(cell: Faul
     flow.kill()
     wait_until(asker, lambda status: silent(status) == {COLOR, GRIPPER, JOINTS}, "all silent")
     answer = asker.ask("stop")["ok"]
-    assert len(answer["breaches"]) >= 3
+    assert [each["name"] for each in answer["findings"]].count("contract_broken") >= 3
     report = json.loads(robot_gst_output("check", str(cell.path("t1")), "--json"))
     assert report["episodes"][0]["state"] == "contract broken"

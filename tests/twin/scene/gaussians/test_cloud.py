@@ -141,3 +141,12 @@ def test_marks_of_what_nobody_measured_go_with_the_gaussians(tmp_path: Path) -> 
         np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").completed, cloud.completed)
         # A file without guesses has the columns that it always had.
         assert (b"property float completed" in (tmp_path / "a.ply").read_bytes()) == (cloud is both)
+
+
+def test_a_header_with_line_ends_of_windows_is_read(tmp_path: Path) -> None:
+    cloud = shiny_cloud(5, 0)
+    write_ply(tmp_path / "a.ply", cloud)
+    head, mark, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    windows = (head + mark).replace(b"\n", b"\r\n")
+    (tmp_path / "b.ply").write_bytes(windows + body)
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means_m, cloud.means_m)
