@@ -1,11 +1,10 @@
 """Draw the rebuilt scene, also in another state than scanned: objects moved, the robot posed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt16
+from jaxtyping import Float, Float32, Int, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -20,13 +19,12 @@ from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.trial import TrialInScene, open_trial
 
 PROBES = 9
 """Instants of an episode at which a camera's place in the hand is looked at."""
@@ -36,47 +34,24 @@ MOVED_M = 0.02
 """A hand that moved less says nothing about what it carries."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Composed:
-    """What is drawn."""
-
-    cloud: GaussianCloud
-    robot: str
-    """How the robot stands, or why it is not drawn."""
-    posture: Posture | None
-    """None: no robot is drawn."""
-    parts: MovableScene
-
-
-def compose(
-    run: RunFolder, scene: Scene, episode: Episode, stamp_ns: int, config: RenderConfig
-) -> Composed:
-    """Put background, objects and robot together as the settings say."""
-    parts = read_movable_scene(run, scene)
-    places = object_places(config.object, list(parts.objects))
-    if not parts.links:
-        reason = why_no_robot(scene)
+def posture_of(
+    trial: TrialInScene, stamp_ns: int, config: RenderConfig
+) -> tuple[Posture | None, str, str]:
+    """How the robot stands: posture or None, its URDF, and where that comes from or why not."""
+    if not trial.parts.links:
         if config.joints is not None:
-            message = f"--joints cannot be followed: {reason}."
+            message = f"--joints cannot be followed: {trial.robot.removeprefix('not drawn: ')}."
             raise UsageError(message)
-        robot = f"not drawn: {reason}"
-        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
+        return None, "", trial.robot
     try:
-        urdf, posture = _posture(episode, stamp_ns, config)
+        urdf, posture = _posture(trial.recorded, stamp_ns, config)
     except GstError as error:
         if config.joints is not None:
             raise
-        robot = f"not drawn: {error}"
-        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
-    source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
-    cloud = parts.at(places, posture, urdf)
-    return Composed(cloud=cloud, robot=f"joints {source}", posture=posture, parts=parts)
-
-
-def why_no_robot(scene: Scene) -> str:
-    """Why a scene without Gaussians of the robot has none."""
-    remark = scene.record.get("robot", {}).get("remark")
-    return "the scene has no robot splats" + (f" ({remark})" if remark else "")
+        return None, "", f"not drawn: {error}"
+    of = trial.recorded.info.id
+    source = "given" if config.joints is not None else f"as {of} has it at that time"
+    return posture, urdf, f"joints {source}"
 
 
 def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
@@ -179,11 +154,9 @@ def _spread(Ts: Float[np.ndarray, "num_poses 4 4"]) -> float:
     return float(np.linalg.norm(np.ptp(Ts[:, :3, 3], axis=0)))
 
 
-def describe_drawn(drawn: Mapping[str, object]) -> str:
-    """The files, and what a reader should know about the robot in them."""
-    files = drawn["files"]
-    lines = [str(path) for path in files] if isinstance(files, list) else []
-    return "\n".join([*lines, f"robot: {drawn['robot']}"])
+def describe_drawn(drawn: Mapping[str, Any]) -> str:
+    """The files, and what a reader should know about what they show."""
+    return "\n".join([*drawn["files"], f"robot: {drawn['robot']}", *drawn["notes"]])
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -199,45 +172,32 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     first_ns = streams.first_stamp_ns(episode)
     began_ns = episode.start_ns if first_ns is None else first_ns
     stamp_ns = began_ns + round((config.at_s or 0.0) * 1e9)
-    composed = compose(run, scene, episode, stamp_ns, config)
+    trial = open_trial(run, scene, episode)
+    moved = object_places(config.object, list(trial.parts.objects))
+    posture, urdf, robot = posture_of(trial, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
-    view = rasteriser.view(composed.cloud, camera, T_base_camera)
+    places = trial.places(stamp_ns) | moved
+    cloud = trial.parts.at(places, posture, urdf)
+    drawn = trial.parts.draw(rasteriser, cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    whole = composed.parts.behind(view, camera, T_base_camera)
-    path.write_bytes(encode_png(whole.image_u8()))
+    path.write_bytes(encode_png(drawn.marked_u8()))
     written = [str(path)]
     if config.depth:
-        depth_path = path.with_name(f"{path.stem}_depth.png")
-        depth_path.write_bytes(encode_png(depth_image(view.depth_m)))
-        seen_path = path.with_name(f"{path.stem}_seen.png")
-        seen = seen_mask(rasteriser, view.alpha, composed.cloud)
-        seen_path.write_bytes(encode_png(np.where(seen, np.uint8(255), np.uint8(0))))
-        written += [str(depth_path), str(seen_path)]
+        for ending, image in (("depth", depth_image(drawn.depth_m)), ("seen", drawn.seen_u8())):
+            beside = path.with_name(f"{path.stem}_{ending}.png")
+            beside.write_bytes(encode_png(image))
+            written.append(str(beside))
     return {
         "files": written,
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
-        "robot": composed.robot,
-        "coverage_fraction": float(view.alpha.mean()),
+        "robot": robot,
+        "notes": list(trial.notes),
+        "not_scanned": sorted(trial.parts.not_scanned),
+        "coverage_fraction": float(drawn.alpha.mean()),
     }
-
-
-SEEN = 0.5
-"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan."""
-
-
-def seen_mask(
-    rasteriser: Rasteriser | CudaRasteriser,
-    alpha: Float32[np.ndarray, "height width"],
-    cloud: GaussianCloud,
-) -> Bool[np.ndarray, "height width"]:
-    """Pixels of the image drawn last that show what was measured, and not what was completed."""
-    if not cloud.completed.any():
-        return np.asarray(alpha >= SEEN)
-    measured = as_float32(~cloud.completed)[:, None]
-    return np.asarray(rasteriser.draw_features(measured)[0] >= SEEN)
 
 
 def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:

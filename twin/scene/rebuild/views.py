@@ -31,7 +31,7 @@ from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.robot.extraction import DrivenRobot
 
@@ -102,14 +102,13 @@ class ViewsJob:
     """What to render held-out frames of, and what to say about it."""
 
     scene_hash: str
-    cloud: GaussianCloud
+    scenes: Decomposition
+    """Draws each episode with its own objects."""
     reference_views: Sequence[ReferenceView]
     limits: DepthLimits
     raster: RasterConfig
     protocol: Mapping[str, Any]
     """How the scene was made: kept with the images, for whoever rates them."""
-    marked: GaussianCloud | None = None
-    """The same scene with objects white and everything else black; None without objects."""
     robot: DrivenRobot | None = None
     """Drawn where it stood at each frame; the cloud holds only what is static."""
     ego_masks: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
@@ -171,9 +170,10 @@ def write_views(
 
 
 def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Iterator[HeldOutViews]:
+    scene, marked = job.scenes.as_seen_in(choice.episode), job.scenes.marked_in(choice.episode)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
-        cloud = job.cloud
+        cloud = scene
         if job.robot is not None:
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
         recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
@@ -181,8 +181,8 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         if job.backdrop is not None:
             view = job.backdrop.behind(view, camera, T)
         masks = {"static": recorded.full.static_mask}
-        if job.marked is not None:
-            planes = rasteriser.draw_planes(job.marked, camera, T)
+        if marked is not None:
+            planes = rasteriser.draw_planes(marked, camera, T)
             masks["objects"] = planes[0] > OBJECT_SHARE
         yield HeldOutViews(
             choice=choice,
