@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from bridge.geometry.camera import Camera
 from bridge.media.image_quality import as_float
 from twin.robot.surface import PosedSurface
-from twin.scene.shape.mesh import Mesh, depth_along
+from twin.scene.shape.mesh import Mesh, first_hit
 from twin.scene.store.library import NOT_SCANNED
 
 
@@ -37,13 +37,13 @@ def part_masks(
     rays = camera.rays()
     nothing = np.full(rays.shape[:2], np.inf, dtype=np.float32)
     robot_m = nothing if robot is None else robot.depth_along(rays, T_base_camera)
-    objects_m = depth_along(rays, T_base_camera, meshes, Ts_base_object)
+    objects_m, _ = first_hit(rays, T_base_camera, meshes, Ts_base_object)
     is_robot = np.isfinite(robot_m) & (robot_m <= objects_m)
     is_object = np.isfinite(objects_m) & ~is_robot
     masks = {"robot": is_robot, "objects": is_object, "background": ~is_robot & ~is_object}
     drawn_from_task = {name: mesh for name, mesh in meshes.items() if name in not_scanned}
     if drawn_from_task:
-        own_m = depth_along(rays, T_base_camera, drawn_from_task, Ts_base_object)
+        own_m, _ = first_hit(rays, T_base_camera, drawn_from_task, Ts_base_object)
         masks[NOT_SCANNED] = is_object & (own_m <= objects_m)
     return masks
 

@@ -119,10 +119,6 @@ def carried_camera(
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
-    Args:
-        frame_id: The camera's frame.
-        tree: Says where the camera was; None: ``/tf`` does.
-
     Returns:
         None when the camera is not seen to move with the hand.
     """

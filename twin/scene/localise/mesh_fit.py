@@ -112,11 +112,7 @@ def seen_through(
 def agreeing(
     T: Float[np.ndarray, "4 4"], surface: MeshSurface, views: Sequence[CameraView], margin_m: float
 ) -> float:
-    """Share of the mesh's facing surface that the camera which sees most of it measured there.
-
-    Args:
-        T: ``T_base_object``.
-    """
+    """Share of the mesh's facing surface that the camera which sees most of it measured there."""
     T_object_base = se3.invert(T)
     share = 0.0
     for view in views:

@@ -20,7 +20,7 @@ from twin.scene.frames.selection import FrameChoice, Sources
 from twin.scene.localise.episode import localise_episode
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.shape.known import shape_mesh, surface_distances
-from twin.scene.shape.mesh import depth_along
+from twin.scene.shape.mesh import first_hit
 
 OWN_M, LIFTED_M = 0.010, 0.003
 """Points this near to an object's known surface, and so far above the table, are the object's."""
@@ -58,7 +58,7 @@ class Placement:
         """Pixels of the half-size image that show an object, and those next to them."""
         half, poses = view.half, self.poses
         meshes = {key: shape_mesh(self.task.objects[key]) for key in poses}
-        expected = depth_along(half.camera.rays(), view.T_base_color, meshes, poses)
+        expected, _ = first_hit(half.camera.rays(), view.T_base_color, meshes, poses)
         known = half.depth_m > 0
         shown = np.isfinite(expected) & ~(known & (half.depth_m < expected - IN_FRONT_M))
         p_camera = half.camera.unproject(half.depth_m)[known]

@@ -119,10 +119,6 @@ def masked_view(
     """One training view in an object's frame, with the pixels that show the object.
 
     A pixel belongs to the object whose surface is nearest to its point.
-
-    Args:
-        view: The training view, in the base frame.
-        models: All objects of the task, by name.
     """
     target = view.full
     depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))

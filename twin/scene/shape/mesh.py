@@ -110,13 +110,13 @@ def read_mesh(path: Path) -> tuple[Vertices, Faces]:
     return vertices.astype(np.float64), faces
 
 
-def depth_along(
+def first_hit(
     rays: Float[np.ndarray, "height width 3"],
     T_base_camera: Float[np.ndarray, "4 4"],
     meshes: Mapping[str, Mesh],
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-) -> Float32[np.ndarray, "height width"]:
-    """Depth at which a camera's rays meet the first of some meshes; infinite beside them all.
+) -> tuple[Float32[np.ndarray, "height width"], Float32[np.ndarray, "height width 3"]]:
+    """Where a camera's rays meet the first of some meshes: depth, infinite beside them, and normal.
 
     Args:
         Ts_base_object: Where the meshes are; those without a pose are not there.
@@ -132,4 +132,5 @@ def depth_along(
             vertices = se3.apply(T_camera_object, vertices_m).astype(np.float32)
             scene.add_triangles(tensor(vertices), tensor(triangles.astype(np.uint32)))
     from_camera = np.concatenate([np.zeros_like(rays), rays], axis=-1).astype(np.float32)
-    return np.asarray(scene.cast_rays(tensor(from_camera))["t_hit"].numpy())
+    found = scene.cast_rays(tensor(from_camera))
+    return found["t_hit"].numpy(), found["primitive_normals"].numpy()
