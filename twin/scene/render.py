@@ -38,32 +38,26 @@ def posture_of(
     trial: TrialInScene, stamp_ns: int, config: RenderConfig
 ) -> tuple[Posture | None, str, str]:
     """How the robot stands: posture or None, its URDF, and where that comes from or why not."""
-    if not trial.parts.links:
-        if config.joints is not None:
+    if config.joints is not None:
+        if not trial.parts.links:
             message = f"--joints cannot be followed: {trial.robot.removeprefix('not drawn: ')}."
             raise UsageError(message)
+        return _given_posture(trial.recorded, config.joints, config.width_m)
+    track, of = trial.postures, trial.recorded.info.id
+    if track is None or not trial.parts.links:
         return None, "", trial.robot
-    try:
-        urdf, posture = _posture(trial.recorded, stamp_ns, config)
-    except GstError as error:
-        if config.joints is not None:
-            raise
-        return None, "", f"not drawn: {error}"
-    of = trial.recorded.info.id
-    source = "given" if config.joints is not None else f"as {of} has it at that time"
-    return posture, urdf, f"joints {source}"
+    if not track.covers(stamp_ns):
+        return None, "", f"not drawn: {of} has no joints at that time: choose another --at-s."
+    recorded = track.at(stamp_ns)
+    width_m = recorded.width_m if config.width_m is None else config.width_m
+    posture = Posture(joints_rad=recorded.joints_rad, width_m=width_m)
+    return posture, track.urdf, f"joints as {of} has them at that time"
 
 
-def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
-    if config.joints is None:
-        track = posture_track(episode)
-        if not track.covers(stamp_ns):
-            message = f"{episode.info.id} has no joints at that time: choose another --at-s."
-            raise UsageError(message)
-        recorded = track.at(stamp_ns)
-        width_m = recorded.width_m if config.width_m is None else config.width_m
-        return track.urdf, Posture(joints_rad=recorded.joints_rad, width_m=width_m)
-    joints = np.array(config.joints, dtype=np.float64)
+def _given_posture(
+    episode: Episode, given: Sequence[float], width_m: float | None
+) -> tuple[Posture, str, str]:
+    joints = np.array(given, dtype=np.float64)
     names = streams.recorded_robot(episode).joints
     if len(joints) != len(names) or not np.isfinite(joints).all():
         message = f"--joints takes {len(names)} angles in rad: {', '.join(names)}."
@@ -74,7 +68,7 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
             found=f"is missing in episode {episode.info.id}",
             hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
-    return urdf, Posture(joints_rad=joints, width_m=config.width_m or 0.0)
+    return Posture(joints_rad=joints, width_m=width_m or 0.0), urdf, "joints given"
 
 
 def object_places(

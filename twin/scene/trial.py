@@ -83,12 +83,14 @@ def open_trial(run: RunFolder, scene: Scene, recorded: Episode) -> TrialInScene:
     A recorded trial is localised before and after its executions if it was not yet.
     """
     postures, robot = None, f"joints as {recorded.path.stem} has them"
-    if not scene.record.get("robot", {}).get("links"):
-        robot = f"not drawn: {why_no_robot(scene)}"
     try:
         postures = posture_track(recorded)
     except GstError as error:
         robot = f"not drawn: {error}"
+    if not scene.record.get("robot", {}).get("links"):
+        remark = scene.record.get("robot", {}).get("remark")
+        reason = f" ({remark})" if remark else ""
+        robot = f"not drawn: the scene has no robot splats{reason}"
     tracks = _recorded_tracks(run, scene, recorded, postures)
     parts, notes = trial_parts(run, scene, recorded, task_of(recorded), tracks.first())
     return TrialInScene(
@@ -99,12 +101,6 @@ def open_trial(run: RunFolder, scene: Scene, recorded: Episode) -> TrialInScene:
         robot=robot,
         notes=(*tracks.notes, *notes),
     )
-
-
-def why_no_robot(scene: Scene) -> str:
-    """Why a scene without Gaussians of the robot has none."""
-    remark = scene.record.get("robot", {}).get("remark")
-    return "the scene has no robot splats" + (f" ({remark})" if remark else "")
 
 
 def _recorded_tracks(

@@ -114,6 +114,9 @@ def test_without_a_scene_every_object_has_the_task_files_shape(task: Task) -> No
 def test_a_problem_knows_where_everything_is(tmp_path: Path, task: Task) -> None:
     (tmp_path / "scene").mkdir()
     written(tmp_path / "scene", task)
+    record = {"schema_version": 1, "key": "k", "scene_hash": "h", "background": {},
+              "sources": [], "views": [], "objects": {"cube": {}}}  # fmt: skip
+    (tmp_path / "scene" / "scene.json").write_text(json.dumps(record))
     T = np.eye(4)
     T[:3, 3] = (0.5, -0.1, 0.02)
     start, sure = np.array(ROBOT.home_rad), np.eye(6) * 1e-6

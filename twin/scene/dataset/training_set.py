@@ -37,7 +37,9 @@ class TrainingSet:
     points: list[PointSet]
     """Static surface points of each training frame, objects included."""
     views: list[TrainingView]
-    background: "Background"
+    bare_points: list[PointSet]
+    """Without the objects of the episodes' tasks."""
+    bare_views: list[TrainingView]
     choice_of_view: list[int]
     """Index of each view's choice."""
     moving: MovingVoxels
@@ -52,14 +54,6 @@ class TrainingSet:
         own = [choice.episode.path == episode.path for choice in self.choices]
         shown = zip(self.views, self.choice_of_view, strict=True)
         return [view for view, index in shown if own[index]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Background:
-    """The training frames without the objects of their tasks."""
-
-    points: list[PointSet]
-    views: list[TrainingView]
 
 
 def limits_of(config: RebuildConfig) -> DepthLimits:
@@ -114,15 +108,14 @@ def read_training_set(
         placements.take_out(choices[index].episode, points[place], views[place])
         for place, index in enumerate(choice_of_view)
     ]
-    background = Background(points=[each for each, _ in bare], views=[each for _, each in bare])
-    moving = find_moving(background.points, reference_views)
-    num_points = sum(len(item.p_m) for item in background.points)
-    for part in (background.points, points):  # one by one, so that memory holds the frames once
-        part[:] = map(moving.drop_from, part)
-    for part in (background.views, views):
-        part[:] = map(moving.mask_in, part)
-    left = sum(len(item.p_m) for item in background.points)
-    gone = (num_points - left) / max(num_points, 1)
+    bare_points, bare_views = [each for each, _ in bare], [each for _, each in bare]
+    moving = find_moving(bare_points, reference_views)
+    num_points = sum(len(item.p_m) for item in bare_points)
+    pairs = ((bare_points, bare_views), (points, views))
+    for seen, shown in pairs:  # one by one, so that memory holds the frames once
+        for place in range(len(shown)):
+            seen[place], shown[place] = moving.drop_from(seen[place]), moving.mask_in(shown[place])
+    gone = (num_points - sum(len(item.p_m) for item in bare_points)) / max(num_points, 1)
     report = replace(
         report,
         moving_fraction=round(gone, 4),
@@ -135,7 +128,8 @@ def read_training_set(
         choices=list(choices),
         points=points,
         views=views,
-        background=background,
+        bare_points=bare_points,
+        bare_views=bare_views,
         choice_of_view=choice_of_view,
         moving=moving,
         ego_masks=ego_masks,

@@ -35,14 +35,13 @@ from twin.scene.gaussians import (
     concatenate,
     moved_cloud,
     read_ply,
-    with_harmonics,
     write_ply,
 )
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
 from twin.scene.settings import InitialiseConfig
-from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, remove_shape, write_shape
+from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
 from twin.scene.shape.from_training import ObjectViews, shapes_of, write_static
 from twin.scene.shape.known import shape_mesh, surface_distances
 from twin.scene.shape.mesh import Mesh, mesh_ply
@@ -174,7 +173,6 @@ class LibraryObject:
 
     def _write_geometry(self, place: Path) -> tuple[list[str], dict[str, Any]]:
         """Write the reconstructed shape, or the known one with the reason why."""
-        remove_shape(place)
         if not isinstance(self.shape, str):
             names, geometry = write_shape(place, self.shape, soft=self.model.soft is not None)
             source = f"reconstructed from {self.shape.num_views} views"
@@ -221,9 +219,7 @@ class Decomposition:
     ) -> dict[str, Any]:
         """Write ``objects/`` and ``sdf.npz``, and return what ``scene.json`` says about them."""
         folder = run.scene_dir / "objects"
-        for place in folder.glob("*/"):
-            if place.name not in self.library:
-                shutil.rmtree(place)
+        shutil.rmtree(folder, ignore_errors=True)
         scans = [
             ObjectViews(views=views_of(item.episode), task=item.task, Ts_base_object=item.poses)
             for item in self.placements.by_episode.values()
@@ -250,26 +246,12 @@ class Decomposition:
 
     def as_seen_in(self, episode: Episode) -> GaussianCloud:
         """The scene as an episode of the sources has it: with its own objects alone."""
-        places = self._places(episode)
-        bare = uncovered(self.background, self.objects, places)
-        return concatenate([bare, *self._placed(places)])
-
-    def marked_in(self, episode: Episode) -> GaussianCloud | None:
-        """The same with objects white and all else black; None where it shows none."""
-        if not self._places(episode):
-            return None
-        cloud = with_harmonics(self.as_seen_in(episode), 0)
-        colors = np.ones_like(cloud.colors)
-        colors[: len(self.background)] = 0.0
-        return replace(cloud, colors=colors)
-
-    def _places(self, episode: Episode) -> dict[str, Float[np.ndarray, "4 4"]]:
         placement = self.placements.by_episode.get(episode.path)
         poses = {} if placement is None else placement.poses
-        return {key: T for key, T in poses.items() if key in self.library}
-
-    def _placed(self, places: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[GaussianCloud]:
-        return [moved_cloud(self.library[key].splats.cloud, T) for key, T in places.items()]
+        places = {key: T for key, T in poses.items() if key in self.library}
+        bare = uncovered(self.background, self.objects, places)
+        own = [moved_cloud(self.library[key].splats.cloud, T) for key, T in places.items()]
+        return concatenate([bare, *own])
 
 
 def decompose(

@@ -107,7 +107,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     links = training.robot.frames.links(config.initialise)
     clock.end("decompose")
     rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
-    backdrop = backdrop_of(fitted.cloud, training.background.views, rasteriser)
+    backdrop = backdrop_of(fitted.cloud, training.bare_views, rasteriser)
     views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     extras = _write_parts(run, sources, training, decomposed, links, config, output)
@@ -132,13 +132,12 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
 def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitResult:
     began_s = time.monotonic()
-    shown = training.background
-    first = fuse(shown.points, config.initialise, shown.views)
+    first = fuse(training.bare_points, config.initialise, training.bare_views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
     with output.progress("fit", 100) as advance:
         return fit(
             first,
-            shown.views,
+            training.bare_views,
             config.fit,
             advance,
             max_splats=config.initialise.max_splats,
@@ -154,7 +153,7 @@ def _close_holes(
 ) -> GaussianCloud:
     """Gaussians where colour was seen and no depth measured."""
     raster = RasterConfig(threads=config.fit.threads)
-    closed = complete_holes(fitted.cloud, training.background.views, config.initialise, raster)
+    closed = complete_holes(fitted.cloud, training.bare_views, config.initialise, raster)
     output.say(f"{len(closed)} Gaussians where colour was seen and no depth measured")
     return closed
 

@@ -45,7 +45,7 @@ def test_exact_points_give_the_exact_pose_from_a_pose_nearby(seed: int, turn_rad
         outlines=(),
         model=model,
         config=config,
-        prior_sigma=np.full((1, 2), 1e-6),  # the points have no shift of their own
+        prior_sigma=np.full((1, 3), 1e-6),  # the points have no shift of their own
     )
     yaw = np.arctan2(start[1, 0], start[0, 0])
     state = np.array([*start[:3, 3], yaw, 0.0, 0.0, 0.0])

@@ -200,11 +200,6 @@ def test_an_episode_shows_its_own_objects_where_it_has_them(
         first = len(parts.library[next(iter(poses))].splats.cloud)
         T = poses[next(iter(poses))]
         np.testing.assert_allclose(own[:first].mean(axis=0), T[:3, 3], atol=0.004)
-        marked = parts.marked_in(episodes[name])
-        assert marked is not None
-        np.testing.assert_array_equal(marked.colors[len(parts.background) :], 1.0)
-        np.testing.assert_array_equal(marked.colors[: len(parts.background)], 0.0)
-    assert parts.marked_in(episodes["scan_9"]) is None
     assert len(parts.as_seen_in(episodes["scan_9"])) == len(parts.background)
 
 
