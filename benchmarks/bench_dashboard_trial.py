@@ -111,7 +111,7 @@ def rasterised(run: RunFolder, trial: str, t_s: float, width: int, height: int) 
     artist = Artist(
         rasteriser=Rasteriser(),
         parts=shown.parts,
-        urdf=shown.urdf,
+        urdf="" if shown.postures is None else shown.postures.urdf,
         camera=sized_camera(info.camera, f"{width}x{height}"),
     )
     frame = Frame(

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -312,7 +312,12 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
 
     Without pictures there is nothing to scan.
     """
-    there = {episode.info.task for path in run.episodes() if (episode := _scan_in(path))}
+    there = set()
+    for path in run.episodes():
+        with suppress(GstError):
+            episode = Episode.open(path)
+            if episode.info.kind == "scan" and not cut_short(episode, episode.outcome):
+                there.add(episode.info.task)
     wanted = {job.task: job for job in reversed(jobs) if job.task not in there}
     if not wanted or config.rate_hz <= 0:
         return
@@ -326,16 +331,6 @@ def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Out
             standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
             standin += ["--image-scale", str(config.image_scale)]
             scan_task(job.chosen, standin, output, recorder)
-
-
-def _scan_in(path: Path) -> Episode | None:
-    """A whole scan; None for anything else."""
-    try:
-        episode = Episode.open(path)
-        is_whole = episode.info.kind == "scan" and not cut_short(episode, episode.outcome)
-    except GstError:
-        return None
-    return episode if is_whole else None
 
 
 def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:

@@ -80,8 +80,7 @@ DARK: Mapping[str, str] = {
 OBJECTS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7")
 """Of objects drawn from above, in the task's order."""
 IN_SCENE = ("recorded", "planned", "twin-planned", "twin-executed", "unknown")
-"""Ways and objects of a 3D view, whose ground may be anything: as on dark pages. ``unknown``
-outlines what was not scanned."""
+"""In a 3D view, on any ground: as on dark pages. ``unknown`` outlines what was not scanned."""
 
 
 def rgb(name: str) -> Rgb:

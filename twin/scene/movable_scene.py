@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.ndimage import binary_dilation
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
@@ -62,12 +63,7 @@ def outlined(
     from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for what was not scanned
     from PIL import ImageDraw  # noqa: PLC0415
 
-    padded = np.pad(mask, 2)
-    height, width = mask.shape
-    near = np.zeros_like(mask)
-    for down, right in ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)):
-        near |= padded[down : down + height, right : right + width]
-    rows, columns = np.nonzero(near & ~mask)
+    rows, columns = np.nonzero(binary_dilation(mask, iterations=2) & ~mask)
     marked = image_u8.copy()
     dark = (rows + columns) // DASH_PX % 2 == 0
     marked[rows, columns] = np.where(dark[:, None], np.uint8(0), np.array(rgb("unknown"), "u1"))

@@ -134,7 +134,7 @@ def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     artist = Artist(
         rasteriser=rasteriser,
         parts=episode.parts,
-        urdf=episode.urdf,
+        urdf="" if episode.postures is None else episode.postures.urdf,
         camera=sized_camera(info.camera, config.size),
     )
     out = config.out or run.results_dir / f"{episode.recorded.path.stem}.{camera_id}.mp4"

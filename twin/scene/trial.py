@@ -53,11 +53,6 @@ class TrialInScene:
     unposed: list[int] = field(default_factory=list)
     """Instants left out because nobody knows where the camera was."""
 
-    @property
-    def urdf(self) -> str:
-        """Of the robot; empty where it is not drawn."""
-        return "" if self.postures is None else self.postures.urdf
-
     def places(self, stamp_ns: int) -> dict[str, Float[np.ndarray, "4 4"]]:
         """Where its objects are at an instant, ``T_base_object``; some in the hand."""
         T_base_tcp = None

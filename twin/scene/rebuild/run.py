@@ -98,7 +98,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     fitted = _fit(training, config, output)
     clock.end("initialise_and_fit")
-    completed = _close_holes(training, fitted, config, output)
+    raster = RasterConfig(threads=config.fit.threads)
+    completed = complete_holes(fitted.cloud, training.bare_views, config.initialise, raster)
+    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
     fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
@@ -106,8 +108,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("decompose")
-    rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
-    backdrop = backdrop_of(fitted.cloud, training.bare_views, rasteriser)
+    backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
     views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     extras = _write_parts(run, sources, training, decomposed, links, config, output)
@@ -143,19 +144,6 @@ def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitRes
             max_splats=config.initialise.max_splats,
             spent_s=time.monotonic() - began_s,
         )
-
-
-def _close_holes(
-    training: TrainingSet,
-    fitted: FitResult,
-    config: RebuildConfig,
-    output: Output,
-) -> GaussianCloud:
-    """Gaussians where colour was seen and no depth measured."""
-    raster = RasterConfig(threads=config.fit.threads)
-    closed = complete_holes(fitted.cloud, training.bare_views, config.initialise, raster)
-    output.say(f"{len(closed)} Gaussians where colour was seen and no depth measured")
-    return closed
 
 
 def _hold_out(

@@ -77,15 +77,9 @@ def library_object(key: str, shape: ObjectShape | str) -> LibraryObject:
 
 def localised(key: str) -> LocalisedObject:
     return LocalisedObject(
-        object_id=key,
-        found=True,
-        T_base_object=POSES[key],
-        covariance=None,
-        confidence=1.0,
-        method="given",
-        reason=None,
-        stamp_ns=1,
-    )
+        object_id=key, found=True, T_base_object=POSES[key], covariance=None, confidence=1.0,
+        method="given", reason=None, stamp_ns=1,
+    )  # fmt: skip
 
 
 def test_the_known_shape_stands_in_with_the_reason(tmp_path: Path) -> None:
