@@ -70,7 +70,7 @@ def outlined(
     picture = pillow.fromarray(marked)
     pen, (top, left) = ImageDraw.Draw(picture), np.argwhere(mask).min(axis=0)
     box = pen.textbbox((0, 0), words)
-    at = min(max(left, 1), max(width - box[2] - 2, 1)), max(top - box[3] - 4, 1)
+    at = min(max(left, 1), max(mask.shape[1] - box[2] - 2, 1)), max(top - box[3] - 4, 1)
     pen.rectangle((at[0] - 1, at[1], at[0] + box[2] + 1, at[1] + box[3] + 1), fill=(0, 0, 0))
     pen.text(at, words, fill=rgb("unknown"))
     return np.asarray(picture)
