@@ -267,8 +267,7 @@ class View {
     }
     for (const box of file.boxes) {
       const hasSplats = file.ranges["object " + box.name];
-      const isHidden = box.side === "recorded" && hasSplats && !box.not_scanned;
-      if (isHidden || !this.isShown(box.side)) continue;
+      if ((box.side === "recorded" && hasSplats && !box.not_scanned) || !this.isShown(box.side)) continue;
       const m = poseAt(file, box.track, t);
       const corners = [...Array(8).keys()].map((bits) => {
         const p = box.half_m.map((h, axis) => box.centre_m[axis] + (bits >> axis & 1 ? h : -h));

@@ -327,8 +327,8 @@ def drawn_mesh(model: ObjectModel, shape: ObjectShape | str) -> Mesh:
     known = shape_mesh(model)
     away_m, _ = surface_distances(shape.vertices_m, model, np.eye(4))
     points, _ = even_points([known], SPACING_M)
-    apart = (np.abs(away_m), np.abs(shape.sdf.distance(points)))
-    is_same = all(np.quantile(each, SAME_SHARE) < SAME_SHAPE_M for each in apart)
+    off_m = (np.abs(away_m), np.abs(shape.sdf.distance(points)))
+    is_same = all(np.quantile(each, SAME_SHARE) < SAME_SHAPE_M for each in off_m)
     return known if is_same else found
 
 
