@@ -269,6 +269,8 @@ def decompose(
         config: The shape of new Gaussians.
     """
     library: dict[str, LibraryObject] = {}
+    for placement in placements.by_episode.values():  # its pixels were masked: nothing held these
+        cloud = cloud.take(~placement.owns(cloud.means_m))
     filling = [cloud.take(np.zeros(0, dtype=np.int64))]
     for placement in placements.by_episode.values():
         views, poses = views_of(placement.episode), placement.poses

@@ -10,8 +10,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -27,9 +25,8 @@ from twin.scene.dataset.training_set import (
 from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
-from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
-from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, write_ply
+from twin.scene.gaussians import GaussianCloud, concatenate, write_ply
 from twin.scene.objects.decompose import Decomposition, decompose
 from twin.scene.objects.placement import find_placements, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
@@ -106,8 +103,7 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    shown = seen_alone(concatenate([fitted.cloud, completed]), training.bare_views, raster)
-    fitted = replace(fitted, cloud=shown)
+    fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
     decomposed = decompose(placements, fitted.cloud, training.views_of, output, config.initialise)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
@@ -148,21 +144,6 @@ def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitRes
             max_splats=config.initialise.max_splats,
             spent_s=time.monotonic() - began_s,
         )
-
-
-SEEN_PX = 1.0
-"""What covers less than this in all training views together, at half size, nobody saw."""
-
-
-def seen_alone(
-    cloud: GaussianCloud, views: Sequence[TrainingView], raster: RasterConfig
-) -> GaussianCloud:
-    """A cloud without what no view shows: where objects were masked, nothing held it back."""
-    rasteriser, seen_px = Rasteriser(raster), np.zeros(len(cloud))
-    for view in views:
-        rasteriser.draw_planes(cloud, view.half.camera, view.T_base_color)
-        seen_px += rasteriser.lift(as_float32(view.half.static_mask)[None])[:, 0]
-    return cloud.take(seen_px >= SEEN_PX)
 
 
 def _hold_out(
