@@ -298,12 +298,7 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
 def scan_task(
     task: str, standin: list[str], output: Output, recorder: Background, *, label: str = ""
 ) -> None:
-    """Record what the trials of a task use, so that ``rebuild`` knows it before they begin.
-
-    Args:
-        task: As it was asked for.
-        standin: The command that publishes the cell, without its task.
-    """
+    """Record what the trials of a task use, so that ``rebuild`` knows it before they begin."""
     words = [*standin, "--task", task, "--trials", "0"]
     step(output, f"{label}the stand-in cell scans what {Path(task).stem} uses", words, recorder)
 

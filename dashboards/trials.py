@@ -308,10 +308,7 @@ def _number(path: Path) -> int:
 
 
 def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:
-    """Record a scan for each task that has none, before its first trial.
-
-    Without pictures there is nothing to scan.
-    """
+    """Record a scan of each task that has none, before its first trial, if pictures are taken."""
     there = set()
     for path in run.episodes():
         with suppress(GstError):

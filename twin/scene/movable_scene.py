@@ -168,11 +168,7 @@ class MovableScene:
 def read_movable_scene(
     run: RunFolder, scene: Scene, wanted: Iterable[str] | None = None
 ) -> MovableScene:
-    """Load the parts that ``scene.json`` lists.
-
-    Args:
-        wanted: Of its objects; None: all.
-    """
+    """Load the parts that ``scene.json`` lists, of its objects those that are wanted."""
     root = scene.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return MovableScene(

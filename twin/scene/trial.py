@@ -1,8 +1,7 @@
 """An episode in the rebuilt scene: which objects it shows, from what each is drawn, and where.
 
-Objects are scanned once and stand where each trial's localisation has them. One that no scan saw is
-drawn from the task's shape, coloured by frames of this episode from before its first motion: what
-the trial is compared with later must not teach its colours.
+Objects stand where the trial's localisation has them. One that no scan saw is drawn from the task's
+shape, coloured by frames from before the first motion: what is compared later must not teach it.
 """
 
 from collections.abc import Mapping

@@ -269,10 +269,15 @@ def decompose(
         config: The shape of new Gaussians.
     """
     library: dict[str, LibraryObject] = {}
-    for placement in placements.by_episode.values():  # its pixels were masked: nothing held these
-        cloud = cloud.take(~placement.owns(cloud.means_m))
+    placed = list(placements.by_episode.values())
+    left = np.ones(len(cloud), dtype=bool)  # but what the fit left where pixels were masked
+    for placement in placed:
+        left &= ~placement.owns(cloud.means_m)
+    if placed:
+        left &= ~np.logical_and.reduce([each.covers(cloud.means_m) for each in placed])
+    cloud = cloud.take(left)
     filling = [cloud.take(np.zeros(0, dtype=np.int64))]
-    for placement in placements.by_episode.values():
+    for placement in placed:
         views, poses = views_of(placement.episode), placement.poses
         models = placement.task.objects
         wanted = [key for key in poses if key not in library]
@@ -337,11 +342,7 @@ def drawn_mesh(model: ObjectModel, shape: ObjectShape | str) -> Mesh:
 def read_objects(
     run: RunFolder, record: Mapping[str, Any], wanted: Iterable[str] | None = None
 ) -> dict[str, ObjectSplats]:
-    """Load objects that ``scene.json`` lists, each in its own frame.
-
-    Args:
-        wanted: Which of them; None: all.
-    """
+    """Load objects that ``scene.json`` lists, or the wanted ones, each in its own frame."""
     objects = {}
     for key in record.get("objects", {}) if wanted is None else wanted:
         folder = run.scene_dir / "objects" / check_episode_id(key)

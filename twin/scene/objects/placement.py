@@ -24,6 +24,8 @@ from twin.scene.shape.mesh import first_hit
 
 OWN_M, LIFTED_M = 0.010, 0.003
 """Points this near to an object's known surface, and so far above the table, are the object's."""
+UNDER_M = 0.004
+"""Table this near to an object is hidden by it."""
 IN_FRONT_M = 0.03
 """A measurement this much nearer than an object shows something in front of it."""
 
@@ -44,14 +46,21 @@ class Placement:
 
     def owns(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
         """Which points (base frame) show an object."""
+        return (p_m[:, 2] > LIFTED_M) & self._near(p_m, OWN_M)
+
+    def covers(self, p_m: Float32[np.ndarray, "num_points 3"]) -> Bool[np.ndarray, " num_points"]:
+        """Which points of the table an object stands on, or nearly so."""
+        on_top = np.column_stack([p_m[:, :2], np.maximum(p_m[:, 2], 0.0)])
+        return (p_m[:, 2] <= LIFTED_M) & self._near(on_top, UNDER_M)
+
+    def _near(self, p_m: np.ndarray, margin_m: float) -> Bool[np.ndarray, " num_points"]:
         mine = np.zeros(len(p_m), dtype=bool)
         for key, T in self.poses.items():
             model = self.task.objects[key]
-            reach_m = np.float32(np.linalg.norm(model.size_m) + OWN_M)
-            away = np.abs(p_m - T[:3, 3].astype(np.float32)).max(axis=1)
-            ids = np.flatnonzero((away < reach_m) & (p_m[:, 2] > LIFTED_M))
+            reach_m = np.float32(np.linalg.norm(model.size_m) + margin_m)
+            ids = np.flatnonzero(np.abs(p_m - T[:3, 3].astype(np.float32)).max(axis=1) < reach_m)
             distance_m, _ = surface_distances(p_m[ids].astype(np.float64), model, T)
-            mine[ids[distance_m < OWN_M]] = True
+            mine[ids[distance_m < margin_m]] = True
         return mine
 
     def shown_in(self, view: TrainingView) -> Bool[np.ndarray, "half_height half_width"]:

@@ -138,6 +138,7 @@ def placements(episodes: dict[str, Episode]) -> Placements:
 def parts(placements: Placements, views: dict[str, list[TrainingView]]) -> Decomposition:
     grid = np.stack(np.meshgrid(np.arange(0.3, 0.7, 0.003), np.arange(-0.3, 0.3, 0.003)), -1)
     table = np.column_stack([grid.reshape(-1, 2), np.zeros(grid[..., 0].size)])
+    table[0] = SCANS["scan_1"][1]["cube"][:3, 3] + [0.0, 0.0, 0.025]  # left over above the cube
     return decompose(
         placements,
         cloud_of(table, (150, 140, 128)),
@@ -176,10 +177,15 @@ def test_points_of_an_object_are_told_from_the_table_beside_it(
     others = se3.apply(T, np.array([[0.024, 0.0, -0.0195], [0.05, 0.0, 0.0], [0.0, 0.0, 0.05]]))
     np.testing.assert_array_equal(placement.owns(as_float32(own)), True)
     np.testing.assert_array_equal(placement.owns(as_float32(others)), False)
+    under = se3.apply(T, np.array([[0.0, 0.0, -0.021], [0.022, 0.0, -0.02], [0.03, 0.0, -0.02]]))
+    np.testing.assert_array_equal(placement.covers(as_float32(under)), [True, True, False])
+    np.testing.assert_array_equal(placement.covers(as_float32(own)), False)
 
 
 @pytest.mark.slow
 def test_each_object_comes_from_the_first_scan_that_shows_it(parts: Decomposition) -> None:
+    assert parts.background.means_m[:, 2].max() < 0.01
+    assert 0 < parts.num_filled < 500  # where objects stand in both: less than the whole block
     sources = {key: item.episode_id for key, item in parts.library.items()}
     assert sources == {"cube": "scan_1", "box": "scan_1", "block": "scan_2"}
     for key, item in parts.library.items():
