@@ -274,8 +274,9 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
         if not found.unscanned:
             output.say("2/6 the scans are recorded; they are kept and used")
-        for task in found.unscanned:
-            scan_task(task, standin, output, recorder, label="2/6 ")
+        for task in found.unscanned:  # each from a start of its own: what one hides another shows
+            start = ["--first-start", str(config.tasks.index(task))]
+            scan_task(task, [*standin, *start], output, recorder, label="2/6 ")
         if not found.unscanned and _scene(run):
             output.say("3/6 the scene is rebuilt; it is kept and used")
         else:
