@@ -24,10 +24,9 @@ from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from bridge.errors import InvalidRecordError
 from bridge.geometry import se3
-from bridge.task.task_file import SCANNED, ObjectModel
+from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
 from bridge.whole_file import write_whole
-from twin.scene.fit.on_mesh import even_points
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import (
     GaussianCloud,
@@ -43,8 +42,8 @@ from twin.scene.objects.placement import Placements
 from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.files import MESH, SDF, TASK_SHAPE, write_shape
 from twin.scene.shape.from_training import ObjectViews, shapes_of, write_static
-from twin.scene.shape.known import shape_mesh, surface_distances
-from twin.scene.shape.mesh import Mesh, mesh_ply
+from twin.scene.shape.known import shape_mesh
+from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 from twin.scene.shape.sdf import SdfGrid
 from twin.scene.store.folder import UnreadableSceneError
@@ -100,8 +99,6 @@ UNDER_M = 0.008
 TRANSPARENT_LOGIT = -30.0
 UP = np.array([0.0, 0.0, 1.0])
 OBJECT_VERSION = 4
-SAME_SHAPE_M, SAME_SHARE = 0.0025, 0.95
-"""So much of two surfaces is this near to the other one where they are of the same body."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,29 +311,12 @@ def object_splats(
     config: InitialiseConfig,
 ) -> ObjectSplats | None:
     """Gaussians on all of an object's surface; None where no view shows it."""
-    cloud = closed_object(drawn_mesh(model, shape), views, T_base_object, config)
+    mesh = shape_mesh(model) if isinstance(shape, str) else (shape.vertices_m, shape.faces)
+    cloud = closed_object(mesh, views, T_base_object, config)
     if cloud is None:
         return None
-    sdf = shape.sdf if isinstance(shape, ObjectShape) else None
+    sdf = None if isinstance(shape, str) else shape.sdf
     return ObjectSplats(cloud=cloud, T_base_object=T_base_object, sdf=sdf)
-
-
-def drawn_mesh(model: ObjectModel, shape: ObjectShape | str) -> Mesh:
-    """The surface that Gaussians are set on: the known one, unless the views show another body.
-
-    Edges of a reconstructed surface are as ragged as its voxels, and those of a known one straight.
-    """
-    if isinstance(shape, str):
-        return shape_mesh(model)
-    found = (shape.vertices_m, shape.faces)
-    if model.mesh is not None or model.shape == SCANNED:
-        return found
-    known = shape_mesh(model)
-    away_m, _ = surface_distances(shape.vertices_m, model, np.eye(4))
-    points, _ = even_points([known], SPACING_M)
-    off_m = (np.abs(away_m), np.abs(shape.sdf.distance(points)))
-    is_same = all(np.quantile(each, SAME_SHARE) < SAME_SHAPE_M for each in off_m)
-    return known if is_same else found
 
 
 def read_objects(
