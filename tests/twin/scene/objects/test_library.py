@@ -185,7 +185,7 @@ def test_points_of_an_object_are_told_from_the_table_beside_it(
 @pytest.mark.slow
 def test_each_object_comes_from_the_first_scan_that_shows_it(parts: Decomposition) -> None:
     assert parts.background.means_m[:, 2].max() < 0.01
-    assert 0 < parts.num_filled < 500  # where objects stand in both: less than the whole block
+    assert 0 < parts.num_filled < 650  # of 4 mm: what the block covers, and not all the box did
     sources = {key: item.episode_id for key, item in parts.library.items()}
     assert sources == {"cube": "scan_1", "box": "scan_1", "block": "scan_2"}
     for key, item in parts.library.items():
