@@ -23,11 +23,11 @@ from serving import dashboard  # noqa: E402
 
 from bridge.episode import streams  # noqa: E402
 from bridge.episode.run_folder import RunFolder  # noqa: E402
-from twin.scene.movable_scene import read_movable_scene  # noqa: E402
 from twin.scene.raster.rasteriser import Rasteriser  # noqa: E402
-from twin.scene.render import poses_in_scene, sized_camera  # noqa: E402
-from twin.scene.sequence import Artist, Frame, open_episode  # noqa: E402
+from twin.scene.render import episode_of, poses_in_scene, sized_camera  # noqa: E402
+from twin.scene.sequence import Artist, Frame  # noqa: E402
 from twin.scene.store.folder import read_scene  # noqa: E402
+from twin.scene.trial import open_trial  # noqa: E402
 
 REPEATS = 3
 JUMPS = 30
@@ -102,7 +102,7 @@ def canvas(tab: Browser) -> np.ndarray:
 def rasterised(run: RunFolder, trial: str, t_s: float, width: int, height: int) -> np.ndarray:
     """The whole scene at that instant from the first recorded camera, by the twin's rasteriser."""
     scene = read_scene(run)
-    shown = open_episode(run, scene, trial)
+    shown = open_trial(run, scene, episode_of(run, scene, trial))
     camera_id = streams.camera_ids(shown.recorded)[0]
     info = streams.camera_info(shown.recorded, camera_id)
     stamp_ns = (streams.first_stamp_ns(shown.recorded) or 0) + round(t_s * 1e9)
@@ -110,8 +110,8 @@ def rasterised(run: RunFolder, trial: str, t_s: float, width: int, height: int) 
     postures = shown.postures
     artist = Artist(
         rasteriser=Rasteriser(),
-        parts=read_movable_scene(run, scene),
-        urdf="" if postures is None else postures.urdf,
+        parts=shown.parts,
+        urdf="" if shown.postures is None else shown.postures.urdf,
         camera=sized_camera(info.camera, f"{width}x{height}"),
     )
     frame = Frame(

@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 from measure import ROOT, Target, report_targets
 
-from twin.scene.objects.assignment import assign_splats, object_poses
-
 NUM_VIEWS, NOISE = 20, 0.004
 BASKET_INNER_M = (0.26, 0.20, 0.08)
 TASKS = ("cube_into_box", "sloth_into_basket", "five_ducks_into_basket")
@@ -89,33 +87,16 @@ def scanned(task_names: Sequence[str], seeds: Sequence[int]) -> list[Target]:
     import scan_objects
 
     scores: dict[str, list[scan_objects.ShapeScore | None]] = {}
-    foreign: dict[str, list[float]] = {}
-    missed: dict[str, list[float]] = {}
     turned: dict[str, list[scan_objects.TurnedScore | None]] = {}
     for task_name, seed in product(task_names, seeds):
         scan = scan_objects.take_scan(task_name, seed)
-        owner = scan_objects.true_owners(scan)
-        places = object_poses(scan.cloud, scan.localised, scan.start.task)
-        given = assign_splats(scan.cloud, places, scan.start.task, shapes_in(scan.shapes))
         for key in scan.start.task.objects:
             name = key.split("_")[0]
             scores.setdefault(name, []).append(scan_objects.score_shape(scan, key))
             turned.setdefault(name, []).append(scan_objects.score_turned(scan, key))
-            if key not in scan.poses:
-                continue
-            index = list(scan.poses).index(key)
-            mine, true = given == index, owner == index
-            foreign.setdefault(name, []).append(float((mine & ~true).sum() / max(mine.sum(), 1)))
-            missed.setdefault(name, []).append(float((true & ~mine).sum() / max(true.sum(), 1)))
     rows = turned_rows(turned)
     for name, found in scores.items():
         rows += scan_rows(name, found)
-        for what, shares in (
-            ("Gaussians that are not its own", foreign),
-            ("own Gaussians left behind", missed),
-        ):
-            share = 100 * float(np.median(shares.get(name, [np.inf])))
-            rows.append(Target(what=f"scanned {name}: {what}", measured=share, limit=5.0, unit="%"))
     return rows
 
 
@@ -135,11 +116,6 @@ def turned_rows(turned: Mapping[str, Sequence[Any]]) -> list[Target]:
                        reference=f"worst of {len(found)} of {len(scores)} scans")
             )  # fmt: skip
     return rows
-
-
-def shapes_in(shapes: Mapping[str, Any]) -> dict[str, Any]:
-    """Those that are shapes and no reasons."""
-    return {key: shape for key, shape in shapes.items() if not isinstance(shape, str)}
 
 
 def scan_rows(name: str, found: Sequence[Any]) -> list[Target]:

@@ -18,10 +18,11 @@ from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, trai
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.localise.objects import LocaliseConfig, localise_objects
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.decompose import SceneParts, closed_parts, shape_mesh, split_objects
+from twin.scene.objects.decompose import ObjectSplats, object_splats
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import FitConfig, InitialiseConfig
 from twin.scene.shape.from_training import shapes_of
+from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import volume_m3
 from twin.scene.shape.reconstruct import ObjectShape
 
@@ -45,10 +46,10 @@ class Scanned:
     poses: dict[str, np.ndarray]
     shapes: dict[str, ObjectShape | str]
 
-    def apart(self) -> SceneParts:
-        """Objects cut out along their shapes, and closed."""
-        parts = split_objects(self.cloud, self.localised, self.start.task, shapes=self.shapes)
-        return closed_parts(parts, self.poses, self.shapes, self.views, InitialiseConfig())
+    def closed(self, key: str) -> ObjectSplats | None:
+        """An object's Gaussians, on all of its surface."""
+        model, T = self.start.task.objects[key], self.poses[key]
+        return object_splats(model, self.shapes[key], self.views, T, InitialiseConfig())
 
 
 def take_scan(task_name: str, seed: int, *, iterations: int = 0, honest: bool = False) -> Scanned:
@@ -96,14 +97,6 @@ def true_mesh(start: Start, key: str) -> Mesh:
         T_object_base = se3.invert(start.Ts_base_object[key])
         return se3.apply(T_object_base, start.skins_m[key]), object_mesh(model).triangles
     return shape_mesh(model)
-
-
-def whole_scene(parts: SceneParts) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
-    """Background and objects where they were scanned, as ``add_semantics`` takes them."""
-    objects = {
-        key: moved_cloud(item.cloud, item.T_base_object) for key, item in parts.objects.items()
-    }
-    return parts.background, objects
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,26 +152,6 @@ def laid_onto(mesh: Mesh, reference: Mesh) -> Mesh:
     return se3.apply(found.transformation, mesh[0]), mesh[1]
 
 
-def true_owners(scan: Scanned) -> np.ndarray:
-    """Index of the object each Gaussian really belongs to, -1 for all else.
-
-    What is nearer to an object's true surface than 6 mm, and nearer than to the table.
-    """
-    import cast_views
-    import open3d as o3d
-
-    p = scan.cloud.means_m
-    owner = np.full(len(p), -1)
-    nearest = np.minimum(np.abs(p[:, 2]), np.float32(0.006))
-    for index, key in enumerate(scan.poses):
-        vertices, faces = true_mesh(scan.start, key)
-        placed = se3.apply(scan.start.Ts_base_object[key], vertices)
-        away = cast_views.ray_scene([(placed, faces)]).compute_distance(o3d.core.Tensor(p)).numpy()
-        owner[away < nearest] = index
-        nearest = np.minimum(nearest, away)
-    return owner
-
-
 @dataclass(frozen=True, kw_only=True)
 class TurnedScore:
     """How an object looks that is turned over."""
@@ -194,10 +167,11 @@ class TurnedScore:
 
 def score_turned(scan: Scanned, key: str) -> TurnedScore | None:
     """Turn an object about; None where it was not closed."""
-    shape, parts = scan.shapes.get(key), scan.apart()
-    if not isinstance(shape, ObjectShape) or key not in parts.objects:
+    shape = scan.shapes.get(key)
+    splats = scan.closed(key) if isinstance(shape, ObjectShape) else None
+    if splats is None or not isinstance(shape, ObjectShape):
         return None
-    cloud, T = parts.objects[key].cloud, parts.objects[key].T_base_object
+    cloud, T = splats.cloud, splats.T_base_object
     rasteriser = Rasteriser(RasterConfig(threads=1))
     mesh = (shape.vertices_m, shape.faces)
     through = []

@@ -130,7 +130,8 @@ def groups_of(config: DemoConfig) -> list[Group]:
 class Recorded:
     """What a run folder holds of a demo."""
 
-    has_scan: bool = False
+    unscanned: list[str] = field(default_factory=list)
+    """Tasks that have no scan, as they were asked for: it shows what their trials use."""
     missing: list[Trial] = field(default_factory=list)
     unusable: dict[Path, str] = field(default_factory=dict)
     void: dict[Path, str] = field(default_factory=dict)
@@ -141,6 +142,7 @@ class Recorded:
 def look(run: RunFolder, config: DemoConfig) -> Recorded:
     """Say what of the demo is recorded, and what of it is of no use."""
     found = Recorded()
+    unscanned = {chosen_task_file(each).task().name: each for each in config.tasks}
     trials = {trial for group in groups_of(config) for trial in group.trials(config)}
     for path in sorted(run.episodes_dir.glob("*.part")):
         descriptor = lock_dead(path)
@@ -162,7 +164,7 @@ def look(run: RunFolder, config: DemoConfig) -> Recorded:
         if problem:
             found.unusable[path] = problem
         elif info.kind == "scan":
-            found.has_scan = True
+            unscanned.pop(info.task, None)
         elif info.kind == "trial" and info.start_seed is not None:
             trials.discard(
                 Trial(
@@ -176,7 +178,7 @@ def look(run: RunFolder, config: DemoConfig) -> Recorded:
                 found.void[path] = (outcome and outcome.detail) or "nobody labelled it"
             else:
                 found.num_known += 1
-    found.missing = sorted(trials)
+    found.missing, found.unscanned = sorted(trials), list(unscanned.values())
     return found
 
 
@@ -254,8 +256,8 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
         set_aside(run, episode, why, output)
     if useless:
         found = look(run, config)
-    if found.has_scan and not found.missing:
-        output.say(f"1/6 to 4/6: {path} holds the scan and all trials; they are kept and used")
+    if not found.unscanned and not found.missing:
+        output.say(f"1/6 to 4/6: {path} holds all scans and trials; they are kept and used")
         if not _scene(run):
             _rebuild(path, config, output)
         return found
@@ -266,12 +268,12 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
     output.say("1/6 starting the recorder (zenoh on the loopback address)")
     with running(["record", path, "--listen", endpoint], logs / "record.log") as recorder:
         recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
-        if found.has_scan:
-            output.say("2/6 the scan is recorded; it is kept and used")
-        else:
-            scan = [*standin, "--task", config.tasks[0], "--trials", "0"]
-            step(output, "2/6 the stand-in cell scans its table", scan, recorder)
-        if found.has_scan and _scene(run):
+        if not found.unscanned:
+            output.say("2/6 the scans are recorded; they are kept and used")
+        for task in found.unscanned:  # each from a start of its own: what one hides another shows
+            start = ["--first-start", str(config.tasks.index(task))]
+            scan_task(task, [*standin, *start], output, recorder, label="2/6 ")
+        if not found.unscanned and _scene(run):
             output.say("3/6 the scene is rebuilt; it is kept and used")
         else:
             _rebuild(path, config, output, recorder)
@@ -279,14 +281,23 @@ def _record(run: RunFolder, config: DemoConfig, output: Output) -> Recorded:
             _record_trials(run, config, endpoint, standin, found.missing, recorder, output)
     found = look(run, config)
     cause = next(iter((found.void | found.unusable).values()), "the session was stopped")
-    if not found.has_scan:
-        raise DashboardError(f"there is no scan: {cause}. Start the demo again.")
+    if found.unscanned:
+        which = ", ".join(Path(each).stem for each in found.unscanned)
+        raise DashboardError(f"there is no scan for {which}: {cause}. Start the demo again.")
     if found.missing or not found.num_known:
         count = len(found.missing) + len(found.void)
         asked = sum(len(group.trials(config)) for group in groups_of(config))
         message = f"{count} of {asked} trials have no outcome: {cause}. "
         raise DashboardError(f"{message}Start the demo again; it adds what is missing.")
     return found
+
+
+def scan_task(
+    task: str, standin: list[str], output: Output, recorder: Background, *, label: str = ""
+) -> None:
+    """Record what the trials of a task use, so that ``rebuild`` knows it before they begin."""
+    words = [*standin, "--task", task, "--trials", "0"]
+    step(output, f"{label}the stand-in cell scans what {Path(task).stem} uses", words, recorder)
 
 
 def _rebuild(path: str, config: DemoConfig, output: Output, *beside: Background) -> None:

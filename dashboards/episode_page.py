@@ -19,6 +19,7 @@ from dashboards.recording import PageClock, Problems, Recording, read_recording
 from dashboards.trial_lanes import Replanned, replans, trial_lanes
 from dashboards.trial_plots import PLANNED, main_plots, plots_of_joints, shown_replays
 from evaluator.review_index import IndexedTrial
+from twin.scene.store.library import not_scanned_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +112,8 @@ class EpisodePage:
     """The first divergence of recording and twin, where the replays tell one."""
     divergence_t_s: float | None
     sent_plan: Plan | None
+    not_scanned: tuple[str, ...]
+    """Objects that the twin draws from the task's shape, because no scan saw them."""
     problems: tuple[str, ...]
 
 
@@ -151,6 +154,7 @@ def build_page(
     shown = shown_replays(replays, sent_plan)
     known = (t for t in (t_s, divergence_t_s, failure_t_s) if t is not None)
     cursor = clock.clamp(next(known, clock.end_s))
+    not_scanned = problems.attempt(lambda: not_scanned_in(run, Episode.open(path)), [])
     return EpisodePage(
         recording=recording,
         replays=replays,
@@ -174,6 +178,7 @@ def build_page(
         divergence=moment,
         divergence_t_s=divergence_t_s,
         sent_plan=sent_plan,
+        not_scanned=tuple(not_scanned),
         problems=tuple(problems.texts),
     )
 

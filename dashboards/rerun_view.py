@@ -5,7 +5,7 @@ twin made of it, ``/plans/<id>`` the way of the tool in each plan. Stand-in trut
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from dashboards.rerun_entities import log_cameras, log_robot
 from dashboards.rerun_file import TIMELINE, RerunFile
 from dashboards.trial_plots import shown_replays
 from dashboards.wording import condition_word, factor_word, outcome_word, verdict_word
+from twin.scene.store.library import FROM_TASK, NOT_SCANNED, not_scanned_in
 
 EYE_M, TARGET_M = (1.5, -1.1, 0.9), (0.35, 0.0, 0.15)
 """Looking at the table in front of the robot from its left."""
@@ -97,8 +98,13 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
             task = problems.attempt(lambda: streams.task_file(episode).task(), None)
         if run is not None and episode.derived is None:  # a label given after the fact counts
             outcome = problems.attempt(lambda: outcome_of(run, episode), outcome)
+        not_scanned = (
+            [] if run is None else problems.attempt(lambda: not_scanned_in(run, episode), [])
+        )
         for side in sides:
-            log_side(file, side, task)
+            log_side(file, side, task, not_scanned)
+        for key in not_scanned:
+            file.note(f"how {key} looks: {FROM_TASK}")
         _log_plans(file, recording)
         file.always("about", _about(recording, outcome, sides, file.notes))
         file.stream.send_blueprint(_layout(name, sides, images))
@@ -154,7 +160,9 @@ def _replay_side(replay: Recording, trajectory: str | None, shift_ns: int) -> Si
     )
 
 
-def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
+def log_side(
+    file: RerunFile, side: Side, task: Task | None, not_scanned: Collection[str] = ()
+) -> None:
     """Log everything of one recording that is a number over time, a pose or a line of text."""
     recording, prefix = side.recording, side.prefix
     joints = recording.joints
@@ -179,7 +187,7 @@ def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
         file.always(f"{prefix}/tcp_path", way)
     for name, poses in recording.objects.items():
         file.poses(f"{prefix}/objects/{name}", poses, side.shift_ns)
-        file.always(f"{prefix}/objects/{name}", _shape(name, task, side.color))
+        file.always(f"{prefix}/objects/{name}", _shape(name, task, side.color, name in not_scanned))
     for event in recording.events:
         stamp_ns = int(event["stamp_ns"]) + side.shift_ns
         file.at(f"{prefix}/events", stamp_ns, rr.TextLog(event_text(event)))
@@ -191,7 +199,9 @@ def log_side(file: RerunFile, side: Side, task: Task | None) -> None:
         file.note(f"{recording.path.name}: {problem}")
 
 
-def _shape(name: str, task: Task | None, color: Rgb) -> rr.Boxes3D | rr.TransformAxes3D:
+def _shape(
+    name: str, task: Task | None, color: Rgb, not_scanned: bool
+) -> rr.Boxes3D | rr.TransformAxes3D:
     """The outlines of an object's boxes, where the task knows them."""
     model = None if task is None else task.objects.get(name)
     if model is None:
@@ -200,7 +210,9 @@ def _shape(name: str, task: Task | None, color: Rgb) -> rr.Boxes3D | rr.Transfor
     return rr.Boxes3D(
         centers=np.array([centre for centre, _ in panels]),
         half_sizes=np.array([size / 2 for _, size in panels]),
-        colors=color,
+        colors=rgb("unknown") if not_scanned else color,
+        labels=[f"{name}: {NOT_SCANNED}"] if not_scanned else None,
+        show_labels=not_scanned,
         fill_mode=rr.components.FillMode.MajorWireframe,
     )
 

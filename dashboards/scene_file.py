@@ -144,15 +144,10 @@ def draw_picture(scene: TrialScene, t_s: float) -> bytes:
         return encode_jpeg(np.zeros((camera.height, camera.width, 3), dtype=np.uint8))
     at = scene.nearest(t_s)
     recorded = scene.sides[0].Ts_base_object
-    clouds = [parts.background]
-    for name, item in parts.objects.items():
-        if name in recorded:
-            clouds.append(moved_cloud(item.cloud, recorded[name][at]))
-        elif name not in scene.absent:
-            clouds.append(moved_cloud(item.cloud, item.T_base_object))
-    clouds += [moved_cloud(parts.links[k], Ts[at]) for k, Ts in scene.Ts_root_link.items()]
-    drawn = open_rasteriser().view(concatenate(clouds), camera, view.T_root_camera)
-    return encode_jpeg(parts.behind(drawn, camera, view.T_root_camera).image_u8())
+    places = {name: Ts[at] for name, Ts in recorded.items() if name in parts.objects}
+    links = [moved_cloud(parts.links[k], Ts[at]) for k, Ts in scene.Ts_root_link.items()]
+    cloud = concatenate([parts.at(places), *links])
+    return encode_jpeg(parts.draw(open_rasteriser(), cloud, camera, view.T_root_camera).marked_u8())
 
 
 @dataclass
@@ -319,7 +314,7 @@ def _parts(
                 track = blocks.track(Ts)
                 found.append({"splats": f"object {name}", "side": side.name, "track": track})
     for name, item in scene.parts.objects.items():
-        if name not in scene.sides[0].Ts_base_object and name not in scene.absent:
+        if name not in scene.sides[0].Ts_base_object:
             track = blocks.track(item.T_base_object[None])
             found.append({"splats": f"object {name}", "side": "", "track": track})
     for name, Ts in scene.Ts_root_link.items():
@@ -348,11 +343,13 @@ def _node_range(name: str, num_nodes: int, node: int) -> str:
 
 def _boxes(sides: Sequence[Side], scene: TrialScene, blocks: _Blocks) -> list[dict[str, Any]]:
     found = []
+    not_scanned = frozenset[str]() if scene.parts is None else scene.parts.not_scanned
     for side in sides:
         for name, Ts in side.Ts_base_object.items():
             if name in scene.boxes_m:
                 centre_m, half_m = scene.boxes_m[name]
                 box = {"name": name, "side": side.name, "centre_m": centre_m, "half_m": half_m}
+                box["not_scanned"] = name in not_scanned
                 found.append(box | {"track": blocks.track(Ts)})
     return found
 

@@ -98,6 +98,8 @@ class SharedTrial:
     clip: Clip | None
     why_no_clip: str
     plots: tuple[TimePlot, ...]
+    not_scanned: tuple[str, ...]
+    """Objects that the twin draws from the task's shape."""
     t_s: float
     """Where the plots have their mark: the moment, in seconds since the first sample."""
     moment_text: str
@@ -254,17 +256,26 @@ def _figure(comparison: Comparison | None) -> tuple[Drawing | None, str | None]:
 def _trial(run: RunFolder, row: IndexedTrial) -> SharedTrial:
     """Everything of a trial but its clip."""
     plots: tuple[TimePlot, ...] = ()
+    not_scanned: tuple[str, ...] = ()
     t_s, text, why = 0.0, "", ""
     if row.file:
         try:
             page = build_page(run, row.file.removesuffix(".mcap"), row, None)
-            plots, t_s = page.plots[:PLOTS], page.t_s
+            plots, t_s, not_scanned = page.plots[:PLOTS], page.t_s, page.not_scanned
             text = "" if page.divergence is None else page.divergence.text
         except GstError as error:
             why = str(error).replace(str(run.path), run.path.name)
     else:
         why = "from a table: nothing was recorded"
-    return SharedTrial(row=row, clip=None, why_no_clip=why, plots=plots, t_s=t_s, moment_text=text)
+    return SharedTrial(
+        row=row,
+        clip=None,
+        why_no_clip=why,
+        plots=plots,
+        not_scanned=not_scanned,
+        t_s=t_s,
+        moment_text=text,
+    )
 
 
 def _with_clips(

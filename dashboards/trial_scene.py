@@ -6,7 +6,7 @@ where the replay has them, taken back to where cameras see them. Nothing is loca
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -28,10 +28,11 @@ from dashboards.recording import PageClock, Problems, Recording
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture, PostureTrack, posture_track
 from twin.scene.frames.camera_poses import base_tree, unknown_mask
-from twin.scene.movable_scene import MovableScene, read_movable_scene
+from twin.scene.movable_scene import MovableScene
 from twin.scene.object_tracks import ObjectTracks, localised_tracks
 from twin.scene.render import poses_in_scene
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.trial import trial_parts
 
 RATE_HZ = 20.0
 """Poses are sampled this often; the page interpolates."""
@@ -102,9 +103,6 @@ class TrialScene:
     cameras: tuple[SceneCamera, ...]
     boxes_m: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]]
     """By object: centre and half extents of the box around it, in its own frame."""
-    absent: frozenset[str]
-    """Objects that were looked for and not found: as recorded they are not drawn. What nobody
-    looked for stands where it was scanned."""
     notes: tuple[str, ...]
 
     def nearest(self, t_s: float) -> int:
@@ -121,9 +119,10 @@ class _Gathering:
     episode: Episode
     clock: PageClock
     task: Task | None
-    parts: MovableScene | None
     times_s: Float[np.ndarray, " num_samples"]
     problems: Problems
+    parts: MovableScene | None = None
+    """None until it is read, and without a rebuilt scene."""
 
     @property
     def stamps_ns(self) -> Int[np.ndarray, " num_samples"]:
@@ -151,9 +150,6 @@ def gather_scene(
     clock = PageClock.of(recording)
     episode = Episode.open(recording.path)
     scene = problems.attempt(lambda: read_scene(run), None)
-    parts = (
-        None if scene is None else problems.attempt(lambda: read_movable_scene(run, scene), None)
-    )
     count = int(np.clip(np.ceil(clock.end_s * RATE_HZ) + 1, 2, MAX_SAMPLES))
     gathering = _Gathering(
         run=run,
@@ -161,7 +157,6 @@ def gather_scene(
         episode=episode,
         clock=clock,
         task=problems.attempt(lambda: streams.task_file(episode).task(), None),
-        parts=parts,
         times_s=np.linspace(0.0, clock.end_s, count),
         problems=problems,
     )
@@ -170,8 +165,11 @@ def gather_scene(
     known = postures if robot is not None else None
     tracks = problems.attempt(lambda: _localised(gathering, known), ObjectTracks())
     problems.texts.extend(tracks.notes)
-    if parts is not None:
-        problems.texts.extend(tracks.strangers(parts.objects))
+    if scene is not None:
+        drawn = partial(trial_parts, run, scene, episode, gathering.task, tracks.first())
+        parts, notes = problems.attempt(drawn, (None, []))
+        problems.texts.extend(notes)
+        gathering = replace(gathering, parts=parts)
     sides = [_recorded_side(gathering, tracks, postures, robot)]
     for trajectory, replay in replays.items():
         side = _replayed_side(gathering, trajectory, replay, robot)
@@ -180,13 +178,12 @@ def gather_scene(
     return TrialScene(
         times_s=gathering.times_s,
         scene=scene,
-        parts=parts,
+        parts=gathering.parts,
         sides=tuple(sides),
         Ts_root_link=_links(gathering, postures, robot),
         paths=tuple(_paths(gathering, replays, sent_plan)),
         cameras=tuple(_cameras(gathering, scene)),
         boxes_m=_boxes(gathering, sides),
-        absent=tracks.absent,
         notes=tuple(problems.texts),
     )
 

@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ from dashboards.demo import (
     ending_on_signals,
     free_port,
     running,
+    scan_task,
     set_aside,
     start_command,
     step,
@@ -107,6 +108,7 @@ def run_trials(path: Path, config: TrialsConfig, output: Output) -> int:
             learned.put_into(run)
         left = _clear(run, jobs, output, retry=config.retry)
         if left:
+            _scan(run, config, left, output)
             _do(run, config, left, output)
         step(
             output, "replaying every plan", ["replay", str(path), "--samples", f"{config.samples}"]
@@ -292,6 +294,29 @@ def _there(run: RunFolder, jobs: Sequence[Job]) -> _There:
 def _number(path: Path) -> int:
     digits = path.name.split(".")[0].rpartition("_")[2]
     return int(digits) if digits.isdigit() else -1
+
+
+def _scan(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:
+    """Record a scan of each task that has none, before its first trial, if pictures are taken."""
+    there = set()
+    for path in run.episodes():
+        with suppress(GstError):
+            episode = Episode.open(path)
+            if episode.info.kind == "scan" and not cut_short(episode, episode.outcome):
+                there.add(episode.info.task)
+    wanted = {job.task: job for job in reversed(jobs) if job.task not in there}
+    if not wanted or config.rate_hz <= 0:
+        return
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    log = run.notes_dir / "logs" / "record_scans.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with running(["record", str(run.path), "--listen", endpoint], log) as recorder:
+        recorder.wait_until(lambda: answers(endpoint, "rec/main/ctl/status"))
+        for job in wanted.values():
+            standin = ["publish", "standin", "--connect", endpoint]
+            standin += ["--seed", str(job.session_seed), "--first-start", str(job.start)]
+            standin += ["--image-scale", str(config.image_scale)]
+            scan_task(job.chosen, standin, output, recorder)
 
 
 def _do(run: RunFolder, config: TrialsConfig, jobs: Sequence[Job], output: Output) -> None:

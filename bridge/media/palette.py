@@ -79,8 +79,8 @@ DARK: Mapping[str, str] = {
 """The same on dark pages; of lines, also over pictures and in 3D."""
 OBJECTS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7")
 """Of objects drawn from above, in the task's order."""
-IN_SCENE = ("recorded", "planned", "twin-planned", "twin-executed")
-"""Ways and objects of a 3D view, whose ground may be anything: as on dark pages."""
+IN_SCENE = ("recorded", "planned", "twin-planned", "twin-executed", "unknown")
+"""In a 3D view, on any ground: as on dark pages. ``unknown`` outlines what was not scanned."""
 
 
 def rgb(name: str) -> Rgb:

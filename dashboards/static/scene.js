@@ -9,7 +9,7 @@ const SLOW_MS = 90; // a frame that takes longer is drawn coarser while things m
 const REST_MS = 250;
 const EDGES = [0, 1, 1, 3, 3, 2, 2, 0, 4, 5, 5, 7, 7, 6, 6, 4, 0, 4, 1, 5, 2, 6, 3, 7];
 const STYLE = getComputedStyle(document.documentElement);
-const COLORS = Object.fromEntries(["recorded", "planned", "twin-planned", "twin-executed"].map((name) =>
+const COLORS = Object.fromEntries(["recorded", "planned", "twin-planned", "twin-executed", "unknown"].map((name) =>
   [name, STYLE.getPropertyValue("--in-scene-" + name).match(/[0-9a-f]{2}/g).map((part) => parseInt(part, 16) / 255)]));
 
 function read(buffer) {
@@ -267,13 +267,13 @@ class View {
     }
     for (const box of file.boxes) {
       const hasSplats = file.ranges["object " + box.name];
-      if ((box.side === "recorded" && hasSplats) || !this.isShown(box.side)) continue;
+      if ((box.side === "recorded" && hasSplats && !box.not_scanned) || !this.isShown(box.side)) continue;
       const m = poseAt(file, box.track, t);
       const corners = [...Array(8).keys()].map((bits) => {
         const p = box.half_m.map((h, axis) => box.centre_m[axis] + (bits >> axis & 1 ? h : -h));
         return [0, 4, 8].map((row) => dot(m.slice(row, row + 3), p) + m[row + 3]);
       });
-      const color = COLORS[box.side === "recorded" ? box.side : "twin-" + box.side];
+      const color = COLORS[box.side !== "recorded" ? "twin-" + box.side : box.not_scanned ? "unknown" : box.side];
       for (let edge = 0; edge < 24; edge += 2) {
         stroke(corners[EDGES[edge]], corners[EDGES[edge + 1]], color, 1);
       }

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -83,7 +84,7 @@ def without_commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 def test_a_whole_recording_is_kept_and_what_is_missing_is_named(run: RunFolder) -> None:
     record_all(run)
-    assert look(run, QUICK) == demo.Recorded(has_scan=True, num_known=4)
+    assert look(run, QUICK) == demo.Recorded(num_known=4)
     (run.episodes_dir / "trial_0003.mcap").unlink()
     found = look(run, QUICK)
     assert found.missing == [trial(*STARTS[2])]
@@ -108,6 +109,21 @@ def test_the_demo_tries_the_tasks_it_is_given() -> None:
     ]
 
 
+def test_every_task_is_scanned_before_the_scene_is_rebuilt(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = replace(QUICK, task=(TASK, "cube_on_block"))
+    record_all(run)
+    assert look(run, both).unscanned == ["cube_on_block"]
+    asked = without_commands(monkeypatch)
+    with pytest.raises(DashboardError, match="there is no scan for cube_on_block"):
+        demo.run_demo(run.path, both, QUIET)
+    scan, calibrate = asked[1], asked[2]
+    assert scan[scan.index("--task") + 1] == "cube_on_block"
+    assert scan[scan.index("--trials") + 1] == "0"
+    assert calibrate[0] == "calibrate"
+
+
 @pytest.mark.parametrize(
     ("stopped_by", "outcome"),
     [
@@ -121,7 +137,7 @@ def test_a_scan_that_was_cut_short_is_recorded_anew(
 ) -> None:
     path = record(run, "scan_0001", stopped_by=stopped_by, outcome=outcome)
     found = look(run, QUICK)
-    assert not found.has_scan
+    assert found.unscanned == [TASK]
     assert list(found.unusable) == [path]
 
 
@@ -182,7 +198,7 @@ def test_every_interrupted_step_leads_to_the_steps_after_it(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = without_commands(monkeypatch)
-    with pytest.raises(DashboardError, match="there is no scan"):
+    with pytest.raises(DashboardError, match=f"there is no scan for {TASK}"):
         demo.run_demo(run.path, QUICK, QUIET)
     assert [words[0] for words in asked] == [
         "record",

@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -208,3 +209,19 @@ def test_a_models_address_with_a_secret_gets_into_no_protocol(tmp_path: Path, ur
 def test_half_a_model_is_no_study(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="--policies model --model URL --model-name NAME"):
         replace(MODEL, **change)
+
+
+def test_each_task_is_scanned_once_before_its_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, asked = RunFolder.create(tmp_path / "run"), list[str]()
+    recorder = SimpleNamespace(wait_until=lambda ready: None)
+    monkeypatch.setattr(trials, "running", lambda *_: nullcontext(recorder))
+    monkeypatch.setattr(trials, "scan_task", lambda task, *_: asked.append(task))
+    both = jobs_of(*protocol_of(replace(STUDY, task=("cube_into_box", "stack_two_cubes"))))
+    with EpisodeWriter(run.episodes_dir / "scan_0001.mcap") as writer:
+        writer.describe(EpisodeInfo(id="scan_0001", kind="scan", task="cube_into_box"))
+    trials._scan(run, STUDY, both, QUIET)
+    assert asked == ["stack_two_cubes"]
+    trials._scan(run, replace(STUDY, rate_hz=0.0), both, QUIET)  # without pictures
+    assert asked == ["stack_two_cubes"]

@@ -15,7 +15,7 @@ from bridge.task.find import ATTACHMENT, MEDIA_TYPE, MissingTaskError, keep_task
 from bridge.task.task_file import TaskFile, load_task
 from evaluator.compare.known_task import recorded_task
 from twin.scene.frames.selection import Sources
-from twin.scene.objects.decompose import scanned_tasks
+from twin.scene.objects.placement import scanned_tasks
 
 CUBE = (datasets_folder() / "tasks" / "cube_into_box.toml").read_bytes()
 MINE = TaskFile(CUBE.replace(b"cube_into_box", b"mine").replace(b"[200, 45", b"[20, 145"), "mine")
@@ -71,7 +71,7 @@ def test_a_scene_of_several_tasks_has_the_objects_of_all(run: RunFolder) -> None
         recorded(run, name, file) for name, file in (("a", MINE), ("b", OTHER), ("c", MINE))
     )
     found = scanned_tasks(Sources(episodes=episodes, remark=""))
-    assert [episode.info.id for episode, _ in found.files] == ["a", "b"]
+    assert [episode.info.id for episode, _ in found.files] == ["a", "b", "c"]
     assert found.task is not None
     assert list(found.task.objects) == ["cube", "box", "sloth", "basket"]
 

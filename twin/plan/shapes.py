@@ -13,9 +13,11 @@ from bridge.task.task_file import SCANNED, ObjectModel, Task
 from twin.plan.problem import Problem, Shape
 from twin.replay.rebuilt_scene import MOST_OFF, read_rebuilt_scene
 from twin.robot.model import load_robot
-from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.files import MESH, TASK_SHAPE
+from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import UnreadableMeshError, read_mesh
+from twin.scene.store.folder import read_record
+from twin.scene.store.library import NOT_SCANNED, Library
 
 GUESSED_SHARE = 0.1
 """Of its largest extent, a scanned object may be off that no scan has shown yet."""
@@ -34,24 +36,19 @@ def problem_of(
     return Problem(
         scene=replace(scene, start_rad=start_rad),
         robot=load_robot(urdf),
-        shapes=shapes_of(run.scene_dir, task),
+        shapes=shapes_of(Library.of(run, read_record(run)), task),
     )
 
 
-def shapes_of(scene_dir: Path | None, task: Task) -> dict[str, Shape]:
-    """The surface of every object of a task, in its own frame."""
-    if scene_dir is None or not scene_dir.is_dir():
-        return {
-            key: _task_shape(model, "task file: there is no scene")
-            for key, model in task.objects.items()
-        }
-    return {key: _shape_of(scene_dir, key, model) for key, model in task.objects.items()}
+def shapes_of(library: Library | None, task: Task) -> dict[str, Shape]:
+    """The surface of every object of a task, in its own frame; by the task where None scanned."""
+    places = {key: None if library is None else library.place(key) for key in task.objects}
+    return {key: _shape_of(places[key], model) for key, model in task.objects.items()}
 
 
-def _shape_of(scene_dir: Path, key: str, model: ObjectModel) -> Shape:
-    folder = scene_dir / "objects" / key
-    if not (folder / MESH).is_file():
-        return _task_shape(model, "task file: the scene has no mesh of it")
+def _shape_of(folder: Path | None, model: ObjectModel) -> Shape:
+    if folder is None or not (folder / MESH).is_file():
+        return _task_shape(model, f"task file: {NOT_SCANNED}")
     try:
         about = json.loads((folder / "object.json").read_text())
         source, geometry = str(about["shape_source"]), about.get("geometry") or {}

@@ -8,7 +8,7 @@ Cameras that were calibrated are where the calibration has them, the others wher
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -26,13 +26,14 @@ from twin.replay.result import ReplayResult
 from twin.replay.scene import ReplayScene
 from twin.robot.posture import Posture
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at
-from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
-from twin.scene.movable_scene import MovableScene, read_movable_scene
+from twin.scene.gaussians import GaussianCloud
+from twin.scene.movable_scene import MovableScene
 from twin.scene.raster.backend import open_rasteriser
 from twin.scene.render import carried_camera
 from twin.scene.skinning import Binding, bind, pose_cloud
 from twin.scene.store.calibration import read_calibration, without_joints
 from twin.scene.store.folder import read_scene
+from twin.scene.trial import trial_parts
 
 RATE_HZ = 5.0
 """Of the images of a plan that was never executed."""
@@ -45,7 +46,6 @@ class _Stage:
     """Everything that can be drawn, ready to be moved."""
 
     parts: MovableScene
-    """Its objects are those that can move; all others belong to its background."""
     bindings: Mapping[str, Binding]
     """Of soft ones: which nodes carry which Gaussians."""
 
@@ -80,7 +80,7 @@ def render_replay(
         start_ns: Source time that is the replay's time 0.
         executed: Whether the plan was executed then, so that there are instants to compare with.
     """
-    stage = _set_up(run, scene, result)
+    stage = _set_up(run, episode, scene, result)
     rasteriser = open_rasteriser()
     tree, calibration = base_tree(episode), read_calibration(run)
     places = {} if calibration is None else calibration.cameras
@@ -105,40 +105,28 @@ def render_replay(
                 T = seen.T_root_frame(info.frame_id, stamp_ns)
             else:
                 T = result.Ts_base_tcp[index] @ T_tcp_camera
-            view = rasteriser.view(stage.at(result, scene, index), info.camera, T)
-            view = stage.parts.behind(view, info.camera, T)
+            cloud = stage.at(result, scene, index)
+            drawn = stage.parts.draw(rasteriser, cloud, info.camera, T)
             yield (
                 camera_id,
                 CompressedColor(
                     stamp_ns=stamp_ns,
                     frame_id=info.frame_id,
                     format="jpeg",
-                    data=encode_jpeg(view.image_u8()),
+                    data=encode_jpeg(drawn.marked_u8()),
                 ),
             )
 
 
-def _set_up(run: RunFolder, scene: ReplayScene, result: ReplayResult) -> _Stage:
-    rebuilt = read_scene(run)
-    parts = read_movable_scene(run, rebuilt)
-    objects = parts.objects
-    places = dict(scene.containers())
-    # What the task does not know stands where it was scanned; what it knows and nobody found is
-    # absent here too.
-    places |= {
-        name: item.T_base_object for name, item in objects.items() if name not in scene.task.objects
-    }
-    static = [moved_cloud(objects[name].cloud, T) for name, T in places.items() if name in objects]
-    movable = {name: item for name, item in objects.items() if name in scene.movable()}
-    soft = {name: body for name, body in soft_models(scene).items() if name in movable}
+def _set_up(run: RunFolder, episode: Episode, scene: ReplayScene, result: ReplayResult) -> _Stage:
+    parts, _ = trial_parts(run, read_scene(run), episode, scene.task, scene.Ts_base_object)
+    soft = {name: body for name, body in soft_models(scene).items() if name in parts.objects}
     return _Stage(
-        parts=replace(
-            parts, background=concatenate([rebuilt.background, *static]), objects=movable
-        ),
+        parts=parts,
         bindings={
-            name: bind(movable[name].cloud.means_m, body.nodes_m)
+            name: bind(parts.objects[name].cloud.means_m, body.nodes_m)
             for name, body in soft.items()
-            if name in result.nodes_m and len(movable[name].cloud)
+            if name in result.nodes_m and len(parts.objects[name].cloud)
         },
     )
 

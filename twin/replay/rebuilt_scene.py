@@ -31,6 +31,7 @@ from twin.scene.shape.lattice import Lattice
 from twin.scene.shape.static import StaticSdf
 from twin.scene.store.calibration import Calibration, read_calibration
 from twin.scene.store.folder import read_record
+from twin.scene.store.library import NOT_SCANNED, Library
 
 
 class UnreadablePosteriorError(TwinError):
@@ -215,9 +216,9 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> RebuiltScene:
     record = read_record(run)
     if record is None:
         return rebuilt
-    lattices, notes = {}, list(rebuilt.notes)
+    lattices, notes, library = {}, list(rebuilt.notes), Library.of(run, record)
     for key in task.soft_objects:
-        arrays, sources[key] = _lattice(run.scene_dir / "objects" / key, task.objects[key])
+        arrays, sources[key] = _lattice(library.place(key), task.objects[key])
         if arrays is None:
             notes.append(f"{key}: {sources[key]}")
         else:
@@ -275,8 +276,12 @@ def shape_hashes(run: RunFolder) -> dict[str, str]:
     }
 
 
-def _lattice(folder: Path, model: ObjectModel) -> tuple[Mapping[str, np.ndarray] | None, str]:
+def _lattice(
+    folder: Path | None, model: ObjectModel
+) -> tuple[Mapping[str, np.ndarray] | None, str]:
     """The scene's lattice of one object, or None; and where its shape comes from, in words."""
+    if folder is None:
+        return None, f"{TASK_SHAPE} ({NOT_SCANNED})"
     path = folder / "soft.npz"
     if not path.is_file():
         return None, f"{TASK_SHAPE} (the scene has no lattice of it)"

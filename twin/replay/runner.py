@@ -32,6 +32,7 @@ from twin.robot.posture import check_joints, width_track
 from twin.scene.localise.episode import MOTION_MARGIN_NS
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import SCENE_FILE, read_record, scene_hash_of
+from twin.scene.store.library import Library
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,7 +304,7 @@ def _replay_trajectories(
     skipped |= unusable
     _say_what_is_missing(run, jobs, output)
     if config.render:
-        for note in describe_undrawn(read_record(run) or {}, _tasks(jobs)):
+        for note in describe_undrawn(run, _tasks(jobs)):
             output.say(note)
     rows, todo = there_already(jobs, force=config.force)
     if todo:
@@ -430,15 +431,11 @@ def _replayed(todo: list[ReplayJob], runner: Runner, output: Output) -> Iterator
                 yield answer
 
 
-def describe_undrawn(record: Mapping[str, Any], tasks: Iterable[Task]) -> list[str]:
-    """Name what the rebuilt scene has no Gaussians of."""
-    found = []
-    for task in tasks:
-        missing = [key for key in task.objects if key not in record.get("objects", {})]
-        if missing:
-            because = record.get("objects_remark")
-            reason = f" ({because})" if because else ""
-            found.append(f"{', '.join(missing)}: not in the scene, not in pictures{reason}")
+def describe_undrawn(run: RunFolder, tasks: Iterable[Task]) -> list[str]:
+    """Name what no scan saw, and what pictures lack."""
+    record = read_record(run) or {}
+    library = Library.of(run, record)
+    found = [note for task in tasks for note in library.notes(task)]
     robot = record.get("robot", {})
     if not robot.get("links"):
         reason = f" ({robot['remark']})" if robot.get("remark") else ""

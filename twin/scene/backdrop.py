@@ -94,9 +94,6 @@ def directions_on_sphere(
     """Where rays leave a sphere, as unit vectors from its centre.
 
     An eye outside of it sees what it would see from the centre.
-
-    Args:
-        rays: Directions of any length.
     """
     d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     from_centre = eye_m - centre_m

@@ -35,12 +35,7 @@ def degree_of(num_harmonics: int) -> int:
 
 
 def harmonic_terms(x: Any, y: Any, z: Any, num_harmonics: int) -> list[Any]:
-    """Values of the harmonics along unit directions, arrays of NumPy or of torch.
-
-    Args:
-        x: First component of the directions; the others alike.
-        num_harmonics: 0, 3, 8 or 15.
-    """
+    """Values of the harmonics along unit directions, arrays of NumPy or of torch."""
     terms = [-SH_FIRST * y, SH_FIRST * z, -SH_FIRST * x]
     if num_harmonics <= NUM_FIRST:
         return terms[:num_harmonics]
@@ -60,12 +55,7 @@ def harmonic_terms(x: Any, y: Any, z: Any, num_harmonics: int) -> list[Any]:
 def harmonic_basis(
     directions: Float[np.ndarray, "*shape 3"], num_harmonics: int = NUM_FIRST
 ) -> Float[np.ndarray, "*shape num_harmonics"]:
-    """Values of the harmonics along unit directions.
-
-    Args:
-        directions: Of length 1.
-        num_harmonics: 3, 8 or 15.
-    """
+    """Values of the harmonics along unit directions."""
     x, y, z = np.moveaxis(directions, -1, 0)
     return np.asarray(np.stack(harmonic_terms(x, y, z, num_harmonics), axis=-1))
 
@@ -80,9 +70,6 @@ def turned_harmonics(
     sqrt(3 / (4 pi)) v . d with v = (-h_2, -h_0, h_1), and turns like one. A rotation mixes the
     harmonics of a degree among themselves; how, follows from their values along enough directions:
     what is seen along d now was seen along R^T d before.
-
-    Args:
-        harmonics: Of all degrees up to one.
     """
     if harmonics.shape[1] == 0:
         return harmonics

@@ -5,20 +5,17 @@ which a part is small counts little. Robot and objects are where their meshes ar
 the ray of the recorded camera, whatever is drawn there; background is all the rest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
-import open3d
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.media.image_quality import as_float
 from twin.robot.surface import PosedSurface
-
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Vertices [m] and triangles."""
+from twin.scene.shape.mesh import Mesh, first_hit
+from twin.scene.store.library import NOT_SCANNED
 
 
 def part_masks(
@@ -27,6 +24,7 @@ def part_masks(
     robot: PosedSurface | None,
     meshes: Mapping[str, Mesh],
     Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+    not_scanned: Collection[str] = (),
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
     """Which pixels show robot, objects and background, by the first mesh along each ray.
 
@@ -34,32 +32,20 @@ def part_masks(
         robot: Its surface as it stands then; None: it is not known.
         meshes: Of objects, each in its own frame.
         Ts_base_object: Where they are; those without a pose are not there.
+        not_scanned: Objects that no scan saw: they are objects, and a kind of their own besides.
     """
     rays = camera.rays()
     nothing = np.full(rays.shape[:2], np.inf, dtype=np.float32)
     robot_m = nothing if robot is None else robot.depth_along(rays, T_base_camera)
-    objects_m = _first_hit(rays, T_base_camera, meshes, Ts_base_object)
+    objects_m, _ = first_hit(rays, T_base_camera, meshes, Ts_base_object)
     is_robot = np.isfinite(robot_m) & (robot_m <= objects_m)
     is_object = np.isfinite(objects_m) & ~is_robot
-    return {"robot": is_robot, "objects": is_object, "background": ~is_robot & ~is_object}
-
-
-def _first_hit(
-    rays: Float[np.ndarray, "height width 3"],
-    T_base_camera: Float[np.ndarray, "4 4"],
-    meshes: Mapping[str, Mesh],
-    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
-) -> Float32[np.ndarray, "height width"]:
-    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-    tensor: Any = open3d.core.Tensor
-    scene = make()
-    for name, (vertices_m, triangles) in meshes.items():
-        if name in Ts_base_object and len(triangles):
-            T_camera_object = se3.invert(T_base_camera) @ Ts_base_object[name]
-            vertices = se3.apply(T_camera_object, vertices_m).astype(np.float32)
-            scene.add_triangles(tensor(vertices), tensor(triangles.astype(np.uint32)))
-    from_camera = np.concatenate([np.zeros_like(rays), rays], axis=-1).astype(np.float32)
-    return np.asarray(scene.cast_rays(tensor(from_camera))["t_hit"].numpy())
+    masks = {"robot": is_robot, "objects": is_object, "background": ~is_robot & ~is_object}
+    drawn_from_task = {name: mesh for name, mesh in meshes.items() if name in not_scanned}
+    if drawn_from_task:
+        own_m, _ = first_hit(rays, T_base_camera, drawn_from_task, Ts_base_object)
+        masks[NOT_SCANNED] = is_object & (own_m <= objects_m)
+    return masks
 
 
 class ImageAgreement:

@@ -20,11 +20,6 @@ def normal_equations(
     residuals: Float[np.ndarray, " num_residuals"],
     weights: Float[np.ndarray, " num_residuals"],
 ) -> tuple[Float[np.ndarray, "num_unknowns num_unknowns"], Float[np.ndarray, " num_unknowns"]]:
-    """Return J^T W J and the gradient J^T W r; a step solves H x = -gradient.
-
-    Args:
-        residuals: What is to become zero.
-        weights: Of each squared residual.
-    """
+    """Return J^T W J and the gradient J^T W r; a step solves H x = -gradient."""
     weighted = (J * weights[:, None]).T
     return weighted @ J, weighted @ residuals

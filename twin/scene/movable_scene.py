@@ -1,27 +1,79 @@
 """A rebuilt scene whose parts can be put anywhere: a cloud for each state of robot and objects."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.ndimage import binary_dilation
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.media.palette import rgb
 from twin.robot.posture import Posture
 from twin.scene.backdrop import Backdrop, read_backdrop
-from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud
-from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose
-from twin.scene.raster.rasteriser import View
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
+from twin.scene.objects.decompose import ObjectSplats, read_objects, read_pose, uncovered
+from twin.scene.raster.backend import CudaRasteriser
+from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.robot.lighting import EVEN, Lighting, read_lighting
 from twin.scene.robot.splats import posed, read_links
 from twin.scene.store.folder import SCENE_FILE, Scene
+from twin.scene.store.library import NOT_SCANNED
 
-UNDER_M = 0.008
-"""Background this far below an object is covered by it."""
-TRANSPARENT_LOGIT = -30.0
-UP = np.array([0.0, 0.0, 1.0])
+SEEN = 0.5
+"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan, and of an
+object in one that shows it."""
+DASH_PX = 4
+"""Dashes of the outline around what was not scanned."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """One state as it was drawn."""
+
+    image_u8: UInt8[np.ndarray, "height width 3"]
+    """What the cameras would have seen: this is compared with what they saw."""
+    depth_m: Float32[np.ndarray, "height width"]
+    alpha: Float32[np.ndarray, "height width"]
+    seen_mask: Bool[np.ndarray, "height width"]
+    """Pixels that show what was measured in the scan, and not what was completed."""
+    not_scanned: Mapping[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
+    """By object that no scan saw: the pixels that show it."""
+
+    def seen_u8(self) -> UInt8[np.ndarray, "height width"]:
+        """The mask as an image, white where seen."""
+        return np.where(self.seen_mask, np.uint8(255), np.uint8(0))
+
+    def marked_u8(self) -> UInt8[np.ndarray, "height width 3"]:
+        """The image for people: what was not scanned has a dashed outline and is named."""
+        image = self.image_u8
+        for name, mask in self.not_scanned.items():
+            image = outlined(image, mask, f"{name}: {NOT_SCANNED}") if mask.any() else image
+        return image
+
+
+def outlined(
+    image_u8: UInt8[np.ndarray, "height width 3"],
+    mask: Bool[np.ndarray, "height width"],
+    words: str,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The image with dashes around a mask, and words above it."""
+    from PIL import Image as pillow  # noqa: PLC0415  # heavy, only for what was not scanned
+    from PIL import ImageDraw  # noqa: PLC0415
+
+    rows, columns = np.nonzero(binary_dilation(mask, iterations=2) & ~mask)
+    marked = image_u8.copy()
+    dark = (rows + columns) // DASH_PX % 2 == 0
+    marked[rows, columns] = np.where(dark[:, None], np.uint8(0), np.array(rgb("unknown"), "u1"))
+    picture = pillow.fromarray(marked)
+    pen, (top, left) = ImageDraw.Draw(picture), np.argwhere(mask).min(axis=0)
+    box = pen.textbbox((0, 0), words)
+    at = min(max(left, 1), max(mask.shape[1] - box[2] - 2, 1)), max(top - box[3] - 4, 1)
+    pen.rectangle((at[0] - 1, at[1], at[0] + box[2] + 1, at[1] + box[3] + 1), fill=(0, 0, 0))
+    pen.text(at, words, fill=rgb("unknown"))
+    return np.asarray(picture)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +82,7 @@ class MovableScene:
 
     background: GaussianCloud
     objects: Mapping[str, ObjectSplats]
+    """Those that are drawn."""
     links: Mapping[str, GaussianCloud]
     T_root_base: Float[np.ndarray, "4 4"]
     """The robot's base in the scene's frame."""
@@ -37,12 +90,41 @@ class MovableScene:
     """On the links."""
     backdrop: Backdrop | None = None
     """What stands behind everything; None: black."""
+    not_scanned: frozenset[str] = frozenset()
+    """Objects that no scan saw: drawn from the task's shape."""
 
-    def behind(self, view: View, camera: Camera, T_base_camera: Float[np.ndarray, "4 4"]) -> View:
-        """A view of one state, with the backdrop where nothing was drawn."""
-        if self.backdrop is None:
-            return view
-        return self.backdrop.behind(view, camera, T_base_camera)
+    def draw(
+        self,
+        rasteriser: Rasteriser | CudaRasteriser,
+        cloud: GaussianCloud,
+        camera: Camera,
+        T_base_camera: Float[np.ndarray, "4 4"],
+    ) -> Drawn:
+        """Draw a cloud of ``at``, with the backdrop where there is nothing.
+
+        Args:
+            cloud: More may stand behind its last Gaussian.
+        """
+        view = rasteriser.view(cloud, camera, T_base_camera)
+        flags = [~cloud.completed]
+        first = len(self.background)
+        for name, item in self.objects.items():
+            if name in self.not_scanned:
+                flags.append(np.zeros(len(cloud), dtype=bool))
+                flags[-1][first : first + len(item.cloud)] = True
+                flags[0] = flags[0] & ~flags[-1]
+            first += len(item.cloud)
+        shown = rasteriser.draw_features(as_float32(np.stack(flags, axis=1))) >= SEEN
+        if self.backdrop is not None:
+            view = self.backdrop.behind(view, camera, T_base_camera)
+        names = [name for name in self.objects if name in self.not_scanned]
+        return Drawn(
+            image_u8=view.image_u8(),
+            depth_m=view.depth_m,
+            alpha=view.alpha,
+            seen_mask=shown[0],
+            not_scanned=dict(zip(names, shown[1:], strict=True)),
+        )
 
     def at(
         self,
@@ -67,7 +149,7 @@ class MovableScene:
             for name, item in self.objects.items()
             if name not in bent
         }
-        parts = [self._uncovered(placed)]
+        parts = [uncovered(self.background, self.objects, placed)]
         for name, item in self.objects.items():
             own = bent[name] if name in bent else moved_cloud(item.cloud, placed[name])
             parts.append(own)
@@ -82,31 +164,16 @@ class MovableScene:
             parts.append(moved_cloud(robot, self.T_root_base))
         return concatenate(parts)
 
-    def _uncovered(self, placed: Mapping[str, Float[np.ndarray, "4 4"]]) -> GaussianCloud:
-        """The background, transparent where closed objects stand in it or on it."""
-        means = self.background.means_m
-        opacities = self.background.opacities_logit.copy()
-        for name, T in placed.items():
-            sdf = self.objects[name].sdf
-            if sdf is None:
-                continue
-            reach_m = sdf.voxel_m * float(np.linalg.norm(sdf.values_m.shape)) + UNDER_M
-            near = np.abs(means - T[:3, 3].astype(np.float32)).max(axis=1) < reach_m
-            ids = np.flatnonzero(near)
-            p = means[ids].astype(np.float64)
-            for up_m in (0.0, UNDER_M / 2, UNDER_M):
-                lifted = se3.apply(se3.invert(T), p + up_m * UP)
-                opacities[ids[sdf.distance(lifted) < 0]] = TRANSPARENT_LOGIT
-        return replace(self.background, opacities_logit=opacities)
 
-
-def read_movable_scene(run: RunFolder, scene: Scene) -> MovableScene:
-    """Load the parts that ``scene.json`` lists."""
+def read_movable_scene(
+    run: RunFolder, scene: Scene, wanted: Iterable[str] | None = None
+) -> MovableScene:
+    """Load the parts that ``scene.json`` lists, of its objects those that are wanted."""
     root = scene.record.get("robot", {}).get("T_base_root")
     T_base_root = np.eye(4) if root is None else read_pose(root, run.scene_dir / SCENE_FILE)
     return MovableScene(
         background=scene.background,
-        objects=read_objects(run, scene.record),
+        objects=read_objects(run, scene.record, wanted),
         links=read_links(run, scene.record),
         T_root_base=se3.invert(T_base_root),
         lighting=read_lighting(scene.record),

@@ -8,7 +8,7 @@ where it is put down. An object that is found far from where it was let go fell,
 and one that was never held was moved by something else: both change place when that is known.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,18 +97,9 @@ class ObjectTracks:
     notes: tuple[str, ...] = ()
     """What nobody saw and what was assumed instead."""
 
-    def strangers(self, scanned: Iterable[str]) -> list[str]:
-        """Name what the scan had and the episode does not know, and the other way round."""
-        known = {*self.spans}
-        if not known:
-            return []
-        drawn = [*scanned]
-        old = [name for name in drawn if name not in known]
-        new = [name for name in sorted(known) if name not in drawn]
-        return [
-            *(f"{name} is not of the episode's task: drawn where it was scanned" for name in old),
-            *(f"{name} was not scanned: the scene cannot draw it" for name in new),
-        ]
+    def first(self) -> dict[str, Float[np.ndarray, "4 4"]] | None:
+        """Where objects were before anything moved; None where nobody localised them."""
+        return self.at(0, None) if self.spans or self.absent else None
 
     def at(
         self, stamp_ns: int, T_base_tcp: Float[np.ndarray, "4 4"] | None

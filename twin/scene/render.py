@@ -1,11 +1,10 @@
 """Draw the rebuilt scene, also in another state than scanned: objects moved, the robot posed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt16
+from jaxtyping import Float, Float32, Int, UInt16
 
 from bridge.episode import streams
 from bridge.episode.reader import Episode
@@ -20,13 +19,12 @@ from twin.robot.model import RobotDescriptionError, load_robot
 from twin.robot.posture import Posture, posture_track
 from twin.scene.frames.camera_poses import base_tree, calibrated_tree_at, unknown_mask
 from twin.scene.frames.pairing import name_of
-from twin.scene.gaussians import GaussianCloud, as_float32
-from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
+from twin.scene.raster.backend import open_rasteriser
+from twin.scene.raster.rasteriser import RasterConfig
 from twin.scene.settings import RenderConfig
 from twin.scene.store.calibration import read_calibration
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.trial import TrialInScene, open_trial
 
 PROBES = 9
 """Instants of an episode at which a camera's place in the hand is looked at."""
@@ -36,59 +34,30 @@ MOVED_M = 0.02
 """A hand that moved less says nothing about what it carries."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Composed:
-    """What is drawn."""
-
-    cloud: GaussianCloud
-    robot: str
-    """How the robot stands, or why it is not drawn."""
-    posture: Posture | None
-    """None: no robot is drawn."""
-    parts: MovableScene
-
-
-def compose(
-    run: RunFolder, scene: Scene, episode: Episode, stamp_ns: int, config: RenderConfig
-) -> Composed:
-    """Put background, objects and robot together as the settings say."""
-    parts = read_movable_scene(run, scene)
-    places = object_places(config.object, list(parts.objects))
-    if not parts.links:
-        reason = why_no_robot(scene)
-        if config.joints is not None:
-            message = f"--joints cannot be followed: {reason}."
+def posture_of(
+    trial: TrialInScene, stamp_ns: int, config: RenderConfig
+) -> tuple[Posture | None, str, str]:
+    """How the robot stands: posture or None, its URDF, and where that comes from or why not."""
+    if config.joints is not None:
+        if not trial.parts.links:
+            message = f"--joints cannot be followed: {trial.robot.removeprefix('not drawn: ')}."
             raise UsageError(message)
-        robot = f"not drawn: {reason}"
-        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
-    try:
-        urdf, posture = _posture(episode, stamp_ns, config)
-    except GstError as error:
-        if config.joints is not None:
-            raise
-        robot = f"not drawn: {error}"
-        return Composed(cloud=parts.at(places), robot=robot, posture=None, parts=parts)
-    source = "given" if config.joints is not None else f"as {episode.info.id} has it at that time"
-    cloud = parts.at(places, posture, urdf)
-    return Composed(cloud=cloud, robot=f"joints {source}", posture=posture, parts=parts)
+        return _given_posture(trial.recorded, config.joints, config.width_m)
+    track, of = trial.postures, trial.recorded.info.id
+    if track is None or not trial.parts.links:
+        return None, "", trial.robot
+    if not track.covers(stamp_ns):
+        return None, "", f"not drawn: {of} has no joints at that time: choose another --at-s."
+    recorded = track.at(stamp_ns)
+    width_m = recorded.width_m if config.width_m is None else config.width_m
+    posture = Posture(joints_rad=recorded.joints_rad, width_m=width_m)
+    return posture, track.urdf, f"joints as {of} has them at that time"
 
 
-def why_no_robot(scene: Scene) -> str:
-    """Why a scene without Gaussians of the robot has none."""
-    remark = scene.record.get("robot", {}).get("remark")
-    return "the scene has no robot splats" + (f" ({remark})" if remark else "")
-
-
-def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str, Posture]:
-    if config.joints is None:
-        track = posture_track(episode)
-        if not track.covers(stamp_ns):
-            message = f"{episode.info.id} has no joints at that time: choose another --at-s."
-            raise UsageError(message)
-        recorded = track.at(stamp_ns)
-        width_m = recorded.width_m if config.width_m is None else config.width_m
-        return track.urdf, Posture(joints_rad=recorded.joints_rad, width_m=width_m)
-    joints = np.array(config.joints, dtype=np.float64)
+def _given_posture(
+    episode: Episode, given: Sequence[float], width_m: float | None
+) -> tuple[Posture, str, str]:
+    joints = np.array(given, dtype=np.float64)
     names = streams.recorded_robot(episode).joints
     if len(joints) != len(names) or not np.isfinite(joints).all():
         message = f"--joints takes {len(names)} angles in rad: {', '.join(names)}."
@@ -99,7 +68,7 @@ def _posture(episode: Episode, stamp_ns: int, config: RenderConfig) -> tuple[str
             found=f"is missing in episode {episode.info.id}",
             hint=f"Choose an --episode that has {ROBOT_DESCRIPTION}.",
         )
-    return urdf, Posture(joints_rad=joints, width_m=config.width_m or 0.0)
+    return Posture(joints_rad=joints, width_m=width_m or 0.0), urdf, "joints given"
 
 
 def object_places(
@@ -144,10 +113,6 @@ def carried_camera(
 ) -> Float[np.ndarray, "4 4"] | None:
     """Where a camera in the robot's hand would be in a posture, ``T_base_camera``.
 
-    Args:
-        frame_id: The camera's frame.
-        tree: Says where the camera was; None: ``/tf`` does.
-
     Returns:
         None when the camera is not seen to move with the hand.
     """
@@ -179,11 +144,9 @@ def _spread(Ts: Float[np.ndarray, "num_poses 4 4"]) -> float:
     return float(np.linalg.norm(np.ptp(Ts[:, :3, 3], axis=0)))
 
 
-def describe_drawn(drawn: Mapping[str, object]) -> str:
-    """The files, and what a reader should know about the robot in them."""
-    files = drawn["files"]
-    lines = [str(path) for path in files] if isinstance(files, list) else []
-    return "\n".join([*lines, f"robot: {drawn['robot']}"])
+def describe_drawn(drawn: Mapping[str, Any]) -> str:
+    """The files, and what a reader should know about what they show."""
+    return "\n".join([*drawn["files"], f"robot: {drawn['robot']}", *drawn["notes"]])
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -199,45 +162,32 @@ def render(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     first_ns = streams.first_stamp_ns(episode)
     began_ns = episode.start_ns if first_ns is None else first_ns
     stamp_ns = began_ns + round((config.at_s or 0.0) * 1e9)
-    composed = compose(run, scene, episode, stamp_ns, config)
+    trial = open_trial(run, scene, episode)
+    moved = object_places(config.object, list(trial.parts.objects))
+    posture, urdf, robot = posture_of(trial, stamp_ns, config)
     camera, T_base_camera = _view_of(run, scene, episode, camera_id, stamp_ns, config)
-    view = rasteriser.view(composed.cloud, camera, T_base_camera)
+    places = trial.places(stamp_ns) | moved
+    cloud = trial.parts.at(places, posture, urdf)
+    drawn = trial.parts.draw(rasteriser, cloud, camera, T_base_camera)
     path = config.out or run.results_dir / "render.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    whole = composed.parts.behind(view, camera, T_base_camera)
-    path.write_bytes(encode_png(whole.image_u8()))
+    path.write_bytes(encode_png(drawn.marked_u8()))
     written = [str(path)]
     if config.depth:
-        depth_path = path.with_name(f"{path.stem}_depth.png")
-        depth_path.write_bytes(encode_png(depth_image(view.depth_m)))
-        seen_path = path.with_name(f"{path.stem}_seen.png")
-        seen = seen_mask(rasteriser, view.alpha, composed.cloud)
-        seen_path.write_bytes(encode_png(np.where(seen, np.uint8(255), np.uint8(0))))
-        written += [str(depth_path), str(seen_path)]
+        for ending, image in (("depth", depth_image(drawn.depth_m)), ("seen", drawn.seen_u8())):
+            beside = path.with_name(f"{path.stem}_{ending}.png")
+            beside.write_bytes(encode_png(image))
+            written.append(str(beside))
     return {
         "files": written,
         "scene_hash": scene.scene_hash,
         "episode": episode.info.id,
         "camera": camera_id,
-        "robot": composed.robot,
-        "coverage_fraction": float(view.alpha.mean()),
+        "robot": robot,
+        "notes": list(trial.notes),
+        "not_scanned": sorted(trial.parts.not_scanned),
+        "coverage_fraction": float(drawn.alpha.mean()),
     }
-
-
-SEEN = 0.5
-"""Least weight of measured Gaussians in a pixel that shows what was seen in the scan."""
-
-
-def seen_mask(
-    rasteriser: Rasteriser | CudaRasteriser,
-    alpha: Float32[np.ndarray, "height width"],
-    cloud: GaussianCloud,
-) -> Bool[np.ndarray, "height width"]:
-    """Pixels of the image drawn last that show what was measured, and not what was completed."""
-    if not cloud.completed.any():
-        return np.asarray(alpha >= SEEN)
-    measured = as_float32(~cloud.completed)[:, None]
-    return np.asarray(rasteriser.draw_features(measured)[0] >= SEEN)
 
 
 def depth_image(depth_m: Float32[np.ndarray, "height width"]) -> UInt16[np.ndarray, "_ _"]:

@@ -6,23 +6,23 @@ moved rigidly, and background, objects and robot are drawn together, as for a si
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from bridge.episode import streams
 from bridge.episode.cdr.messages import color_from_message
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.transforms import TransformTree
-from bridge.errors import GstError, UsageError
+from bridge.errors import UsageError
 from bridge.geometry.camera import Camera
 from bridge.media.color import encode_png
 from twin.robot.model import load_robot
-from twin.robot.posture import Posture, PostureTrack, posture_track
+from twin.robot.posture import Posture
 from twin.robot.surface import PosedSurface
 from twin.scene.frames.camera_poses import unknown_mask
 from twin.scene.image_agreement import (
@@ -31,9 +31,7 @@ from twin.scene.image_agreement import (
     describe_agreement,
     part_masks,
 )
-from twin.scene.localise.episode import write_localised
-from twin.scene.movable_scene import MovableScene, read_movable_scene
-from twin.scene.object_tracks import ObjectTracks, localised_tracks
+from twin.scene.movable_scene import Drawn, MovableScene
 from twin.scene.raster.backend import CudaRasteriser, open_rasteriser
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.render import (
@@ -42,14 +40,11 @@ from twin.scene.render import (
     depth_image,
     episode_of,
     poses_in_scene,
-    seen_mask,
     sized_camera,
-    why_no_robot,
 )
 from twin.scene.settings import RenderConfig
-from twin.scene.shape.files import MESH
-from twin.scene.shape.mesh import read_mesh
 from twin.scene.store.folder import Scene, read_scene
+from twin.scene.trial import TrialInScene, open_trial
 
 CRF = 18
 """Quality of the video: hardly to be told from the frames."""
@@ -68,51 +63,8 @@ class Frame:
     """None: no robot is drawn."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EpisodeInScene:
-    """What an episode says of robot and objects while its scene is drawn."""
-
-    recorded: Episode
-    tracks: ObjectTracks
-    postures: PostureTrack | None
-    robot: str
-    """How the robot stands, or why it is not drawn."""
-    unposed: list[int] = field(default_factory=list)
-    """Instants left out because nobody knows where the camera was."""
-
-
-def open_episode(run: RunFolder, scene: Scene, wanted: str) -> EpisodeInScene:
-    """Find an episode by its id, with all that moves in it.
-
-    A recorded trial is localised before and after its executions if it was not yet.
-    """
-    recorded = episode_of(run, scene, wanted)
-    postures, robot = None, f"joints as {recorded.path.stem} has them"
-    if not scene.record.get("robot", {}).get("links"):
-        robot = f"not drawn: {why_no_robot(scene)}"
-    try:
-        postures = posture_track(recorded)
-    except GstError as error:
-        robot = f"not drawn: {error}"
-    tracks = recorded_tracks(run, scene, recorded, postures)
-    return EpisodeInScene(recorded=recorded, tracks=tracks, postures=postures, robot=robot)
-
-
-def recorded_tracks(
-    run: RunFolder, scene: Scene, episode: Episode, postures: PostureTrack | None
-) -> ObjectTracks:
-    """Where a recorded episode's objects were: localised, and carried in between."""
-    try:
-        task = streams.task_file(episode).task()
-        path = write_localised(run, episode, task, scene_hash=scene.scene_hash)
-        records = streams.localisations(Episode.open(path))
-    except GstError as error:
-        return ObjectTracks(notes=(f"objects are drawn where they were scanned: {error}",))
-    return localised_tracks(episode, records, task, postures)
-
-
 def frames_of(
-    run: RunFolder, scene: Scene, episode: EpisodeInScene, camera_id: str, config: RenderConfig
+    run: RunFolder, scene: Scene, episode: TrialInScene, camera_id: str, config: RenderConfig
 ) -> Iterator[Frame]:
     """Yield the instants to be drawn, in the order of time.
 
@@ -125,7 +77,6 @@ def frames_of(
     frame_id = streams.camera_info(episode.recorded, camera_id).frame_id
     tree: TransformTree | None = None
     unknown = np.zeros(len(stamps), dtype=bool)
-    robot = None if episode.postures is None else load_robot(episode.postures.urdf)
     if T_chosen is None:
         tree = poses_in_scene(run, scene, episode.recorded, camera_id, stamps)
         unknown = unknown_mask(tree, [frame_id], stamps)
@@ -136,18 +87,19 @@ def frames_of(
         posture = None
         if episode.postures is not None and episode.postures.covers(stamp_ns):
             posture = episode.postures.at(stamp_ns)
-        T_tcp = None
-        if robot is not None and posture is not None:
-            T_tcp = robot.T_base_tcp(posture.joints_rad)
         T = T_chosen
         if T is None and tree is not None:
             T = tree.T_root_frame(frame_id, stamp_ns)
         if T is not None:
-            places = episode.tracks.at(stamp_ns, T_tcp)
-            yield Frame(stamp_ns=stamp_ns, T_base_camera=T, Ts_base_object=places, posture=posture)
+            yield Frame(
+                stamp_ns=stamp_ns,
+                T_base_camera=T,
+                Ts_base_object=episode.places(stamp_ns),
+                posture=posture,
+            )
 
 
-def _stamps(episode: EpisodeInScene, camera_id: str) -> np.ndarray:
+def _stamps(episode: TrialInScene, camera_id: str) -> np.ndarray:
     images = _recorded_images(episode.recorded, camera_id)
     recorded = np.array([message.stamp_ns for message in images], dtype=np.int64)
     first_ns, last_ns = episode.recorded.start_ns, episode.recorded.end_ns
@@ -176,20 +128,17 @@ def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
     _check(config)
     rasteriser = open_rasteriser(RasterConfig(backend=config.backend))
     scene = read_scene(run)
-    parts = read_movable_scene(run, scene)
-    episode = open_episode(run, scene, config.episode)
-    there = {k: item for k, item in parts.objects.items() if k not in episode.tracks.absent}
-    parts = replace(parts, objects=there)
+    episode = open_trial(run, scene, episode_of(run, scene, config.episode))
     camera_id = camera_of(episode.recorded, config.camera)
     info = streams.camera_info(episode.recorded, camera_id)
     artist = Artist(
         rasteriser=rasteriser,
-        parts=parts,
+        parts=episode.parts,
         urdf="" if episode.postures is None else episode.postures.urdf,
         camera=sized_camera(info.camera, config.size),
     )
     out = config.out or run.results_dir / f"{episode.recorded.path.stem}.{camera_id}.mp4"
-    comparison = _Comparison.start(run, episode, parts) if config.compare else None
+    comparison = _Comparison.start(run, episode) if config.compare else None
     recorded = _recorded_images(episode.recorded, camera_id) if config.compare else iter(())
     begun_ns: int | None = None
     stamps: list[int] = []
@@ -197,7 +146,7 @@ def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         for frame in frames_of(run, scene, episode, camera_id, config):
             drawn = artist.draw(frame)
             begun_ns = frame.stamp_ns if begun_ns is None else begun_ns
-            image = drawn.image_u8
+            image = drawn.marked_u8()
             if comparison is not None:
                 before = next(item for item in recorded if item.stamp_ns == frame.stamp_ns)
                 image = comparison.add(before.image_u8(), drawn, frame, artist)
@@ -216,7 +165,8 @@ def render_sequence(run: RunFolder, config: RenderConfig) -> dict[str, Any]:
         "robot": episode.robot,
         "frames": len(stamps),
         "frames_without_pose": len(episode.unposed),
-        "notes": [*episode.tracks.notes, *episode.tracks.strangers(parts.objects)],
+        "notes": list(episode.notes),
+        "not_scanned": sorted(episode.parts.not_scanned),
         **({} if comparison is None else {"agreement": comparison.agreement.record()}),
     }
 
@@ -241,20 +191,6 @@ def _check(config: RenderConfig) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """One frame as it was drawn."""
-
-    image_u8: UInt8[np.ndarray, "height width 3"]
-    depth_m: Float32[np.ndarray, "height width"]
-    seen_mask: Bool[np.ndarray, "height width"]
-    """Pixels that show what was measured in the scan, and not what was completed."""
-
-    def seen_u8(self) -> UInt8[np.ndarray, "height width"]:
-        """The mask as an image, white where seen."""
-        return np.where(self.seen_mask, np.uint8(255), np.uint8(0))
-
-
-@dataclass(frozen=True, kw_only=True)
 class Artist:
     """Draws frames of one scene through one camera."""
 
@@ -266,10 +202,7 @@ class Artist:
     def draw(self, frame: Frame) -> Drawn:
         """Draw the scene as it was at one instant."""
         cloud = self.parts.at(frame.Ts_base_object, frame.posture, self.urdf)
-        view = self.rasteriser.view(cloud, self.camera, frame.T_base_camera)
-        seen = seen_mask(self.rasteriser, view.alpha, cloud)
-        image_u8 = self.parts.behind(view, self.camera, frame.T_base_camera).image_u8()
-        return Drawn(image_u8=image_u8, depth_m=view.depth_m, seen_mask=seen)
+        return self.parts.draw(self.rasteriser, cloud, self.camera, frame.T_base_camera)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,14 +211,15 @@ class _Comparison:
 
     agreement: ImageAgreement
     meshes: Mapping[str, Mesh]
-    episode: EpisodeInScene
-    parts: MovableScene
+    not_scanned: frozenset[str]
 
     @staticmethod
-    def start(run: RunFolder, episode: EpisodeInScene, parts: MovableScene) -> "_Comparison":
-        folder = run.scene_dir / "objects"
-        meshes = {name: read_mesh(folder / name / MESH) for name in parts.objects}
-        return _Comparison(agreement=ImageAgreement(), meshes=meshes, episode=episode, parts=parts)
+    def start(run: RunFolder, episode: TrialInScene) -> "_Comparison":
+        return _Comparison(
+            agreement=ImageAgreement(),
+            meshes=episode.meshes(run),
+            not_scanned=episode.parts.not_scanned,
+        )
 
     def add(
         self,
@@ -299,11 +233,17 @@ class _Comparison:
         if frame.posture is not None:
             robot = PosedSurface(load_robot(artist.urdf), frame.posture)
         masks = part_masks(
-            artist.camera, frame.T_base_camera, robot, self.meshes, frame.Ts_base_object
+            artist.camera,
+            frame.T_base_camera,
+            robot,
+            self.meshes,
+            frame.Ts_base_object,
+            self.not_scanned,
         )
         self.agreement.add(recorded_u8, drawn.image_u8, drawn.seen_mask, masks)
         difference = np.abs(recorded_u8.astype(np.int16) - drawn.image_u8.astype(np.int16))
-        return np.concatenate([recorded_u8, drawn.image_u8, difference.astype(np.uint8)], axis=1)
+        sides = [recorded_u8, drawn.marked_u8(), difference.astype(np.uint8)]
+        return np.concatenate(sides, axis=1)
 
 
 Write = Callable[[int, Mapping[str, np.ndarray]], None]

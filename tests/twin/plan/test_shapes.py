@@ -11,9 +11,10 @@ from bridge.episode.run_folder import RunFolder
 from bridge.robots.default import ROBOT
 from bridge.task.task_file import SCANNED, Task, load_task
 from twin.plan.shapes import GUESSED_SHARE, problem_of, shapes_of
-from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.files import MESH, TASK_SHAPE
+from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.mesh import mesh_ply
+from twin.scene.store.library import Library
 
 SHIFT_M = np.array([0.004, -0.002, -0.001])
 TRUNCATION_M = 0.006
@@ -31,8 +32,8 @@ def written(
     scale: float = 1.0,
     source: str = "reconstructed",
     closed: bool = True,
-) -> Path:
-    """A scene folder with the cube, larger and elsewhere than the task file has it."""
+) -> Library:
+    """A scene with the cube, larger and elsewhere than the task file has it."""
     place = folder / "objects" / "cube"
     place.mkdir(parents=True)
     vertices, triangles = shape_mesh(task.objects["cube"])
@@ -40,7 +41,7 @@ def written(
     geometry = {"watertight": closed, "truncation_m": TRUNCATION_M, "voxel_m": 0.0015}
     about = {"shape_source": source, "geometry": geometry}
     (place / "object.json").write_text(json.dumps(about))
-    return folder
+    return Library(folder=folder / "objects", objects={"cube": {}})
 
 
 def test_a_scanned_surface_is_put_where_localisation_has_the_object(
@@ -86,11 +87,18 @@ def test_what_cannot_be_used_is_stood_in_for_by_the_task(
 
 @pytest.mark.parametrize("name", [MESH, "object.json"])
 def test_a_damaged_file_is_said_and_stood_in_for(tmp_path: Path, task: Task, name: str) -> None:
-    path = written(tmp_path, task) / "objects" / "cube" / name
+    library = written(tmp_path, task)
+    path = library.folder / "cube" / name
     path.write_bytes(path.read_bytes()[:-3])
-    shape = shapes_of(tmp_path, task)["cube"]
+    shape = shapes_of(library, task)["cube"]
     assert shape.source.startswith("task file")
     assert ("damaged" in shape.source) or (MESH in shape.source)
+
+
+def test_what_the_scene_does_not_list_was_not_scanned(tmp_path: Path, task: Task) -> None:
+    shape = shapes_of(replace(written(tmp_path, task, scale=1.05), objects={}), task)["cube"]
+    np.testing.assert_array_equal(shape.vertices_m, shape_mesh(task.objects["cube"])[0])
+    assert shape.source == "task file: not scanned"
 
 
 def test_without_a_scene_every_object_has_the_task_files_shape(task: Task) -> None:
@@ -106,6 +114,9 @@ def test_without_a_scene_every_object_has_the_task_files_shape(task: Task) -> No
 def test_a_problem_knows_where_everything_is(tmp_path: Path, task: Task) -> None:
     (tmp_path / "scene").mkdir()
     written(tmp_path / "scene", task)
+    record = {"schema_version": 1, "key": "k", "scene_hash": "h", "background": {},
+              "sources": [], "views": [], "objects": {"cube": {}}}  # fmt: skip
+    (tmp_path / "scene" / "scene.json").write_text(json.dumps(record))
     T = np.eye(4)
     T[:3, 3] = (0.5, -0.1, 0.02)
     start, sure = np.array(ROBOT.home_rad), np.eye(6) * 1e-6

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bridge.episode.reader import Episode
 from bridge.terminal import Output
 from twin.scene.dataset.geometry_search import check_geometry
 from twin.scene.dataset.masks import (
@@ -19,6 +20,7 @@ from twin.scene.dataset.scan_check import CameraCheck, ScanReport, check_scan
 from twin.scene.frames.downscaled import DownscaledDepth, downscaled_depth
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, PointSet, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, NoFramesError, load
+from twin.scene.objects.placement import NO_OBJECTS, Placements
 from twin.scene.robot.extraction import MAX_POSTURES, FoundRobot, find_robot, look_closer
 from twin.scene.settings import RebuildConfig
 
@@ -33,8 +35,11 @@ class TrainingSet:
 
     choices: list[FrameChoice]
     points: list[PointSet]
-    """Static surface points of each training frame."""
+    """Static surface points of each training frame, objects included."""
     views: list[TrainingView]
+    bare_points: list[PointSet]
+    """Without the objects of the episodes' tasks."""
+    bare_views: list[TrainingView]
     choice_of_view: list[int]
     """Index of each view's choice."""
     moving: MovingVoxels
@@ -43,6 +48,12 @@ class TrainingSet:
     reference_views: list[ReferenceView]
     report: ScanReport
     robot: FoundRobot
+
+    def views_of(self, episode: Episode) -> list[TrainingView]:
+        """Those of one episode."""
+        own = [choice.episode.path == episode.path for choice in self.choices]
+        shown = zip(self.views, self.choice_of_view, strict=True)
+        return [view for view, index in shown if own[index]]
 
 
 def limits_of(config: RebuildConfig) -> DepthLimits:
@@ -63,9 +74,15 @@ class _Read:
 
 
 def read_training_set(
-    choices: Sequence[FrameChoice], config: RebuildConfig, output: Output
+    choices: Sequence[FrameChoice],
+    config: RebuildConfig,
+    output: Output,
+    placements: Placements = NO_OBJECTS,
 ) -> TrainingSet:
-    """Read every training frame, check the scan, and set aside what moved."""
+    """Read every training frame, check the scan, and set aside what moved.
+
+    Objects that stand elsewhere in another episode did not move while they were looked at.
+    """
     robot = find_robot(choices, output)
     read = _read(choices, config, robot, output)
     if not read.views:
@@ -87,11 +104,18 @@ def read_training_set(
     paths = [choice.episode.path for choice in choices]
     scans = [paths.index(paths[index]) for index in choice_of_view]
     reference_views = choose_reference_views(views, scans)
-    moving = find_moving(points, reference_views)
-    num_points = sum(len(item.p_m) for item in points)
-    for place in range(len(points)):  # one by one, so that memory holds the frames once
-        points[place], views[place] = moving.drop_from(points[place]), moving.mask_in(views[place])
-    gone = (num_points - sum(len(item.p_m) for item in points)) / max(num_points, 1)
+    bare = [
+        placements.take_out(choices[index].episode, points[place], views[place])
+        for place, index in enumerate(choice_of_view)
+    ]
+    bare_points, bare_views = [each for each, _ in bare], [each for _, each in bare]
+    moving = find_moving(bare_points, reference_views)
+    num_points = sum(len(item.p_m) for item in bare_points)
+    pairs = ((bare_points, bare_views), (points, views))
+    for seen, shown in pairs:  # one by one, so that memory holds the frames once
+        for place in range(len(shown)):
+            seen[place], shown[place] = moving.drop_from(seen[place]), moving.mask_in(shown[place])
+    gone = (num_points - sum(len(item.p_m) for item in bare_points)) / max(num_points, 1)
     report = replace(
         report,
         moving_fraction=round(gone, 4),
@@ -104,6 +128,8 @@ def read_training_set(
         choices=list(choices),
         points=points,
         views=views,
+        bare_points=bare_points,
+        bare_views=bare_views,
         choice_of_view=choice_of_view,
         moving=moving,
         ego_masks=ego_masks,

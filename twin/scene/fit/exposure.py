@@ -57,11 +57,7 @@ def _without_mean(
 def gain_between(
     drawn: Float32[np.ndarray, "3 height width"], target: Target
 ) -> Float[np.ndarray, "3"]:
-    """The factor per channel that brings a drawn image closest to the recorded one.
-
-    Args:
-        drawn: Colour planes, 0..1.
-    """
+    """The factor per channel that brings a drawn image closest to the recorded one."""
     wanted = target.image()
     usable = target.static_mask & (wanted < SATURATED).all(axis=0)
     recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)

@@ -179,7 +179,7 @@ def write_scene_semantics(
         fused: The surface as it was measured: things are looked for in it. None: in the Gaussians.
         models: Large models to ask beside the default segmenter; None: none.
     """
-    objects = {} if decomposed.parts is None else decomposed.parts.objects
+    objects = decomposed.objects
     placed = {key: moved_cloud(item.cloud, item.T_base_object) for key, item in objects.items()}
     cloud = concatenate([decomposed.background, *placed.values()])
     output.say(f"name what is in the scene: {len(cloud)} Gaussians, {len(objects)} objects known")

@@ -201,10 +201,6 @@ def find_poses(
     Frames that are held out get a pose from the odometry too, but nothing is learnt from them:
     neither the path of the camera nor its loop closures.
 
-    Args:
-        stamps_ns: Source times of its frames, ascending.
-        held_out_ns: Those of them that nothing is learnt from.
-
     Raises:
         FrameNotFoundError: When ``/tf`` is asked for and does not know the camera.
         UnusableCameraError: When no image was taken while ``/tf`` or the joints said where the

@@ -423,11 +423,7 @@ def _pick(
 
 
 def spread(values: np.ndarray, count: int) -> np.ndarray:
-    """Pick at most ``count`` values at even distances, both ends included.
-
-    Args:
-        values: In their order.
-    """
+    """Pick at most ``count`` values at even distances, both ends included."""
     if len(values) <= count:
         return values
     return np.asarray(values[np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))])

@@ -28,7 +28,8 @@ from twin.scene.localise.shape_fit import ShapeFitConfig
 from twin.scene.shape.files import MESH, TASK_SHAPE
 from twin.scene.shape.known import pose_of
 from twin.scene.shape.mesh import read_mesh
-from twin.scene.store.folder import UnreadableSceneError
+from twin.scene.store.folder import UnreadableSceneError, read_record
+from twin.scene.store.library import Library
 
 FACING = 0.15
 """Cosine below which a camera hardly sees a surface."""
@@ -111,11 +112,7 @@ def seen_through(
 def agreeing(
     T: Float[np.ndarray, "4 4"], surface: MeshSurface, views: Sequence[CameraView], margin_m: float
 ) -> float:
-    """Share of the mesh's facing surface that the camera which sees most of it measured there.
-
-    Args:
-        T: ``T_base_object``.
-    """
+    """Share of the mesh's facing surface that the camera which sees most of it measured there."""
     T_object_base = se3.invert(T)
     share = 0.0
     for view in views:
@@ -164,11 +161,11 @@ def scanned_surfaces(run: RunFolder, task: Task, num_samples: int) -> ScannedSur
     Args:
         task: Other objects have a shape of their own there.
     """
-    found = ScannedSurfaces()
-    for key, model in task.objects.items():
-        folder = run.scene_dir / "objects" / key
+    found, library = ScannedSurfaces(), Library.of(run, read_record(run))
+    for key in library.scanned(task):
+        folder = library.folder / key
         about = folder / "object.json"
-        if model.shape != SCANNED or not about.is_file():
+        if task.objects[key].shape != SCANNED or not about.is_file():
             continue
         try:
             source = json.loads(about.read_text())["shape_source"]

@@ -48,10 +48,6 @@ def likeness(
     An edge pixel that mixes object and grey lies between, which places edges between pixels.
 
     Range: 0 and up, about 1 on the object.
-
-    Args:
-        image_linear: Linear light, not sRGB.
-        color_srgb: Colour of the object, 0..255.
     """
     total = image_linear.sum(axis=-1)
     dark = total < 3 * config.min_luminance

@@ -271,30 +271,6 @@ def fit_shape(
     return _summary(best, problem)
 
 
-def refine_on_points(
-    points: Float[np.ndarray, "num_points 3"],
-    model: ObjectModel,
-    T_base_object: Float[np.ndarray, "4 4"],
-    config: ShapeFitConfig,
-) -> Float[np.ndarray, "4 4"]:
-    """Lay a shape onto points that all come from one source, starting from a pose nearby.
-
-    Args:
-        points: On the surface of the object, base frame [m].
-    """
-    cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
-    problem = _Problem(
-        cluster=cluster.thinned(config.max_points),
-        outlines=(),
-        model=model,
-        config=config,
-        prior_sigma=np.full((1, _PER_VIEW), 1e-6),  # the source has no shift of its own
-    )
-    yaw = np.arctan2(T_base_object[1, 0], T_base_object[0, 0])
-    state = np.array([*T_base_object[:3, 3], yaw, 0.0, 0.0, 0.0])
-    return pose_of(_solve(state, problem)[:_POSE])
-
-
 def _in_view(state: Float[np.ndarray, " num_unknowns"], view_id: int) -> Float[np.ndarray, "4"]:
     """(x, y, z, yaw) as one view sees it."""
     first = _POSE + _PER_VIEW * view_id

@@ -141,11 +141,7 @@ def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:
 def is_stationary(
     tree: TransformTree, frame_id: str, stamp_ns: int, until_ns: int | None = None
 ) -> bool:
-    """Say whether a frame's pose is the same shortly before and after an instant.
-
-    Args:
-        until_ns: Nothing later is looked at; None: no limit.
-    """
+    """Say whether a frame's pose is the same shortly before and after an instant."""
     last_ns = (
         stamp_ns + STATIONARY_WINDOW_NS
         if until_ns is None
@@ -159,11 +155,7 @@ def is_stationary(
 
 
 def calibrated_cameras(episode: Episode, calibration: Calibration | None) -> Poses:
-    """Where the cameras of an episode are, as far as they were calibrated.
-
-    Args:
-        calibration: Of the run; None: no camera was calibrated.
-    """
+    """Where the cameras of an episode are, as far as they were calibrated."""
     mounts = {} if calibration is None else calibration.cameras
     return {
         camera_id: calibrated_poses(

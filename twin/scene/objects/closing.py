@@ -9,7 +9,6 @@ surface next to it that was seen, and is marked as completed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,6 +23,7 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.settings import InitialiseConfig
 from twin.scene.shape.from_training import image_window
+from twin.scene.shape.mesh import first_hit
 
 FOOTPRINTS = 1.6
 """Spacing of the Gaussians in pixels of the views that come nearest."""
@@ -59,8 +59,7 @@ def closed_object(
         mesh: In the object's frame, closed.
         views: What the scene was fitted to, in the base frame.
     """
-    surface = _ClosedSurface(mesh)
-    looks = [_Look.of(view, surface, T_base_object) for view in views]
+    looks = [_Look.of(view, mesh, T_base_object) for view in views]
     looks = [look for look in looks if look.shown.any()]
     if not looks:
         return None
@@ -80,32 +79,6 @@ def closed_object(
     return replace(cloud, completed=~is_seen)
 
 
-class _ClosedSurface:
-    """A mesh that rays can be cast at, in the object's frame."""
-
-    def __init__(self, mesh: Triangles) -> None:
-        import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
-
-        make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
-        tensor: Any = open3d.core.Tensor
-        self._scene, self._tensor = make(), tensor
-        vertices_m, triangles = mesh
-        self._scene.add_triangles(
-            tensor(vertices_m.astype(np.float32)), tensor(triangles.astype(np.uint32))
-        )
-        self.reach_m = float(np.linalg.norm(vertices_m, axis=1).max())
-
-    def hit(
-        self, rays: Float[np.ndarray, "height width 3"], T_object_camera: Float[np.ndarray, "4 4"]
-    ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
-        """Depth along the camera's axis, infinite beside the mesh, and normals."""
-        directions = rays @ T_object_camera[:3, :3].T
-        origins = np.broadcast_to(T_object_camera[:3, 3], directions.shape)
-        both = np.concatenate([origins, directions], axis=-1).astype(np.float32)
-        found = self._scene.cast_rays(self._tensor(np.ascontiguousarray(both)))
-        return found["t_hit"].numpy(), found["primitive_normals"].numpy()
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Look:
     """The part of a view in which an object shows."""
@@ -123,14 +96,13 @@ class _Look:
     """How surely a pixel shows this place: 1 away from outlines and edges."""
 
     @staticmethod
-    def of(
-        view: TrainingView, surface: _ClosedSurface, T_base_object: Float[np.ndarray, "4 4"]
-    ) -> "_Look":
+    def of(view: TrainingView, mesh: Triangles, T_base_object: Float[np.ndarray, "4 4"]) -> "_Look":
         target = view.full
         T_camera_object = se3.invert(view.T_base_color) @ T_base_object
-        rows, columns = image_window(target.camera, T_camera_object[:, 3], surface.reach_m)
+        reach_m = float(np.linalg.norm(mesh[0], axis=1).max())
+        rows, columns = image_window(target.camera, T_camera_object[:, 3], reach_m)
         rays = target.camera.rays()[rows, columns]
-        expected, normals = surface.hit(rays, se3.invert(T_camera_object))
+        expected, normals = first_hit(rays, view.T_base_color, {"": mesh}, {"": T_base_object})
         measured = target.depth_m[rows, columns]
         slack = SAME_M + SAME_FRACTION * measured
         shown = np.isfinite(expected) & target.static_mask[rows, columns] & (measured > 0)

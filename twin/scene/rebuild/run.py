@@ -10,8 +10,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bridge.episode import provenance
 from bridge.episode.reader import Episode
 from bridge.episode.run_folder import RunFolder
@@ -28,15 +26,9 @@ from twin.scene.fit.completion import complete_holes
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.selection import FrameChoice, Sources, choose_frames, find_sources
-from twin.scene.gaussians import (
-    GaussianCloud,
-    as_float32,
-    concatenate,
-    moved_cloud,
-    with_harmonics,
-    write_ply,
-)
-from twin.scene.objects.decompose import Decomposition, decompose, scanned_tasks
+from twin.scene.gaussians import GaussianCloud, concatenate, write_ply
+from twin.scene.objects.decompose import Decomposition, decompose
+from twin.scene.objects.placement import find_placements, scanned_tasks
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 from twin.scene.rebuild.record import Cost, make_record, protocol_of
 from twin.scene.rebuild.views import ENGINE, ViewsJob, summarise_views, views_path, write_views
@@ -51,7 +43,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 25
+METHOD_VERSION = 26
 """Counts changes of method that make older scenes out of date."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""
@@ -99,22 +91,25 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
         return done
     clock = _Clock()
     chosen = choose_frames(sources, config.frames, output, calibration)
-    training = read_training_set(chosen.choices, config, output)
+    placements = find_placements(sources, chosen.choices, output)
+    clock.end("find_objects")
+    training = read_training_set(chosen.choices, config, output, placements)
     clock.end("read")
     run.scene_dir.mkdir(parents=True, exist_ok=True)
     fitted = _fit(training, config, output)
     clock.end("initialise_and_fit")
-    completed = _close_holes(training, fitted, config, output)
+    raster = RasterConfig(threads=config.fit.threads)
+    completed = complete_holes(fitted.cloud, training.bare_views, config.initialise, raster)
+    output.say(f"{len(completed)} Gaussians where colour was seen and no depth measured")
     clock.end("complete_holes")
     (run.scene_dir / SCENE_FILE).unlink(missing_ok=True)  # it vouches for the files below
-    decomposed = _decompose(sources, training, fitted.cloud, completed, config, output)
+    fitted = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
+    decomposed = decompose(placements, fitted.cloud, training.views_of, output, config.initialise)
     write_ply(run.scene_dir / BACKGROUND, decomposed.background)
     links = training.robot.frames.links(config.initialise)
     clock.end("decompose")
-    drawn = replace(fitted, cloud=concatenate([fitted.cloud, completed]))
-    rasteriser = Rasteriser(RasterConfig(threads=config.fit.threads))
-    backdrop = backdrop_of(drawn.cloud, training.views, rasteriser)
-    views = _hold_out(run, training, drawn, backdrop, decomposed, links, config, clock, output)
+    backdrop = backdrop_of(fitted.cloud, training.bare_views, Rasteriser(raster))
+    views = _hold_out(run, training, fitted, backdrop, decomposed, links, config, clock, output)
     clock.end("held_out_views")
     extras = _write_parts(run, sources, training, decomposed, links, config, output)
     clock.end("objects_and_semantics")
@@ -138,45 +133,17 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
 
 def _fit(training: TrainingSet, config: RebuildConfig, output: Output) -> FitResult:
     began_s = time.monotonic()
-    first = fuse(training.points, config.initialise, training.views)
+    first = fuse(training.bare_points, config.initialise, training.bare_views)
     output.say(f"{len(first)} Gaussians from {len(training.views)} training frames")
     with output.progress("fit", 100) as advance:
         return fit(
             first,
-            training.views,
+            training.bare_views,
             config.fit,
             advance,
             max_splats=config.initialise.max_splats,
             spent_s=time.monotonic() - began_s,
         )
-
-
-def _decompose(
-    sources: Sources,
-    training: TrainingSet,
-    cloud: GaussianCloud,
-    completed: GaussianCloud,
-    config: RebuildConfig,
-    output: Output,
-) -> Decomposition:
-    """Objects and background of what was fitted; what closes holes belongs to the background."""
-    found = decompose(sources, cloud, training.choices, training.views, output, config.initialise)
-    if found.remark:
-        output.say(found.remark)
-    return replace(found, background=concatenate([found.background, completed]))
-
-
-def _close_holes(
-    training: TrainingSet,
-    fitted: FitResult,
-    config: RebuildConfig,
-    output: Output,
-) -> GaussianCloud:
-    """Gaussians where colour was seen and no depth measured."""
-    raster = RasterConfig(threads=config.fit.threads)
-    closed = complete_holes(fitted.cloud, training.views, config.initialise, raster)
-    output.say(f"{len(closed)} Gaussians where colour was seen and no depth measured")
-    return closed
 
 
 def _hold_out(
@@ -194,12 +161,11 @@ def _hold_out(
     choices = training.choices
     job = ViewsJob(
         scene_hash=background_hash(run),
-        cloud=fitted.cloud,
+        scenes=decomposed,
         reference_views=training.reference_views,
         limits=limits_of(config),
         raster=RasterConfig(threads=config.fit.threads),
         protocol=protocol_of(choices, fitted, config, clock.cost()),
-        marked=_marked_objects(decomposed),
         robot=DrivenRobot(frames=training.robot.frames, links=links),
         ego_masks={
             (choices[index].episode.path, choices[index].camera_id): mask
@@ -224,7 +190,9 @@ def _write_parts(
 ) -> dict[str, Any]:
     """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
     output.say("write objects, robot links and the distances to what is static")
-    written = decomposed.write(run, training.views) | write_robot(run, training.robot, links)
+    written = decomposed.write(run, training.views, training.views_of) | write_robot(
+        run, training.robot, links
+    )
     if not config.models.any_named and not has_leaf("perception"):
         return written
     named: dict[str, Any] = load_leaf("perception", "name_things")(
@@ -250,24 +218,6 @@ def _evenly_fused(training: TrainingSet, config: RebuildConfig) -> GaussianCloud
         return None
     finer = replace(config.initialise, max_splats=SEARCHED_SPLATS, growth=0.0)
     return fuse(training.points, finer, training.views)
-
-
-def _marked_objects(decomposed: Decomposition) -> GaussianCloud | None:
-    """The scene with its objects white and all else black: where they show in a view."""
-    objects = {} if decomposed.parts is None else decomposed.parts.objects
-    if not objects:
-        return None
-    placed = [moved_cloud(item.cloud, item.T_base_object) for item in objects.values()]
-    cloud = with_harmonics(concatenate([decomposed.background, *placed]), 0)
-    colors = np.ones((len(cloud), 3))
-    colors[: len(decomposed.background)] = 0.0
-    return GaussianCloud(
-        means_m=cloud.means_m,
-        quats_wxyz=cloud.quats_wxyz,
-        scales_log=cloud.scales_log,
-        opacities_logit=cloud.opacities_logit,
-        colors=as_float32(colors),
-    )
 
 
 def _key(

@@ -31,7 +31,7 @@ from twin.scene.backdrop import Backdrop
 from twin.scene.dataset.masks import EgoMask, ReferenceView, find_moving
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.frames.selection import FrameChoice, load
-from twin.scene.gaussians import GaussianCloud
+from twin.scene.objects.decompose import Decomposition
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.robot.extraction import DrivenRobot
 
@@ -102,14 +102,13 @@ class ViewsJob:
     """What to render held-out frames of, and what to say about it."""
 
     scene_hash: str
-    cloud: GaussianCloud
+    scenes: Decomposition
+    """Draws each episode with its own objects."""
     reference_views: Sequence[ReferenceView]
     limits: DepthLimits
     raster: RasterConfig
     protocol: Mapping[str, Any]
     """How the scene was made: kept with the images, for whoever rates them."""
-    marked: GaussianCloud | None = None
-    """The same scene with objects white and everything else black; None without objects."""
     robot: DrivenRobot | None = None
     """Drawn where it stood at each frame; the cloud holds only what is static."""
     ego_masks: Mapping[tuple[Path, str], EgoMask] = field(default_factory=dict)
@@ -145,6 +144,7 @@ def write_views(
     """Render every held-out frame; one derived episode per recorded one, replaced if present."""
     rasteriser = Rasteriser(job.raster)
     numbers: list[ViewNumbers] = []
+    paths = [choice.episode.path for choice in choices]
     episodes = {choice.episode.path: choice.episode for choice in choices if choice.holdout_ns}
     for path, episode in episodes.items():
         target = views_path(run, episode, job.scene_hash)
@@ -163,27 +163,34 @@ def write_views(
                 ),
             )
             for choice in own:
-                for item in _rendered(choice, rasteriser, job):
+                for item in _rendered(choice, rasteriser, job, paths.index(path)):
                     _write_view(writer, item)
                     numbers.append(rate_view(item.frame, item.view, choice))
                     advance(len(numbers), f"{numbers[-1].psnr_db:.1f} dB")
     return numbers
 
 
-def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Iterator[HeldOutViews]:
+def _rendered(
+    choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob, scan: int
+) -> Iterator[HeldOutViews]:
+    """Draw the held-out frames of one camera; objects of other scans did not move in this one."""
+    references = [each for each in job.reference_views if each.scan == scan]
+    scene, num_background = job.scenes.as_seen_in(choice.episode), len(job.scenes.background)
     for frame in load(choice, choice.holdout_ns):
         camera, T = frame.color_camera, frame.T_base_color
-        cloud = job.cloud
+        cloud = scene
         if job.robot is not None:
             cloud = job.robot.joined(cloud, choice.episode, frame.stamp_ns)
-        recorded = _recorded(frame, job, job.ego_masks.get((choice.episode.path, choice.camera_id)))
+        ego_mask = job.ego_masks.get((choice.episode.path, choice.camera_id))
+        recorded = _recorded(frame, job.limits, references, ego_mask)
         view = rasteriser.view(cloud, camera, T)
         if job.backdrop is not None:
             view = job.backdrop.behind(view, camera, T)
         masks = {"static": recorded.full.static_mask}
-        if job.marked is not None:
-            planes = rasteriser.draw_planes(job.marked, camera, T)
-            masks["objects"] = planes[0] > OBJECT_SHARE
+        if len(scene) > num_background:
+            white = np.zeros((len(cloud), 1), dtype=np.float32)
+            white[num_background : len(scene)] = 1.0
+            masks["objects"] = rasteriser.draw_features(white)[0] > OBJECT_SHARE
         yield HeldOutViews(
             choice=choice,
             frame=frame,
@@ -193,13 +200,18 @@ def _rendered(choice: FrameChoice, rasteriser: Rasteriser, job: ViewsJob) -> Ite
         )
 
 
-def _recorded(frame: RgbdFrame, job: ViewsJob, ego_mask: EgoMask | None) -> TrainingView:
+def _recorded(
+    frame: RgbdFrame,
+    limits: DepthLimits,
+    references: Sequence[ReferenceView],
+    ego_mask: EgoMask | None,
+) -> TrainingView:
     """A held-out frame without what training frames look through or moves with the camera."""
-    surface = FrameSurface(frame, job.limits)
+    surface = FrameSurface(frame, limits)
     view, points = training_view(surface), surface.points()
     if ego_mask is not None:
         view, points = ego_mask.mask_in(view), ego_mask.drop_from(points, view)
-    return find_moving([points], job.reference_views).mask_in(view)
+    return find_moving([points], references).mask_in(view)
 
 
 def one_camera(frame: RgbdFrame) -> bool:

@@ -1,6 +1,5 @@
 """The geometry files of one object: mesh, distances, lattice, and their record."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +10,8 @@ from twin.scene.shape.mesh import mesh_ply
 from twin.scene.shape.reconstruct import ObjectShape
 
 MESH, SDF, SOFT = "mesh.ply", "sdf.npz", "soft.npz"
-OLD_PARTS = "collision"
-"""Convex parts that earlier editions left here."""
 TASK_SHAPE = "task file"
 """Source of a shape that no view gave."""
-
-
-def remove_shape(folder: Path) -> None:
-    """Remove what an earlier reconstruction left in an object's folder."""
-    for name in (MESH, SDF, SOFT):
-        (folder / name).unlink(missing_ok=True)
-    if (folder / OLD_PARTS).is_dir():
-        shutil.rmtree(folder / OLD_PARTS)
 
 
 def write_shape(

@@ -4,8 +4,8 @@ An object's pixels are those whose measured point lies at its localised surface.
 in the object's own frame, so walls of a box lie along the voxels.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,21 +51,24 @@ def shapes_of(
     views: Sequence[TrainingView],
     models: Mapping[str, ObjectModel],
     Ts_base_object: Poses,
+    wanted: Iterable[str] | None = None,
     config: ShapeConfig | None = None,
     advance: Advance = lambda done, note: None,
 ) -> dict[str, ObjectShape | str]:
-    """Reconstruct each object in its own frame, or say why not.
+    """Reconstruct objects in their own frames, or say why not.
 
     Args:
         views: What the scene was fitted to, in ``base_link`` whose z = 0 is the table.
         models: Known shapes: they say which pixels are the object's, nothing more.
         Ts_base_object: Where the objects were; others are left out.
+        wanted: Those to reconstruct; None: all that have a place.
         config: Settings; the defaults, with eight rounds of view alignment, when None.
     """
     config = ShapeConfig(align_rounds=ALIGN_ROUNDS) if config is None else config
     found: dict[str, ObjectShape | str] = {}
-    for done, (key, T) in enumerate(Ts_base_object.items()):
+    for done, key in enumerate(Ts_base_object if wanted is None else wanted):
         advance(done, key)
+        T = Ts_base_object[key]
         if T[2, 2] < LEANING_COSINE:
             found[key] = f"{key} does not stand upright, so its underside cannot be closed"
             continue
@@ -116,10 +119,6 @@ def masked_view(
     """One training view in an object's frame, with the pixels that show the object.
 
     A pixel belongs to the object whose surface is nearest to its point.
-
-    Args:
-        view: The training view, in the base frame.
-        models: All objects of the task, by name.
     """
     target = view.full
     depth = np.where(target.static_mask, target.depth_m, np.float32(0.0))
@@ -230,16 +229,15 @@ def rim_height_m(
     return float(np.percentile(seen, TOP_PERCENTILE)) if len(seen) >= FEWEST_POINTS else None
 
 
-def _rim_heights_m(
-    views: Sequence[TrainingView], task: Task, Ts_base_object: Poses
-) -> dict[str, float]:
-    """Of the containers whose walls the views show."""
-    found = {}
-    for key, T in Ts_base_object.items():
-        if task.objects[key].wall_m > 0:
-            height_m = rim_height_m(views, task.objects[key], T)
-            if height_m is not None:
-                found[key] = height_m
+def _rim_heights_m(scans: Sequence["ObjectViews"]) -> dict[str, float]:
+    """Of the containers whose walls the views show; each by the first scan that does."""
+    found: dict[str, float] = {}
+    for scan in scans:
+        for key, T in scan.Ts_base_object.items():
+            if scan.task.objects[key].wall_m > 0 and key not in found:
+                height_m = rim_height_m(scan.views, scan.task.objects[key], T)
+                if height_m is not None:
+                    found[key] = height_m
     return found
 
 
@@ -258,28 +256,40 @@ def with_heights(task: Task, heights_m: Mapping[str, float]) -> Task:
     return replace(task, objects=objects)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ObjectViews:
+    """Training views of one episode, and where it has its task's objects."""
+
+    views: Sequence[TrainingView]
+    task: Task
+    Ts_base_object: Poses
+
+
 def write_static(
     folder: Path,
     views: Sequence[TrainingView],
-    task: Task | None,
-    Ts_base_object: Poses,
+    scans: Sequence[ObjectViews],
     config: StaticConfig | None = None,
 ) -> dict[str, Any]:
     """Write ``sdf.npz``, the static scene without the objects, and return its record.
 
     Only a task says that z = 0 is a table; without one nothing closes the scene below.
+
+    Args:
+        views: All training views.
+        scans: Those of episodes whose objects are known, each with the objects in its views.
     """
     path = folder / STATIC_FILE
     path.unlink(missing_ok=True)
-    heights_m = {} if task is None else _rim_heights_m(views, task, Ts_base_object)
-    seen = None if task is None else with_heights(task, heights_m)
+    heights_m = _rim_heights_m(scans)
     objects = [
         partial(from_outside_m, model=seen.objects[key], T_base_object=T)
-        for key, T in Ts_base_object.items()
-        if seen is not None
+        for scan in scans
+        for seen in [with_heights(scan.task, heights_m)]
+        for key, T in scan.Ts_base_object.items()
     ]
     try:
-        static = static_sdf(views, None if task is None else 0.0, objects, config)
+        static = static_sdf(views, 0.0 if scans else None, objects, config)
     except TwinError as error:
         return {"file": None, "remark": str(error), "rim_height_m": heights_m}
     static.save(path)

@@ -26,9 +26,6 @@ def isosurface(
     """Triangles of the surface where values cross zero, facing the positive side [m].
 
     The surface is closed: what lies beyond the grid counts as outside.
-
-    Args:
-        values: At grid points; negative inside.
     """
     padded = np.pad(values, 1, constant_values=max(voxel_m, float(np.abs(values).max())))
     inside = padded < 0

@@ -1,10 +1,11 @@
 """The surface of a known shape, and where to begin laying it onto points."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from bridge.geometry import se3
+from bridge.task.meshes.catalogue import object_mesh
 from bridge.task.task_file import SCANNED, ObjectModel
 
 
@@ -107,3 +108,21 @@ def surface_distances(
     nearest = np.argmin(distances, axis=0)
     gradient = np.stack(gradients)[nearest, rows] @ T_base_object[:3, :3].T
     return np.stack(distances)[nearest, rows], gradient
+
+
+def shape_mesh(
+    model: ObjectModel,
+) -> tuple[Float[np.ndarray, "num_vertices 3"], Int[np.ndarray, "num_faces 3"]]:
+    """Triangles of the known shape in the object frame [m]: its mesh, or a box per panel."""
+    if model.mesh is not None:
+        known = object_mesh(model)
+        return known.vertices_m, known.triangles
+    vertices, faces = [], []
+    corner = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    # Counter-clockwise seen from outside.
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    for index, (centre, extents) in enumerate(model.panels()):
+        vertices.append(centre + corner * extents / 2)
+        faces.append(triangles + 8 * index)
+    return np.concatenate(vertices), np.concatenate(faces)

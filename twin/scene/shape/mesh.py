@@ -1,15 +1,20 @@
 """Triangle meshes: are they closed, how much do they hold, how are they written and read."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from bridge.errors import PathNotFoundError
+from bridge.geometry import se3
 from twin.errors import UnreadableFileError
 
 Vertices = Float[np.ndarray, "num_vertices 3"]
 Faces = Int[np.ndarray, "num_faces 3"]
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices [m] and triangles."""
 
 
 MAX_BYTES = 500_000_000
@@ -103,3 +108,29 @@ def read_mesh(path: Path) -> tuple[Vertices, Faces]:
     if num_faces and (faces.min() < 0 or faces.max() >= num_vertices):
         raise UnreadableMeshError(path=path, found="faces of vertices that do not exist")
     return vertices.astype(np.float64), faces
+
+
+def first_hit(
+    rays: Float[np.ndarray, "height width 3"],
+    T_base_camera: Float[np.ndarray, "4 4"],
+    meshes: Mapping[str, Mesh],
+    Ts_base_object: Mapping[str, Float[np.ndarray, "4 4"]],
+) -> tuple[Float32[np.ndarray, "height width"], Float32[np.ndarray, "height width 3"]]:
+    """Where a camera's rays meet the first of some meshes: depth, infinite beside them, and normal.
+
+    Args:
+        Ts_base_object: Where the meshes are; those without a pose are not there.
+    """
+    import open3d  # noqa: PLC0415  # loads 300 modules; who only reads meshes needs none
+
+    make: Any = open3d.t.geometry.RaycastingScene  # its stubs leave out the defaults
+    tensor: Any = open3d.core.Tensor
+    scene = make()
+    for name, (vertices_m, triangles) in meshes.items():
+        if name in Ts_base_object and len(triangles):
+            T_camera_object = se3.invert(T_base_camera) @ Ts_base_object[name]
+            vertices = se3.apply(T_camera_object, vertices_m).astype(np.float32)
+            scene.add_triangles(tensor(vertices), tensor(triangles.astype(np.uint32)))
+    from_camera = np.concatenate([np.zeros_like(rays), rays], axis=-1).astype(np.float32)
+    found = scene.cast_rays(tensor(from_camera))
+    return found["t_hit"].numpy(), found["primitive_normals"].numpy()

@@ -175,11 +175,6 @@ def laid_together(
     disagree carving takes away more than it leaves. On average the object stays where the poses as
     given have it.
 
-    Args:
-        views: What a shape will be made from.
-        support_z_m: Height of the plane; None without one.
-        rounds: How many steps at most; 0 changes nothing.
-
     Returns:
         The moved views, and how far they moved what they show, root mean square [m].
     """
@@ -324,12 +319,7 @@ def _agreement(surfaces: Sequence[SeenSurface], state: _State) -> tuple[np.ndarr
 def slope_by_sensor(
     slope: Float[np.ndarray, "*batch 3"], p: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 8"]:
-    """Derivative of a point's distance along a slope by the errors of its sensor.
-
-    Args:
-        slope: Unit vectors in the camera's frame.
-        p: The points in the camera's frame.
-    """
+    """Derivative of a point's distance along a slope by the errors of its sensor."""
     along = np.sum(slope * p, axis=-1, keepdims=True)
     offset = along / np.maximum(p[..., 2:], 1e-9)
     return np.concatenate([slope, np.cross(p, slope), offset, along], axis=-1)

@@ -141,10 +141,6 @@ def smoothed(
     A mean over distances keeps them 1-Lipschitz but eats thin walls (a wall of two voxels loses
     a fifth); the level that holds as much as before becomes zero again. A voxel that the surface
     runs through counts by the share that its distance leaves inside.
-
-    Args:
-        distances_m: Signed, negative inside.
-        sigma_voxels: Standard deviation of the Gaussian mean, in voxels.
     """
     mean = ndimage.gaussian_filter(distances_m, sigma_voxels, mode="nearest")
     wanted = _volume_voxels(distances_m.ravel() / voxel_m)

@@ -8,7 +8,7 @@ from bridge.task.task_file import ObjectModel
 from twin.plan.grasp.margin import SHIFTS_M, WAYS, Doubt, Lines, margins, reaches_along
 from twin.plan.grasp.pairs import SampledSurface
 from twin.plan.problem import Shape
-from twin.scene.objects.decompose import shape_mesh
+from twin.scene.shape.known import shape_mesh
 
 SIZE = (0.06, 0.03, 0.04)
 FAR = 1.0

@@ -7,7 +7,7 @@ from bridge.task.meshes.catalogue import toy_mesh
 from bridge.task.task_file import ObjectModel
 from twin.plan.grasp.pairs import SampledSurface, antipodal_pairs, pairs_along, thinned
 from twin.plan.problem import Shape
-from twin.scene.objects.decompose import shape_mesh
+from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.reconstruct import shape_of_mesh
 
 SIZE = (0.06, 0.03, 0.04)

@@ -20,7 +20,7 @@ from twin.replay.clearance.bodies import SCENE, TABLE, placed_panels
 from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of, signed_distance
 from twin.robot.model import load_robot
-from twin.scene.objects.decompose import shape_mesh
+from twin.scene.shape.known import shape_mesh
 from twin.scene.shape.sdf import SdfGrid, distances_of_solid
 from twin.scene.shape.static import StaticSdf
 

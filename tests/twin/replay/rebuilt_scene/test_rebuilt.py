@@ -43,7 +43,7 @@ def run(tmp_path: Path) -> RunFolder:
     lattice_of_task().save(place / "soft.npz")
     write_object(folder, watertight=True)
     record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
-              "sources": [], "views": []}  # fmt: skip
+              "sources": [], "views": [], "objects": {"sloth": {}}}  # fmt: skip
     (folder.scene_dir / "scene.json").write_text(json.dumps(record))
     return folder
 

@@ -12,6 +12,7 @@ from bridge.task.task_file import load_task
 from bridge.terminal import Output
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import describe_undrawn, replay_run
+from twin.scene.store.folder import write_record
 
 
 def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_path: Path) -> None:
@@ -22,13 +23,19 @@ def test_pictures_without_a_scene_are_refused_before_anything_is_replayed(tmp_pa
         replay_run(run, ReplayRunConfig(render=True), Output(quiet=True))
 
 
-def test_objects_and_a_robot_that_the_scene_lacks_are_named_with_the_reason() -> None:
+def test_what_was_not_scanned_and_a_missing_robot_are_named_with_the_reason(
+    tmp_path: Path,
+) -> None:
+    run = RunFolder.create(tmp_path / "run")
+    run.scene_dir.mkdir()
     record = {
-        "objects": {"box": {}},
-        "objects_remark": "cube not found: hidden",
+        "schema_version": 1, "key": "k", "scene_hash": "h", "background": {}, "sources": [],
+        "views": [], "objects": {"box": {}}, "objects_remark": "cube not found: hidden",
         "robot": {"links": {}, "remark": "no joints"},
-    }
-    assert describe_undrawn(record, [load_task("cube_into_box")]) == [
-        "cube: not in the scene, not in pictures (cube not found: hidden)",
+    }  # fmt: skip
+    write_record(run, record)
+    assert describe_undrawn(run, [load_task("cube_into_box")]) == [
+        "cube was not scanned: drawn from the task's shape, with colours from before the first "
+        "motion (cube not found: hidden)",
         "robot: not in the scene, not in pictures (no joints)",
     ]

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from bridge.geometry import se3
@@ -150,3 +151,21 @@ def test_a_header_with_line_ends_of_windows_is_read(tmp_path: Path) -> None:
     windows = (head + mark).replace(b"\n", b"\r\n")
     (tmp_path / "b.ply").write_bytes(windows + body)
     np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means_m, cloud.means_m)
+
+
+def test_moving_a_cloud_moves_covariances_like_points() -> None:
+    rng = np.random.default_rng(1)
+    cloud = GaussianCloud(
+        means_m=as_float32(rng.normal(size=(5, 3))), quats_wxyz=as_float32(rng.normal(size=(5, 4))),
+        scales_log=as_float32(np.log([[0.1, 0.2, 0.3]] * 5)),
+        opacities_logit=as_float32(np.zeros(5)), colors=as_float32(np.zeros((5, 3))),
+    )  # fmt: skip
+    T = se3.transform_from(np.array([0.5, 0.5, -0.1, 0.7]), np.array([1.0, 2.0, 3.0]))
+
+    def covariances(item: GaussianCloud) -> np.ndarray:
+        R = Rotation.from_quat(item.quats_wxyz, scalar_first=True).as_matrix()
+        return np.einsum("nij,nj,nkj->nik", R, np.exp(2 * item.scales_log), R)
+
+    moved, turn = moved_cloud(cloud, T), T[:3, :3]
+    np.testing.assert_allclose(covariances(moved), turn @ covariances(cloud) @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(moved.means_m, cloud.means_m @ turn.T + T[:3, 3], atol=1e-6)

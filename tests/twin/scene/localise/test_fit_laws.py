@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.localise.shape_fit import ShapeFitConfig, _crossings, refine_on_points
+from twin.scene.localise.points import Cluster
+from twin.scene.localise.shape_fit import ShapeFitConfig, _crossings, _Problem, _solve
+from twin.scene.shape.known import pose_of
 
 SIZE_M = (0.09, 0.03, 0.05)
 
@@ -36,9 +38,18 @@ def test_exact_points_give_the_exact_pose_from_a_pose_nearby(seed: int, turn_rad
     start = T.copy()
     start[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, turn_rad])) @ T[:3, :3]
     start[:2, 3] += [0.004, -0.003]
-    found = refine_on_points(
-        se3.apply(T, surface_points(seed)), model, start, ShapeFitConfig(iterations=30)
+    points, config = se3.apply(T, surface_points(seed)), ShapeFitConfig(iterations=30)
+    cluster = Cluster(p_base=points, view_ids=np.zeros(len(points), dtype=np.int64))
+    problem = _Problem(
+        cluster=cluster.thinned(config.max_points),
+        outlines=(),
+        model=model,
+        config=config,
+        prior_sigma=np.full((1, 3), 1e-6),  # the points have no shift of their own
     )
+    yaw = np.arctan2(start[1, 0], start[0, 0])
+    state = np.array([*start[:3, 3], yaw, 0.0, 0.0, 0.0])
+    found = pose_of(_solve(state, problem)[:4])
     np.testing.assert_allclose(found[:3, 3], T[:3, 3], atol=2e-4)
     assert se3.rotation_angle_rad(found[:3, :3].T @ T[:3, :3]) < 2e-3
 

@@ -81,6 +81,9 @@ def run(tmp_path: Path, known: ToyMesh) -> RunFolder:
     folder.mkdir(parents=True)
     (folder / "mesh.ply").write_bytes(mesh_ply(known.vertices_m, known.triangles))
     (folder / "object.json").write_text(json.dumps({"shape_source": "reconstructed"}))
+    record = {"schema_version": 1, "key": "k", "scene_hash": "abc", "background": {},
+              "sources": [], "views": [], "objects": {"thing": {}}}  # fmt: skip
+    (run.scene_dir / "scene.json").write_text(json.dumps(record))
     return run
 
 
@@ -96,6 +99,14 @@ def test_meshes_of_scanned_objects_are_read_from_the_scene(
         json.dumps({"shape_source": "task file"})
     )
     assert not scanned_surfaces(run, scanned_task, 500).hashes
+
+
+def test_what_the_scene_does_not_list_was_not_scanned_whatever_lies_about(
+    run: RunFolder, scanned_task: Task
+) -> None:
+    path = run.scene_dir / "scene.json"
+    path.write_text(path.read_text().replace('"thing"', '"duck"'))
+    assert not scanned_surfaces(run, scanned_task, 500).surfaces
 
 
 def test_the_gate_lays_out_scanned_objects_by_the_scene_s_mesh(

@@ -13,9 +13,9 @@ from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import GaussianCloud, moved_cloud
 from twin.scene.objects.closing import closed_object, weighted_median
-from twin.scene.objects.decompose import shape_mesh
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.settings import InitialiseConfig
+from twin.scene.shape.known import shape_mesh
 
 CAMERA = Camera(width=200, height=160, fx=260.0, fy=260.0, cx=100.0, cy=80.0)
 HALF_M = 0.02

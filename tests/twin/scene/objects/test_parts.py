@@ -9,10 +9,10 @@ import pytest
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
 from bridge.task.task_file import load_task
-from twin.scene.gaussians import GaussianCloud, as_float32, concatenate
+from twin.scene.gaussians import GaussianCloud, as_float32, concatenate, moved_cloud
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.movable_scene import MovableScene
-from twin.scene.objects.decompose import read_objects, split_objects, write_objects
+from twin.scene.objects.decompose import LibraryObject, ObjectSplats, read_objects
 from twin.scene.shape.sdf import SdfGrid
 
 
@@ -41,20 +41,21 @@ def written(tmp_path: Path) -> tuple[RunFolder, dict, GaussianCloud, np.ndarray]
     T = se3.transform_from(np.array([0.97, 0, 0, 0.24]), np.array([0.5, -0.1, 0.02]))
     cloud, task = cube_on_table(T), load_task("cube_into_box")
     found = LocalisedObject(
-        object_id="cube",
-        found=True,
-        T_base_object=T,
-        covariance=None,
-        confidence=1.0,
-        method="given",
-        reason="",
-        stamp_ns=1,
+        object_id="cube", found=True, T_base_object=T, covariance=None, confidence=1.0,
+        method="given", reason="", stamp_ns=1,
+    )  # fmt: skip
+    cube = LibraryObject(
+        model=task.objects["cube"],
+        splats=ObjectSplats(
+            cloud=moved_cloud(cloud.take(np.arange(600)), se3.invert(T)), T_base_object=T
+        ),
+        shape="seen too little",
+        localised=found,
+        episode_id="scan_0001",
     )
-    parts = split_objects(cloud, {"cube": found}, task)
     run = RunFolder.create(tmp_path / "run")
-    run.scene_dir.mkdir()
-    record = {"objects": write_objects(run.scene_dir, parts, {"cube": found}, task)}
-    return run, record, parts.background, T
+    record = {"objects": {"cube": cube.write(run.scene_dir / "objects" / "cube")}}
+    return run, record, cloud.take(np.arange(600, 1500)), T
 
 
 def test_putting_together_gives_every_gaussian_back(

@@ -18,12 +18,11 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from twin.replay.config import ReplayRunConfig
 from twin.replay.runner import replay_run
-from twin.scene.fit.initialise import fuse
-from twin.scene.frames.rgbd import DepthLimits, FrameSurface
 from twin.scene.frames.selection import choose_frames, find_sources
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects import decompose as parts_module
-from twin.scene.objects.decompose import decompose, read_objects
+from twin.scene.objects import placement as parts_module
+from twin.scene.objects.decompose import read_objects
+from twin.scene.objects.placement import find_placements
 from twin.scene.rebuild.record import describe_scene
 from twin.scene.rebuild.run import rebuild
 from twin.scene.settings import (
@@ -35,9 +34,6 @@ from twin.scene.settings import (
 from twin.scene.store.folder import UnreadableSceneError, read_record, read_scene, scene_hash_of
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
-
-
-LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 
 
 def change_record(run: RunFolder, change: Callable[[dict[str, Any]], object]) -> None:
@@ -136,10 +132,7 @@ def test_objects_are_not_looked_for_in_held_out_frames(
     monkeypatch.setattr(Episode, "info", EpisodeInfo(id="s", kind="scan", task="cube_into_box"))
     sources = find_sources(room)
     choices = choose_frames(sources, FrameConfig(holdout_every=3)).choices
-    cloud = fuse(
-        [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
-    )
-    decompose(sources, cloud, choices)
+    find_placements(sources, choices, QUIET)
     assert len(choices[0].holdout_ns) == 3
     assert asked["held_out_ns"] == {"wrist": choices[0].holdout_ns}
 
@@ -153,12 +146,9 @@ def test_objects_are_not_cut_out_of_a_scene_in_a_frame_of_its_own(
     sources = find_sources(room)
     (choice,) = choose_frames(sources, FrameConfig()).choices
     followed = replace(choice, poses=replace(choice.poses, source="odometry"))
-    cloud = fuse(
-        [FrameSurface(textured_room.frame(0, 9), LIMITS).points()], InitialiseConfig(max_splats=50)
-    )
-    apart = decompose(sources, cloud, [followed])
+    apart = find_placements(sources, [followed], QUIET)
     assert "followed by its images" in apart.remark
-    assert apart.background is cloud
+    assert not apart.by_episode
 
 
 def test_frames_are_known_by_their_own_stamp_and_not_by_when_they_were_sent(

@@ -13,13 +13,13 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.default import ROBOT
-from twin.scene import render as compose_module
+from twin.scene import render as render_module
 from twin.scene.gaussians import (
     GaussianCloud,
     as_float32,
     write_ply,
 )
-from twin.scene.render import compose, object_places, render
+from twin.scene.render import object_places, posture_of, render
 from twin.scene.robot.splats import write_links
 from twin.scene.settings import RenderConfig
 from twin.scene.store.folder import (
@@ -27,6 +27,7 @@ from twin.scene.store.folder import (
     read_scene,
     write_record,
 )
+from twin.scene.trial import open_trial
 
 pytestmark = pytest.mark.usefixtures("few_voxels")
 
@@ -108,19 +109,19 @@ def with_robot(room: RunFolder, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
     links = {"base_link": blob(1), "tool0": blob(2)}
     write_record(room, {**scene.record, "robot": {"links": write_links(room, links)}})
     urdf = ROBOT.urdf_text()
-    monkeypatch.setattr(compose_module.streams, "robot_description", lambda _episode: urdf)
+    monkeypatch.setattr(render_module.streams, "robot_description", lambda _episode: urdf)
     return room
 
 
 def test_given_joints_move_the_hand_and_not_the_base(with_robot: RunFolder) -> None:
     episode = Episode.open(with_robot.episodes_dir / "scan.mcap")
-    scene = read_scene(with_robot)
+    trial = open_trial(with_robot, read_scene(with_robot), episode)
 
     def robot(*joints: float) -> np.ndarray:
         config = RenderConfig(joints=joints)
-        composed = compose(with_robot, scene, episode, episode.start_ns, config)
-        assert composed.robot == "joints given"
-        return composed.cloud.means_m[-120:]
+        posture, urdf, words = posture_of(trial, episode.start_ns, config)
+        assert words == "joints given"
+        return trial.parts.at({}, posture, urdf).means_m[-120:]
 
     before, after = robot(*HOME), robot(HOME[0] + 0.5, *HOME[1:])
     np.testing.assert_allclose(after[:60], before[:60], atol=1e-6)

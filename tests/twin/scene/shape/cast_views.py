@@ -9,9 +9,8 @@ from bridge.geometry import se3
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import Target, TrainingView
-from twin.scene.objects.decompose import shape_mesh
 from twin.scene.shape.carve import MaskedView
-from twin.scene.shape.known import pose_of
+from twin.scene.shape.known import pose_of, shape_mesh
 
 CAMERA = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 Mesh = tuple[np.ndarray, np.ndarray]

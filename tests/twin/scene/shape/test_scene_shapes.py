@@ -12,7 +12,7 @@ from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import TrainingView
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.localise.result import LocalisedObject
-from twin.scene.objects.decompose import ObjectSplats, SceneParts, write_objects
+from twin.scene.objects.decompose import LibraryObject, ObjectSplats
 from twin.scene.shape.from_training import (
     masked_view,
     shapes_of,
@@ -58,7 +58,7 @@ def test_what_cannot_be_reconstructed_says_why(views: list[TrainingView]) -> Non
     assert "masks are empty" in str(shapes_of([], TASK.objects, POSES)["box"])
 
 
-def parts_of(*keys: str) -> SceneParts:
+def library_object(key: str, shape: ObjectShape | str) -> LibraryObject:
     cloud = GaussianCloud(
         means_m=as_float32(np.zeros((3, 3))),
         quats_wxyz=as_float32(np.tile([1.0, 0, 0, 0], (3, 1))),
@@ -66,32 +66,26 @@ def parts_of(*keys: str) -> SceneParts:
         opacities_logit=as_float32(np.ones(3)),
         colors=as_float32(np.ones((3, 3))),
     )
-    objects = {key: ObjectSplats(cloud=cloud, T_base_object=POSES[key]) for key in keys}
-    return SceneParts(background=cloud, objects=objects, filling=cloud)
+    return LibraryObject(
+        model=TASK.objects[key],
+        splats=ObjectSplats(cloud=cloud, T_base_object=POSES[key]),
+        shape=shape,
+        localised=localised(key),
+        episode_id="scan_0001",
+    )
 
 
 def localised(key: str) -> LocalisedObject:
     return LocalisedObject(
-        object_id=key,
-        found=True,
-        T_base_object=POSES[key],
-        covariance=None,
-        confidence=1.0,
-        method="given",
-        reason=None,
-        stamp_ns=1,
-    )
+        object_id=key, found=True, T_base_object=POSES[key], covariance=None, confidence=1.0,
+        method="given", reason=None, stamp_ns=1,
+    )  # fmt: skip
 
 
-@pytest.mark.slow
-def test_the_known_shape_stands_in_and_nothing_old_is_left(
-    shapes: dict[str, ObjectShape | str], tmp_path: Path
-) -> None:
-    where = {"cube": localised("cube")}
-    write_objects(tmp_path, parts_of("cube"), where, TASK, shapes)
-    record = write_objects(tmp_path, parts_of("cube"), where, TASK, {"cube": "seen too little"})
+def test_the_known_shape_stands_in_with_the_reason(tmp_path: Path) -> None:
     folder = tmp_path / "objects" / "cube"
-    assert {p.name for p in folder.iterdir()} == set(record["cube"]["files"])
+    record = library_object("cube", "seen too little").write(folder)
+    assert {p.name for p in folder.iterdir()} == set(record["files"])
     about = json.loads((folder / "object.json").read_text())
     assert about["shape_source"] == "task file"
     assert about["shape_remark"] == "seen too little"

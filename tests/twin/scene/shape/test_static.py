@@ -126,7 +126,7 @@ def test_without_views_there_is_no_static_scene_but_a_reason(tmp_path: Path) -> 
     with pytest.raises(ShapeError, match="0 points"):
         static_sdf([], 0.0)
     (tmp_path / "sdf.npz").write_bytes(b"old")
-    about = write_static(tmp_path, [], None, {})
+    about = write_static(tmp_path, [], [])
     assert about["file"] is None
     assert "0 points" in about["remark"]
     assert not (tmp_path / "sdf.npz").exists()
