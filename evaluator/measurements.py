@@ -77,12 +77,6 @@ AVERAGE_POOLED = _new(
     "higher",
     "successes / {unit}s over {over} {condition} ({side}): every trial counts the same",
 )
-NEVER_SENT = _new(
-    "plans.never_sent",
-    "count",
-    "none",
-    "plans that were published and never executed, of all plans published; they are part of no rate",
-)
 STAGE = _new(
     "stage.{task}.{condition}.{stage}",
     "1",
@@ -186,24 +180,6 @@ MMRV_RECORDED = _agreement(
     "1",
     "lower",
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
-)
-VARIED_R = _agreement(
-    "varied.pearson_r",
-    "1",
-    "higher",
-    "Pearson r of recorded rates and the twin's of varied replays (each trial's share that succeed, averaged) {what}",
-)
-VARIED_BIAS = _agreement(
-    "varied.bias_pp",
-    "pp",
-    "none",
-    "the twin's rate of varied replays - recorded rate, averaged {what}",
-)
-VARIED_MMRV = _agreement(
-    "varied.mmrv_recorded_gap",
-    "1",
-    "lower",
-    "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
 )
 # Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
 

@@ -28,9 +28,3 @@ PROTOCOL_DEPARTURES = new_quantity(
     "lower",
     "departures of what was done from the protocol that was locked before the first trial",
 )
-PROTOCOL_AGREEMENT = new_quantity(
-    "protocol.primary.agreement",
-    "1",
-    "higher",
-    "the primary question of the protocol, agreed / decided trials: {about}",
-)

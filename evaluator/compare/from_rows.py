@@ -22,7 +22,6 @@ from evaluator.compare.success import (
     WITH,
     WITHOUT,
     averages,
-    never_sent,
     rate_groups,
     side_rates,
     trials_in,
@@ -35,7 +34,6 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
-from evaluator.compare.varied_agreement import varied_agreement
 from evaluator.result import Exclusion, Measurement, Table
 
 
@@ -106,11 +104,9 @@ def _measure(
         *group_agreement(groups),
         *gains,
         *varied_sim(rows),
-        *varied_agreement(rows, groups),
         *study,
         *compared.measurements,
         *regret_results(usable_groups(groups)),
-        *never_sent(rows),
         *beside,
         *reliability(rows),
         *stages,

@@ -243,7 +243,7 @@ def _pairs_after(tries: Sequence[Try]) -> list[float]:
     seen: dict[tuple[str, str], list[Try | None]] = {}
     shared: Counter[str] = Counter()
     left: dict[str, list[int]] = {}
-    worth: dict[str, float] = {}
+    counted: dict[str, float] = {}
     total, found = 0.0, []
     for place, each in enumerate(tries):
         start = seen.setdefault((each.task, each.start or f"unnamed {place}"), [None, None])
@@ -258,8 +258,8 @@ def _pairs_after(tries: Sequence[Try]) -> list[float]:
                 others[1] -= 1
         n, m = others
         now = shared[each.task] + (2 * n * m / (n + m) if n and m else 0.0)
-        total += now - worth.get(each.task, 0.0)
-        worth[each.task] = now
+        total += now - counted.get(each.task, 0.0)
+        counted[each.task] = now
         found.append(total)
     return found
 
@@ -420,7 +420,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
     """Lay answers out; the first column that a reader needs is the sentence."""
     if not answers:
         return Part()
-    said: list[dict[str, Cell]] = [
+    sentences: list[dict[str, Cell]] = [
         {"answer": each.sentence, "task": each.task or ALL_TASKS} for each in answers
     ]
     plan = plan_of(protocol)
@@ -430,7 +430,7 @@ def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None)
         else f"no plan was locked: as if {plan.pairs} pairs had been planned"
     )
     table = Table.of(
-        said,
+        sentences,
         id="comparisons",
         title="Which is better, as recorded",
         note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 from bridge.episode.metadata import treatment_of
 from bridge.task.protocol import FILE_NAME, Endpoint, Protocol
-from evaluator.compare.measure import Part, measured, proportion
+from evaluator.compare.measure import Part, measured
 from evaluator.compare.policies import Answer
 from evaluator.compare.rows import TrialRow, in_order
 from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
-from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.study_measurements import PROTOCOL_AGREEMENT, PROTOCOL_DEPARTURES
+from evaluator.result import Cell, Exclusion, Table
+from evaluator.study_measurements import PROTOCOL_DEPARTURES
 
 ARM_OF_CONDITION = {condition: arm for arm, condition in CONDITION_OF_ARM.items()}
 NO_HASH = "0" * 64
@@ -72,7 +72,7 @@ def protocol_results(
         *_of_order(mine, protocol),
         *_of_exclusions(mine, protocol, left_out),
     ]
-    found += _unanswered(mine, answers, protocol.primary)
+    found += _unanswered(answers, protocol.primary)
     count = measured(
         PROTOCOL_DEPARTURES.of(),
         lambda: float(len(found)),
@@ -81,7 +81,7 @@ def protocol_results(
         reason_without_interval="a count",
     )
     return Part(
-        measurements=(count, *_agreement(mine, protocol, method)),
+        measurements=(count,),
         tables=(_departure_table(found, protocol),),
     )
 
@@ -189,49 +189,16 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-def _unanswered(
-    rows: Sequence[TrialRow], answers: Sequence[Answer], endpoint: Endpoint
-) -> Iterable[_Departure]:
+def _unanswered(answers: Sequence[Answer], endpoint: Endpoint) -> Iterable[_Departure]:
     """Say that the primary question has no answer at all."""
     if endpoint.kind == "agreement":
-        if not _agreeing(rows, endpoint)[1]:
-            why = "no trial has a decided replay and an outcome"
-            yield _Departure("primary question", endpoint.words, "an answer", why)
+        why = "claims of agreement are no longer judged: read agreement.sim_planned.rate"
+        yield _Departure("primary question", endpoint.words, "an answer", why)
         return
     known = [each for each in answers if each.question.is_primary and not each.task]
     if not any(each.reading.evidence.pairs for each in known):
         why = "no start was tried in both arms"
         yield _Departure("primary question", endpoint.words, "an answer", why)
-
-
-def _agreeing(rows: Sequence[TrialRow], endpoint: Endpoint) -> tuple[int, int]:
-    """Trials in which twin and outcome agree, and all that have both."""
-    known = [
-        row
-        for row in rows
-        if (row.policy, row.study_arm) == (endpoint.policy, endpoint.arm)
-        and row.recorded is not None
-        and row.sim_planned is not None
-    ]
-    return sum(row.recorded == row.sim_planned for row in known), len(known)
-
-
-def _agreement(rows: Sequence[TrialRow], protocol: Protocol, method: str) -> list[Measurement]:
-    """Answer a claim that twin and outcome agree: its interval lies above the limit, or not."""
-    endpoint = protocol.primary
-    if endpoint is None or endpoint.kind != "agreement":
-        return []
-    agreed, n = _agreeing(rows, endpoint)
-    return [
-        proportion(
-            PROTOCOL_AGREEMENT.of(about=f"{endpoint.words}: {agreed} of {n} trials"),
-            agreed,
-            n,
-            counted="trial",
-            reason_if_undefined="no trial has a decided replay and an outcome",
-            method=method,
-        )
-    ]
 
 
 def _departure_table(found: Sequence[_Departure], protocol: Protocol) -> Table:

@@ -68,8 +68,8 @@ def _compared(results: Results) -> list[str]:
     """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
     table = next((t for t in results.tables if t.id == "comparisons"), None)
     rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
-    said = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
-    found = [f"{text[0].upper()}{text[1:]}." for text in said[:SHOWN_ANSWERS]]
+    sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
+    found = [f"{text[0].upper()}{text[1:]}." for text in sentences[:SHOWN_ANSWERS]]
     regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
     if regret is not None and regret.value is not None:
         ends = _ends(regret, ".0f")

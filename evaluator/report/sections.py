@@ -39,10 +39,7 @@ SECTIONS: tuple[Section, ...] = (
         id="protocol",
         title="The study against its protocol",
         lead="What was fixed before the first trial, what it found, and every departure from it.",
-        numbers=(
-            ("protocol.departures", "Departures from the protocol"),
-            ("protocol.primary.*", ""),
-        ),
+        numbers=(("protocol.departures", "Departures from the protocol"),),
         tables=("protocol_departures",),
     ),
     Section(
@@ -63,9 +60,6 @@ SECTIONS: tuple[Section, ...] = (
             ("agreement.pearson_r", "Pearson r"),
             ("agreement.pearson_r.without_replanning", "Pearson r, without replanning"),
             ("agreement.pearson_r.with_replanning", "Pearson r, with replanning"),
-            ("agreement.varied.pearson_r", "Pearson r of varied replays"),
-            ("agreement.varied.mmrv_recorded_gap", "MMRV of varied replays, gap of recorded rates"),
-            ("agreement.varied.bias_pp", "Bias of varied replays: sim minus labelled"),
             ("agreement.spearman_rho", "Spearman's rank correlation"),
             ("agreement.bias_pp", "Bias: sim minus labelled"),
             ("agreement.mae_pp", "Mean absolute error"),

@@ -158,11 +158,11 @@ def _moments(
     other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
     y = expit(at + size * _bent(other, bend))
     given = y @ w
-    said = expit(blind_at[:, None] + blind_size[:, None] * z)
+    of_blind = expit(blind_at[:, None] + blind_size[:, None] * z)
     mean_x, square_x = x @ w, x**2 @ w
-    mean_y = (1 - share) * (given @ w) + share * (said @ w)
-    square_y = (1 - share) * ((y**2 @ w) @ w) + share * (said**2 @ w)
-    both = (1 - share) * ((x * given) @ w) + share * mean_x * (said @ w)
+    mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
+    square_y = (1 - share) * ((y**2 @ w) @ w) + share * (of_blind**2 @ w)
+    both = (1 - share) * ((x * given) @ w) + share * mean_x * (of_blind @ w)
     spread = (square_x - mean_x**2) * (square_y - mean_y**2)
     r = (both - mean_x * mean_y) / np.sqrt(np.maximum(spread, 1e-14))
     return np.clip(r, -1, 1), mean_y - mean_x
@@ -196,8 +196,8 @@ class GapModel:
         odds = common_log_odds(self.groups)
         table = np.stack([_likelihood(group, odds) for group in self.groups])
         seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
-        said = np.einsum("gxy,ny->ngx", table, there.blind, optimize=True)
-        blind = np.einsum("ngx,nx->ng", said, there.recorded)
+        of_blind = np.einsum("gxy,ny->ngx", table, there.blind, optimize=True)
+        blind = np.einsum("ngx,nx->ng", of_blind, there.recorded)
         share = there.share[:, None]
         chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
         logs = np.log(chance).sum(axis=1) / self.design_effect

@@ -56,11 +56,6 @@ def test_the_success_table_says_that_the_twin_selected_the_accepted_plans(six_tr
     assert "Replays with --samples estimate it again with fresh seeds" in table.note
 
 
-def test_plans_that_were_never_sent_are_counted_apart(six_trials: Any) -> None:
-    never = compare_run(six_trials.run).results().get("plans.never_sent")
-    assert (never.value, never.n) == (6.0, 12)
-
-
 def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:
     maker.trial("t1", num_poses=900)
     maker.replay("t1", num_poses=900, astray=301)
