@@ -1,101 +1,138 @@
 """True success rates on which the model of agreement is judged, fixed before the first result.
 
-Every truth is a population of groups: a pair of normal numbers with correlation ``rho``, turned
-into a recorded rate and a rate of the twin. Judged is whether an interval holds the correlation and
-the mean difference of the rates of that population. Groups of a task share a part of their numbers.
+Every truth draws groups: a recorded rate and the twin's. Judged is whether an interval holds the
+correlation and the mean difference of the rates of the population that the groups come from: of new
+tasks and policies, too, where groups are tasks x policies. Sixteen truths, each with 8, 12 and 28
+groups (4 x 2, 4 x 3, 7 x 4) of 10 and 20 recorded trials, half of the studies with as many trials
+of the twin and half with ten times as many; the seed of a cell is [truth, groups, trials, factor].
+Success: the least coverage over truths (all cells of one together) is at least 93 %.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float64
-from scipy.special import ndtr, ndtri
+from jaxtyping import Float64, Int64
+from scipy.special import expit, logit, ndtr
 from scipy.stats import beta
 
-RHOS = (0.0, 0.6, 0.95)
-NUM_GROUPS = (4, 5, 6, 7, 8, 12, 20, 30)
-NUM_TRIALS = (5, 10, 20, 50)
+NUM_GROUPS = {8: (4, 2), 12: (4, 3), 28: (7, 4)}
+"""Number of groups, and as how many tasks and policies where these are crossed."""
+NUM_TRIALS = (10, 20)
 SIM_FACTORS = (1, 10)
-"""Trials of the twin for each recorded one: as many, or ten times as many."""
-SHARED = 0.6
-"""Part of the variance that groups of a task share, where groups are clustered."""
-POLICIES = 3
-NODES = 61
+BLIND = 0.2
+"""Share of groups in which a blind twin says nothing of what is recorded."""
+Rates = Float64[np.ndarray, "studies groups"]
+Sides = tuple[Rates, Rates]
+Draw = Callable[[np.random.Generator, int, int], Sides]
+Curve = Callable[[np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Truth:
-    """One population of groups."""
-
-    shape: str
-    """A name in ``SHAPES``."""
-    rho: float
-    clustered: bool = False
-    """Whether ``POLICIES`` groups at a time share a task."""
-
-    @property
-    def name(self) -> str:
-        """Shape and correlation in words."""
-        return f"{self.shape}{', by task' if self.clustered else ''}, rho {self.rho:g}"
-
-    def rates(
-        self, normal: Float64[np.ndarray, "*groups sides"]
-    ) -> Float64[np.ndarray, "*groups sides"]:
-        """Turn standard normal numbers into recorded and twin rates."""
-        share = ndtr(normal)
-        recorded, sim = SHAPES[self.shape]
-        return np.stack([recorded(share[..., 0]), sim(share[..., 1])], axis=-1)
-
-    def population(self) -> tuple[float, float]:
-        """Return the correlation of both rates over the population, and the mean difference."""
-        steps = (np.arange(NODES * 8) + 0.5) / (NODES * 8)
-
-        first = ndtri(steps)[:, None]
-        second = self.rho * first + np.sqrt(1 - self.rho**2) * ndtri(steps)[None, :]
-        normal = np.stack(np.broadcast_arrays(first, second), axis=-1)
-        rates = self.rates(normal).reshape(-1, 2)
-        r = float(np.corrcoef(rates.T)[0, 1])
-        return r, float((rates[:, 1] - rates[:, 0]).mean())
-
-    def draw(self, num_groups: int, rng: np.random.Generator) -> Float64[np.ndarray, "groups 2"]:
-        """Draw the true rates of some groups."""
-        chol = np.linalg.cholesky(np.array([[1.0, self.rho], [self.rho, 1.0]]))
-        normal = rng.standard_normal((num_groups, 2))
-        if self.clustered:
-            tasks = np.array(self.tasks(num_groups))
-            shared = rng.standard_normal((tasks.max() + 1, 2))[tasks]
-            normal = np.sqrt(SHARED) * shared + np.sqrt(1 - SHARED) * normal
-        return self.rates(normal @ chol.T)
-
-    def tasks(self, num_groups: int) -> list[int]:
-        """Return the task of each group; each its own where they are not clustered."""
-        return [place // POLICIES if self.clustered else place for place in range(num_groups)]
+def _beta(a: float, b: float) -> Curve:
+    shares = np.linspace(0, 1, 4001)
+    rates = beta.ppf(shares, a, b)
+    return lambda u: np.interp(u, shares, rates)
 
 
-def _zeros(share: Float64[np.ndarray, "*groups"], part: float) -> Float64[np.ndarray, "*groups"]:
-    above = np.clip((share - part) / (1 - part), 0.0, 1.0)
-    return np.where(share < part, 0.0, beta.ppf(above, 1.0, 2.0))
+def _zeros(part: float) -> Curve:
+    above = _beta(1, 2)
+    return lambda u: np.where(u < part, 0.0, above(np.clip((u - part) / (1 - part), 0, 1)))
 
 
-def _levels(share: Float64[np.ndarray, "*groups"], top: float) -> Float64[np.ndarray, "*groups"]:
-    within = np.where(share < 0.5, 2 * share, 2 * share - 1)
-    return np.where(share < 0.5, 0.1, top - 0.1) + 0.1 * within
+def _levels(top: float) -> Curve:
+    return lambda u: np.where(u < 0.5, 0.1, top - 0.1) + 0.1 * np.where(u < 0.5, 2 * u, 2 * u - 1)
 
 
-SHAPES = {
-    "middling": (lambda u: beta.ppf(u, 2, 2), lambda u: beta.ppf(u, 2.5, 2)),
-    "U-shaped": (lambda u: beta.ppf(u, 0.4, 0.4), lambda u: beta.ppf(u, 0.5, 0.4)),
-    "full of zeros": (lambda u: _zeros(u, 0.4), lambda u: _zeros(u, 0.3)),
-    "two levels": (lambda u: _levels(u, 0.8), lambda u: _levels(u, 0.9)),
+def _normal(
+    rng: np.random.Generator, shape: tuple[int, ...], rho: float
+) -> Float64[np.ndarray, "*shape 2"]:
+    found = rng.standard_normal((*shape, 2))
+    found[..., 1] = rho * found[..., 0] + np.sqrt(1 - rho**2) * found[..., 1]
+    return found
+
+
+def _copula(recorded: Curve, sim: Curve, rho: float) -> Draw:
+    def draw(rng: np.random.Generator, studies: int, groups: int) -> Sides:
+        share = ndtr(_normal(rng, (studies, groups), rho))
+        return recorded(share[..., 0]), sim(share[..., 1])
+
+    return draw
+
+
+def _blind(said: Curve) -> Draw:
+    """A twin that follows closely but in a fifth of the groups, where it says something else."""
+    recorded = _beta(1.2, 1.2)
+
+    def draw(rng: np.random.Generator, studies: int, groups: int) -> Sides:
+        shape = (studies, groups)
+        x = recorded(rng.random(shape))
+        noise = 0.3 + 0.4 * rng.standard_normal(shape)
+        y = expit(logit(np.clip(x, 0.002, 0.998)) + noise)
+        return x, np.where(rng.random(shape) < BLIND, said(rng.random(shape)), y)
+
+    return draw
+
+
+def _crossed(of_tasks: float, of_policies: float, of_cells: float) -> Draw:
+    """Effects of tasks, of policies and of both together, each with its own correlation."""
+
+    def draw(rng: np.random.Generator, studies: int, groups: int) -> Sides:
+        tasks, policies = NUM_GROUPS.get(groups, (1, 1))
+        effects = 0.9 * _normal(rng, (studies, tasks, 1), of_tasks)
+        effects = effects + 0.6 * _normal(rng, (studies, 1, policies), of_policies)
+        effects = effects + 0.4 * _normal(rng, (studies, tasks, policies), of_cells)
+        rates = expit(1.3 * effects).reshape(studies, groups, 2)
+        return rates[..., 0], rates[..., 1]
+
+    return draw
+
+
+def _same(rng: np.random.Generator, studies: int, groups: int) -> Sides:
+    x = _beta(0.8, 0.8)(rng.random((studies, groups)))
+    return x, x
+
+
+MIDDLING = (_beta(2, 2), _beta(2.5, 2))
+TRUTHS: dict[str, Draw] = {
+    "middling, rho 0": _copula(*MIDDLING, 0.0),
+    "middling, rho 0.6": _copula(*MIDDLING, 0.6),
+    "middling, rho 0.95": _copula(*MIDDLING, 0.95),
+    "U-shaped, rho 0.6": _copula(_beta(0.4, 0.4), _beta(0.5, 0.4), 0.6),
+    "U-shaped, rho 0.95": _copula(_beta(0.4, 0.4), _beta(0.5, 0.4), 0.95),
+    "full of zeros": _copula(_zeros(0.4), _zeros(0.3), 0.6),
+    "two levels": _copula(_levels(0.8), _levels(0.9), 0.6),
+    "blind fifth says yes": _blind(lambda u: 0.85 + 0.15 * u),
+    "blind fifth says no": _blind(lambda u: 0.1 * u),
+    "blind fifth says anything": _blind(lambda u: u),
+    "tasks x policies": _crossed(0.7, 0.7, 0.3),
+    "tasks x policies, opposed": _crossed(0.9, -0.3, 0.0),
+    "ceiling": _copula(_beta(8, 1.5), _beta(9, 1.2), 0.6),
+    "all alike": _copula(lambda u: 0.46 + 0.08 * u, lambda u: 0.5 + 0.1 * u, 0.6),
+    "unequal n": _copula(*MIDDLING, 0.6),
+    "the twin is right": _same,
 }
-"""How a share of the population becomes a recorded rate, and a rate of the twin."""
-TRUTHS = (
-    *(Truth(shape=shape, rho=rho) for shape in SHAPES for rho in RHOS),
-    *(
-        Truth(shape=shape, rho=rho, clustered=True)
-        for shape in ("middling", "U-shaped")
-        for rho in RHOS
-    ),
-)
-FEWEST_CLUSTERED = 12
-"""Groups from which truths by task are asked for: four tasks of three policies."""
+CROSSED = ("tasks x policies", "tasks x policies, opposed")
+UNEQUAL = "unequal n"
+"""Groups of half, once and three times as many trials."""
+
+
+def population(name: str, many: int = 1_000_000) -> tuple[float, float]:
+    """Return the correlation of both rates over the population, and the mean difference."""
+    rng = np.random.default_rng(7)
+    size = (many, 1) if name in CROSSED else (1, many)
+    x, y = (side.ravel() for side in TRUTHS[name](rng, *size))
+    return float(np.corrcoef(x, y)[0, 1]), float((y - x).mean())
+
+
+Counts = Int64[np.ndarray, "studies groups"]
+
+
+def studies(
+    name: str, groups: int, trials: int, factor: int, many: int
+) -> tuple[Counts, Counts, Counts, Counts]:
+    """Draw studies: successes and trials as recorded, and the twin's."""
+    rng = np.random.default_rng([list(TRUTHS).index(name), groups, trials, factor])
+    x, y = TRUTHS[name](rng, many, groups)
+    n = np.full(x.shape, trials)
+    if name == UNEQUAL:
+        n = rng.choice([trials // 2, trials, 3 * trials], size=x.shape)
+    return rng.binomial(n, x), n, rng.binomial(factor * n, y), factor * n

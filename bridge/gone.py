@@ -13,6 +13,8 @@ FIXED = (
 """Settings of a replay that are constants now."""
 
 GONE: dict[str, str] = {
+    "design --width": "Give --gain with --rate; at a given size use --starts.",
+    **dict.fromkeys(("design --agrees-above", "design --agreement"), "Use evaluate --fail-under."),
     "sync": "Copy a run with rclone, for example: rclone copy --checksum RUN DEST.",
     "check --rerun": "Rerun's own checker is: rerun mcap check --full FILE.",
     "export catalogue": "robot-gst ls RUN --json lists all of it.",
@@ -44,9 +46,7 @@ GONE: dict[str, str] = {
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
     ),
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
-    "recover --in-place": (
-        "Free some space, or move the file to another disk: a copy is made beside it."
-    ),
+    "recover --in-place": "Free some space, or use another disk: a copy is made beside it.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
     **dict.fromkeys(

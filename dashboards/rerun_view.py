@@ -98,9 +98,9 @@ def export_rrd(episode_path: Path, out: Path, run: RunFolder | None = None) -> E
             task = problems.attempt(lambda: streams.task_file(episode).task(), None)
         if run is not None and episode.derived is None:  # a label given after the fact counts
             outcome = problems.attempt(lambda: outcome_of(run, episode), outcome)
-        not_scanned = (
-            [] if run is None else problems.attempt(lambda: not_scanned_in(run, episode), [])
-        )
+        not_scanned: list[str] = []
+        if run is not None:
+            not_scanned = problems.attempt(lambda: not_scanned_in(run, episode), not_scanned)
         for side in sides:
             log_side(file, side, task, not_scanned)
         for key in not_scanned:

@@ -348,9 +348,16 @@ def _boxes(sides: Sequence[Side], scene: TrialScene, blocks: _Blocks) -> list[di
         for name, Ts in side.Ts_base_object.items():
             if name in scene.boxes_m:
                 centre_m, half_m = scene.boxes_m[name]
-                box = {"name": name, "side": side.name, "centre_m": centre_m, "half_m": half_m}
-                box["not_scanned"] = name in not_scanned
-                found.append(box | {"track": blocks.track(Ts)})
+                found.append(
+                    {
+                        "name": name,
+                        "side": side.name,
+                        "centre_m": centre_m,
+                        "half_m": half_m,
+                        "not_scanned": name in not_scanned,
+                        "track": blocks.track(Ts),
+                    }
+                )
     return found
 
 

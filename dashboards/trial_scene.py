@@ -167,7 +167,8 @@ def gather_scene(
     problems.texts.extend(tracks.notes)
     if scene is not None:
         drawn = partial(trial_parts, run, scene, episode, gathering.task, tracks.first())
-        parts, notes = problems.attempt(drawn, (None, []))
+        nothing: tuple[MovableScene | None, list[str]] = (None, [])
+        parts, notes = problems.attempt(drawn, nothing)
         problems.texts.extend(notes)
         gathering = replace(gathering, parts=parts)
     sides = [_recorded_side(gathering, tracks, postures, robot)]

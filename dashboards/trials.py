@@ -456,7 +456,7 @@ def command_of(job: Job, config: TrialsConfig, endpoint: str) -> list[str]:
 
 
 CARRIED_OUT = (
-    *("tasks", "policies", "rounds", "study_seed", "coin_from", "stopping", "void_causes"),
+    *("tasks", "policies", "rounds", "study_seed", "coin_from", "void_causes"),
     *("calibration_sha256", "calibration_from", "model_name", "model_address"),
 )
 """What whoever carries a study out decides, too; the rest is the design's alone."""

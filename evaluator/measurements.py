@@ -77,12 +77,6 @@ AVERAGE_POOLED = _new(
     "higher",
     "successes / {unit}s over {over} {condition} ({side}): every trial counts the same",
 )
-NEVER_SENT = _new(
-    "plans.never_sent",
-    "count",
-    "none",
-    "plans that were published and never executed, of all plans published; they are part of no rate",
-)
 STAGE = _new(
     "stage.{task}.{condition}.{stage}",
     "1",
@@ -116,49 +110,6 @@ GAIN_RELATIVE_AVERAGE = _new(
     "higher",
     "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
 )
-BOSCHLOO = _new(
-    "unpaired.boschloo_p.{side}.{task}.{policy}",
-    "1",
-    "none",
-    "two-sided p of Boschloo's exact test, starts not paired: {about}",
-)
-BOSCHLOO_POOLED = _new(
-    "unpaired.boschloo_p.{side}.pooled",
-    "1",
-    "none",
-    "two-sided p of Boschloo's exact test over the pooled trials of {count} tasks ({side}), starts not paired",
-)
-TRIALS_NEEDED = _new(
-    "power.trials_needed.{side}.{task}.{policy}",
-    "count",
-    "none",
-    "per condition, to show a gain as large as {about} with {power}",
-)
-PAIRED_GAIN = _new(
-    "paired.gain_pp.{side}",
-    "pp",
-    "higher",
-    "gain with replanning in percentage points over paired starts: {words}",
-)
-MCNEMAR = {
-    kind: _new(
-        f"paired.mcnemar_p_{kind}.{{side}}",
-        "1",
-        "none",
-        f"two-sided McNemar test, {test}: {{words}}",
-    )
-    for kind, test in (("exact", "exact binomial"), ("mid", "mid-p"))
-}
-START_DISTANCE = {
-    kind: _new(
-        f"paired.start_distance_{kind}_m",
-        "m",
-        "lower",
-        f"{kind} over paired starts of the largest distance between the localised objects of both trials; pairs beyond {{limit_mm:.0f}} mm are excluded, {{unknown}} of {{count}} pairs were not localised and are kept",
-    )
-    for kind in ("mean", "max")
-}
-
 # Agreement over groups. ``{what}`` says over which.
 
 
@@ -175,71 +126,35 @@ PEARSON_R = _agreement(
 PEARSON_R_OF_CONDITION = _new(
     "agreement.pearson_r.{condition}", "1", "higher", PEARSON_R.definition
 )
-PEARSON_R_REMEASURED = _new(
-    "agreement.pearson_r_remeasured",
+BLIND_SHARE = _new(
+    "agreement.blind_share",
     "1",
-    "higher",
-    "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
+    "lower",
+    "share of groups of this kind in which the twin says nothing of what is recorded, by the model of all counts",
 )
-MODEL_R = _new(
-    "agreement.model.r",
+BLIND_GROUP = _new(
+    "agreement.blind.{task}.{condition}.{policy}",
     "1",
-    "higher",
-    "correlation of the true rates of these groups: the noise of counting is taken out",
+    "lower",
+    "probability that the twin says nothing of what is recorded in this group, where it is above 1/2",
 )
-MODEL_R_OTHERS = _new(
-    "agreement.model.r_others",
-    "1",
-    "higher",
-    "the same over all groups of this kind; its interval is that of Pearson r",
-)
-MODEL_WITHIN = _new(
-    "agreement.model.r_within",
-    "1",
-    "higher",
-    "correlation of log-odds between groups of one task, noise of counting taken out",
-)
-MODEL_BETWEEN = _new(
-    "agreement.model.r_between",
-    "1",
-    "higher",
-    "correlation of the mean log-odds of tasks, noise of counting taken out",
-)
-MODEL_OPPOSED = _new(
-    "agreement.model.opposed",
-    "1",
-    "none",
-    "probability that the correlations within and between tasks have different signs",
-)
-MODEL_BIAS = _new(
-    "agreement.model.bias_pp",
+REGRET = _new(
+    "decision.regret_pp",
     "pp",
-    "none",
-    "mean true sim rate - true recorded rate of these groups",
+    "lower",
+    "recorded success rate of the best candidate less that of what the twin ranks first ({words}), mean over the tasks that all have",
 )
-MODEL_BIAS_OF_GROUP = _new(
-    "agreement.model.bias_pp.{task}.{condition}.{policy}",
-    "pp",
-    "none",
-    "true sim rate - true recorded rate of one group, drawn towards the others where it is small",
-)
-MODEL_GAIN = _new(
-    "gain.model.pp.{side}.average",
-    "pp",
-    "higher",
-    "gain with replanning ({side}), mean of tasks, in the model of all groups",
-)
-MODEL_GAIN_OF_TASK = _new(
-    "gain.model.pp.{side}.{task}.{policy}",
-    "pp",
-    "higher",
-    "gain with replanning ({side}) of one task in the model of all groups: drawn towards the others",
-)
-MODEL_BEST = _new(
-    "decision.model.best",
+WRONG_PAIRS = _new(
+    "decision.wrong_pairs",
     "1",
-    "higher",
-    "probability that what the twin calls best ({words}) has the highest recorded rate",
+    "lower",
+    "pairs of candidates that the twin orders wrongly or as level / pairs whose recorded rates differ{words}",
+)
+WRONG_BY = _new(
+    "decision.wrong_pairs_pp",
+    "pp",
+    "lower",
+    "mean recorded difference of the pairs that the twin orders wrongly{words}",
 )
 SPEARMAN = _agreement(
     "spearman_rho",
@@ -265,24 +180,6 @@ MMRV_RECORDED = _agreement(
     "1",
     "lower",
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
-)
-VARIED_R = _agreement(
-    "varied.pearson_r",
-    "1",
-    "higher",
-    "Pearson r of recorded rates and the twin's of varied replays (each trial's share that succeed, averaged) {what}",
-)
-VARIED_BIAS = _agreement(
-    "varied.bias_pp",
-    "pp",
-    "none",
-    "the twin's rate of varied replays - recorded rate, averaged {what}",
-)
-VARIED_MMRV = _agreement(
-    "varied.mmrv_recorded_gap",
-    "1",
-    "lower",
-    "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
 )
 # Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
 
@@ -353,12 +250,6 @@ BASELINE_GAIN_OF_TASK = _new(
     "higher",
     BASELINE_GAIN.definition,
 )
-BREAK_EVEN_PRICE = _new(
-    "gate.break_even_price",
-    "1",
-    "higher",
-    "bad executions avoided / good plans refused, by verdicts that were not obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
-)
 _WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
 BRIER = _new(
     "reliability.brier",
@@ -371,12 +262,6 @@ BRIER_OF_BASE_RATE = _new(
     "1",
     "none",
     "Brier score of always saying the observed success rate; above it the probability is worth nothing",
-)
-BRIER_PERFECT = _new(
-    "reliability.brier_perfect",
-    "1",
-    "none",
-    "Brier score of a perfect forecaster of the same probabilities, with the range of 95 % of what it would show over as many trials",
 )
 LABEL_AGREED = _new(
     "label.localised.rate",

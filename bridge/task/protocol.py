@@ -60,7 +60,7 @@ class Endpoint:
     """A question that the study answers, and what answers it."""
 
     kind: str
-    """difference: success of one arm less that of another over the same starts, McNemar's mid-p.
+    """difference: success of one arm less that of another, compared while the study goes on.
     agreement: the share of trials in which twin and outcome agree, its interval above ``limit``."""
     policy: str
     arm: str
@@ -112,7 +112,7 @@ class Protocol:
     model_address: str = ""
     """Of its server, without user and query."""
     stopping: str = "fixed"
-    """fixed: after all starts of every task; nobody looks before."""
+    """fixed: after all starts of every task. sequential: at the first look that decides."""
     retry: bool = False
     """Whether each failed execution is followed by one new start of the same trial."""
     void_causes: tuple[str, ...] = VOID_CAUSES

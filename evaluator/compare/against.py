@@ -12,7 +12,7 @@ from evaluator.compare.trial import Trial
 from evaluator.errors import EvaluatorError, UndefinedStatisticError
 from evaluator.result import Cell, Table
 from evaluator.statistics.agreement import pearson
-from evaluator.statistics.differences import mcnemar, tango_points
+from evaluator.statistics.differences import paired_points
 from evaluator.statistics.gate import brier
 
 
@@ -94,8 +94,8 @@ def against_tables(
         rows,
         id="against",
         title=f"{first} against {second} on the same {len(shared.rows)} trials",
-        note=f"Difference: {first} minus {second}. Accuracy: Tango's interval of pairs, p by "
-        f"McNemar's mid-p test; an interval that holds 0 shows no difference.{left}",
+        note=f"Difference: {first} minus {second}. Accuracy: Tango's interval of "
+        f"pairs; one that holds 0 shows no difference.{left}",
     )
     return (table, *_flips(shared, (first, second)), *_settings_table(trials, (first, second)))
 
@@ -105,13 +105,11 @@ def _differences(shared: SharedTrials, names: tuple[str, str]) -> list[dict[str,
     right = [answers[side] == recorded for side in (0, 1)]
     n = len(recorded)
     improved, worsened = int((right[0] & ~right[1]).sum()), int((right[1] & ~right[0]).sum())
-    points, tango = tango_points(improved, worsened, n)
-    pairs = list(zip(right[1].tolist(), right[0].tolist(), strict=True))
-    p = mcnemar(pairs).p_mid if improved + worsened else None
+    points, tango = paired_points(improved, worsened, n)
     rates = [float(mark.mean()) for mark in right]
     lines = [_line("accuracy", names, rates, points / 100, n)]
     lines[0]["low"], lines[0]["high"] = tango.low / 100, tango.high / 100
-    lines[0]["method"], lines[0]["p"] = tango.method, p
+    lines[0]["method"] = tango.method
     for name, of in _statistics(shared).items():
         values = [of(side) for side in (0, 1)]
         if None not in values:
@@ -135,7 +133,6 @@ def _line(
         "low": None,
         "high": None,
         "method": None,
-        "p": None,
         "trials": n,
     }
 

@@ -6,12 +6,12 @@ from evaluator.compare.measure import (
     RATE_COLUMNS,
     ends,
     rate_row,
-    vouched_rate,
 )
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import trials_in
 from evaluator.result import Cell, Measurement, Table
-from evaluator.statistics.differences import newcombe_difference, tango_points
+from evaluator.statistics.differences import paired_points, unpaired_points
+from evaluator.statistics.intervals import RATE_INTERVALS
 
 MOST_VALUES = 40
 """Values of one axis that a table lists; an axis with more is a number, not a setting."""
@@ -39,7 +39,7 @@ def axis_tables(
     )
     note = (
         "Agreement is over trials where both sides are known. The gap is of pairs (Tango) where "
-        "there are any, else of each side's own trials (Newcombe). One axis at a time: what "
+        "there are any, else of each side's own trials (score). One axis at a time: what "
         "varies together is not told apart here."
     )
     return (
@@ -56,16 +56,15 @@ def axis_tables(
 def _axis_line(rows: Sequence[TrialRow], method: str) -> tuple[Cell, ...]:
     both = [row for row in rows if row.recorded is not None and row.sim_planned is not None]
     agree, n = trials_in(row for row in both if row.recorded == row.sim_planned), trials_in(both)
-    interval, why = vouched_rate(agree, n, method) if n else (None, "no trial has both sides")
     rate = Measurement(
         id="agree",
         unit="1",
         definition="sim and outcome agree",
         value=agree / n if n else None,
-        interval=interval,
+        interval=RATE_INTERVALS[method](agree, n) if n else None,
         k=agree,
         n=n,
-        reason_if_undefined=None if n else why,
+        reason_if_undefined=None if n else "no trial has both sides",
     )
     real, sim = _counts(rows, "recorded", both), _counts(rows, "sim_planned", both)
     if not (real[1] and sim[1]):
@@ -73,12 +72,11 @@ def _axis_line(rows: Sequence[TrialRow], method: str) -> tuple[Cell, ...]:
     elif both:
         improved = trials_in(row for row in both if row.sim_planned and not row.recorded)
         worsened = trials_in(row for row in both if row.recorded and not row.sim_planned)
-        points, tango = tango_points(improved, worsened, n)
+        points, tango = paired_points(improved, worsened, n)
         gap = (points, tango.low, tango.high, tango.method)
     else:
-        newcombe = newcombe_difference(*real, *sim)
-        points = 100 * (sim[0] / sim[1] - real[0] / real[1])
-        gap = (points, *ends(newcombe, 100.0), newcombe.method)
+        points, score = unpaired_points(real, sim)
+        gap = (points, *ends(score), score.method)
     rates = [None if not n_side else k_side / n_side for k_side, n_side in (real, sim)]
     return (trials_in(rows), *rate_row(rate), *rates, *gap)
 

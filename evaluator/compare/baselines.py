@@ -32,7 +32,7 @@ from evaluator.measurements import (
 from evaluator.metrics.geometric_rule import judge_by_geometry
 from evaluator.result import Cell, Measurement, Table
 from evaluator.run_reader.object_states import AFTER
-from evaluator.statistics.differences import tango_points
+from evaluator.statistics.differences import paired_points
 from evaluator.statistics.gate import Confusion
 
 TWIN = "twin"
@@ -184,7 +184,7 @@ def _gain(
     quantity = BASELINE_GAIN if task == ALL_TASKS else BASELINE_GAIN_OF_TASK
     return measured(
         quantity.of(by=by, baseline=name, task=task, words=words),
-        partial(tango_points, better, worse, n),
+        partial(paired_points, better, worse, n),
         n=n,
         counted="trial",
         episodes=names_of(rows),

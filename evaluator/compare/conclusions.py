@@ -5,61 +5,58 @@ And what it could not have seen: the smallest difference that so many trials wou
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 from evaluator.compare.agreement import usable_groups
 from evaluator.compare.measure import ends
-from evaluator.compare.model import model_of
+from evaluator.compare.policies import Answer, Candidate
 from evaluator.compare.rows import RateGroup, TrialRow
 from evaluator.compare.success import trials_in
-from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Cell, Interval, Table
-from evaluator.statistics.differences import (
-    mean_of_intervals,
-    newcombe_difference,
-    tango_points,
-)
-from evaluator.statistics.hierarchical import estimate
-from evaluator.statistics.power import detectable_rate, trials_needed
+from evaluator.statistics.differences import points_of
+from evaluator.statistics.intervals import normal_quantile
+from evaluator.statistics.sequential import ALPHA, POWER, Stratum
 
 MOST_TASKS = 200
 """Tasks that get a line of their own; more are a sample, and the model speaks of it."""
-UNREACHABLE = 5000
-"""Trials beyond which nobody asks."""
 
 
 def conclusions_table(
-    groups: Sequence[RateGroup], rows: Sequence[TrialRow] = ()
+    groups: Sequence[RateGroup], answers: Sequence[Answer], rows: Sequence[TrialRow] = ()
 ) -> tuple[Table, ...]:
     """Lay out for each task what its numbers mean; none without groups that have both rates.
 
-    The bias is the model's where there are counts and three groups, else of the pairs (Tango) or
-    of both sides' own trials (Newcombe), over two groups their mean (Zou and Donner). The ranking
-    is settled when the interval of the recorded difference of the best and the next leaves zero
-    out.
+    The bias is of pairs, else of both sides' own trials, over a task's groups. The ranking is
+    settled when the comparison of the best and the next is decided.
     """
     usable = usable_groups(groups)
     tasks = list(dict.fromkeys(group.task for group in usable))
     if not tasks or len(tasks) > MOST_TASKS:
         return ()
-    lines = [_line(task, usable, rows) for task in tasks]
+    lines = [_line(task, usable, answers, rows) for task in tasks]
     note = (
         "Bias: sim minus recorded, mean of the task's groups. A yes: trials in which sim said "
         "success, and those that then succeeded; beside it what succeeded whatever sim said. "
         "Ranked: whether the recorded trials settle which candidate is best; more trials, of the "
-        "best and the next together, that would with 80 % power if the rates are as they look. "
+        "best and the next together, after which the comparison is likely to be decided. "
         "Smallest: the difference of two candidates, and of sim and recorded, that so many trials "
         "would show with 80 % power (unpaired)."
     )
     return (Table.of(lines, id="conclusions", title="What it means, task by task", note=note),)
 
 
-def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> dict[str, Cell]:
+def _line(
+    task: str,
+    usable: Sequence[RateGroup],
+    answers: Sequence[Answer],
+    rows: Sequence[TrialRow],
+) -> dict[str, Cell]:
     members = [group for group in usable if group.task == task]
-    bias, interval = _bias(task, members, usable)
+    bias, interval = _bias(members)
     judged = [r for r in rows if r.task == task and None not in (r.sim_planned, r.recorded)]
     accepted = [row for row in judged if row.sim_planned]
-    best, ranked, more = _ranking(members)
+    single = len({group.task for group in usable}) == 1
+    mine = [each for each in answers if each.task == task or (single and not each.task)]
+    best, ranked, more = _ranking(members, mine)
     n = [group.recorded.n for group in members if group.recorded.n]
     sim_n = [group.sim.n for group in members if group.sim.n]
     return {
@@ -82,43 +79,30 @@ def _line(task: str, usable: Sequence[RateGroup], rows: Sequence[TrialRow]) -> d
     }
 
 
-def _bias(
-    task: str, members: Sequence[RateGroup], usable: Sequence[RateGroup]
-) -> tuple[float, Interval | None]:
+def _bias(members: Sequence[RateGroup]) -> tuple[float, Interval | None]:
     gaps = [float((g.sim_rate or 0) - (g.recorded_rate or 0)) for g in members]
     value = 100 * sum(gaps) / len(gaps)
-    try:
-        model = model_of(usable)
-        places = [place for place, group in enumerate(usable) if group.task == task]
-        found = estimate(model.draws.gap[:, places].mean(axis=1))
-    except UndefinedStatisticError:
-        return value, _counted(members)
-    return 100 * found.mean, found.interval(100.0)
-
-
-def _counted(members: Sequence[RateGroup]) -> Interval | None:
-    """The interval of the mean gap from each group's own counts, as if none shared a trial."""
-    gaps = [100 * float((g.sim_rate or 0) - (g.recorded_rate or 0)) for g in members]
-    found = [_of_group(group) for group in members]
-    known = [each for each in found if each is not None]
+    strata = [_counted(group) for group in members]
+    known = [each for each in strata if each is not None]
     if len(known) < len(members):
-        return None
-    return known[0] if len(known) == 1 else mean_of_intervals(gaps, known)
+        return value, None
+    return points_of(known)
 
 
-def _of_group(group: RateGroup) -> Interval | None:
+def _counted(group: RateGroup) -> Stratum | None:
+    """The twin's trials against the recorded ones: pairs where each trial has both sides."""
     if group.trial_table is not None and any(group.trial_table):
-        both, only_sim, only_recorded, neither = group.trial_table
-        n = both + only_sim + only_recorded + neither
-        return tango_points(only_sim, only_recorded, n)[1]
+        _, only_sim, only_recorded, _ = group.trial_table
+        return Stratum(improved=only_sim, worsened=only_recorded, pairs=sum(group.trial_table))
     real, sim = group.recorded, group.sim
     if real.k is None or not real.n or sim.k is None or not sim.n:
         return None
-    found = newcombe_difference(real.k, real.n, sim.k, sim.n)
-    return replace(found, low=100 * found.low, high=100 * found.high)
+    return Stratum(first=(real.k, real.n), second=(sim.k, sim.n))
 
 
-def _ranking(members: Sequence[RateGroup]) -> tuple[str | None, str | None, int | None]:
+def _ranking(
+    members: Sequence[RateGroup], answers: Sequence[Answer]
+) -> tuple[str | None, str | None, int | None]:
     """Return the best candidate as recorded, whether that is settled, and how many more trials."""
     if len(members) < 2:
         return None, None, None
@@ -127,28 +111,29 @@ def _ranking(members: Sequence[RateGroup]) -> tuple[str | None, str | None, int 
     name = ", ".join(part for part in (first.condition, first.policy) if part).replace("_", " ")
     if first.recorded_rate == second.recorded_rate:
         return None, "tie", None
-    a, b = first.recorded, second.recorded
-    if a.k is None or not a.n or b.k is None or not b.n:
+    if first.recorded.n is None or second.recorded.n is None:
         return name, "no n", None
-    if newcombe_difference(b.k, b.n, a.k, a.n).low > 0:
-        return name, "yes", 0
-    try:
-        needed = trials_needed(b.k / b.n, a.k / a.n)
-    except UndefinedStatisticError:
+    pair = {Candidate(policy=g.policy, condition=g.condition) for g in (first, second)}
+    found = [e for e in answers if {e.question.first, e.question.second} == pair]
+    if not found:
         return name, "no", None
-    more = max(0, needed - a.n) + max(0, needed - b.n)
-    return name, "no", more if 0 < more < UNREACHABLE else None
+    reading = found[0].reading
+    if reading.better:
+        return name, "yes", 0
+    return name, "no", None if reading.more is None else 2 * reading.more
 
 
 def _smallest(members: Sequence[RateGroup], n: int) -> float | None:
     """The smallest difference [pp] to a rate like these that n trials on each side would show."""
     rates = [float(group.recorded_rate or 0) for group in members]
     middle = sum(rates) / len(rates)
-    below = min(middle, 1 - middle)  # towards the middle there is more room
-    try:
-        return 100 * (detectable_rate(below, n) - below)
-    except UndefinedStatisticError:
-        return None
+    low = min(middle, 1 - middle)  # towards the middle there is more room
+    reach = normal_quantile(1 - ALPHA / 2) + normal_quantile(POWER)
+    found = 1.0
+    for _ in range(40):
+        mean = min(1.0, low + found / 2)
+        found = min(1.0, reach * math.sqrt(2 * mean * (1 - mean) / n)) if n else 1.0
+    return None if found > 1 - low - 1e-9 else 100 * found
 
 
 def direction(low: float | None, high: float | None) -> str:

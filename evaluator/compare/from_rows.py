@@ -4,22 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from bridge.episode.executions import NO_PLAN
-from bridge.task.protocol import VOID_CAUSES
-from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
+from bridge.task.protocol import VOID_CAUSES, Protocol
+from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.axes import axis_tables
 from evaluator.compare.baselines import baseline_results
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.gains import (
-    gain_tests,
-    pair_starts,
-    paired_gain,
-    replanning_gains,
-    start_distances,
-)
-from evaluator.compare.gate import agreement, gate_scorecard, reliability
+from evaluator.compare.gains import replanning_gains
+from evaluator.compare.gate import agreement, reliability
 from evaluator.compare.measure import refuse_alike
-from evaluator.compare.model import model_results
 from evaluator.compare.notes import notes, notes_table
+from evaluator.compare.policies import Answer, compare_policies, comparison_part
+from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, RateGroup, TrialRow
 from evaluator.compare.stages import failures_table, stage_results
 from evaluator.compare.study import study_results
@@ -27,7 +22,6 @@ from evaluator.compare.success import (
     WITH,
     WITHOUT,
     averages,
-    never_sent,
     rate_groups,
     side_rates,
     trials_in,
@@ -40,7 +34,6 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
-from evaluator.compare.varied_agreement import varied_agreement
 from evaluator.result import Exclusion, Measurement, Table
 
 
@@ -53,6 +46,9 @@ class _Found:
     exclusions: tuple[Exclusion, ...]
     gains: list[Measurement]
     study_tables: tuple[Table, ...]
+    answers: list[Answer]
+    """Which candidate is better."""
+    compared_tables: tuple[Table, ...]
     gate_tables: tuple[Table, ...]
     """The gate's scorecard."""
     stage_tables: tuple[Table, ...]
@@ -66,6 +62,7 @@ def compare_rows(
     stand_in: bool | None,
     method: str = "wilson",
     void_causes: Sequence[str] = VOID_CAUSES,
+    protocol: Protocol | None = None,
 ) -> Comparison:
     """Measure everything that follows from trial rows alone, wherever they came from."""
     empty = Comparison(run=run, source=source, stand_in=stand_in)
@@ -73,7 +70,7 @@ def compare_rows(
         return empty
     for kind in ("task", "condition", "policy"):
         refuse_alike(kind, ((getattr(row, kind), row.episode) for row in rows))
-    found = _measure(rows, method, void_causes)
+    found = _measure(rows, method, void_causes, protocol)
     return replace(
         empty,
         rows=tuple(rows),
@@ -85,12 +82,17 @@ def compare_rows(
     )
 
 
-def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) -> _Found:
+def _measure(
+    rows: Sequence[TrialRow],
+    method: str,
+    void_causes: Sequence[str],
+    protocol: Protocol | None,
+) -> _Found:
     rates = side_rates(rows, method=method)
     groups = rate_groups(rows, rates, method=method)
-    gains = replanning_gains(groups, method=method)
-    pairs, unpaired = pair_starts(rows)
-    scorecard, scorecard_tables = gate_scorecard(rows)
+    gains = replanning_gains(groups)
+    answers = compare_policies(rows, protocol, void_causes)
+    compared = comparison_part(answers, protocol)
     beside, beside_tables = baseline_results(rows)
     stages, stage_tables, other_stages = stage_results(rows)
     study, study_tables, void = study_results(rows, void_causes, method=method)
@@ -101,26 +103,23 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *agreement(rows, method=method),
         *group_agreement(groups),
         *gains,
-        *gain_tests(groups),
         *varied_sim(rows),
-        *varied_agreement(rows, groups),
         *study,
-        *paired_gain(pairs),
-        *start_distances(pairs),
-        *never_sent(rows),
+        *compared.measurements,
+        *regret_results(usable_groups(groups)),
         *beside,
-        *scorecard,
         *reliability(rows),
         *stages,
-        *model_results(usable_groups(groups)),
     )
     return _Found(
         groups=groups,
         measurements=measurements,
-        exclusions=(*unpaired, *void, *other_stages),
+        exclusions=(*void, *other_stages),
         gains=gains,
         study_tables=study_tables,
-        gate_tables=(*beside_tables, *scorecard_tables),
+        answers=answers,
+        compared_tables=compared.tables,
+        gate_tables=beside_tables,
         stage_tables=stage_tables,
     )
 
@@ -129,13 +128,13 @@ def _tables(rows: Sequence[TrialRow], found: _Found, word: str) -> tuple[Table, 
     """Lay out what was found; ``word`` is what the recorded side is called."""
     groups, measurements = found.groups, found.measurements
     return (
-        *conclusions_table(groups, rows),
+        *found.compared_tables,
+        *conclusions_table(groups, found.answers, rows),
         success_table(groups, word),
         *layout_table(groups, measurements, word),
         *gains_table(found.gains, word),
         *found.study_tables,
         *notes_table(notes(groups, measurements)),
-        *agreement_intervals(groups),
         confusion_table(rows, word),
         *found.gate_tables,
         *found.stage_tables,

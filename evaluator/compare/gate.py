@@ -1,4 +1,4 @@
-"""Trial by trial: does what the twin said agree with what happened, and does the gate pay?"""
+"""Trial by trial: does what the twin said agree with what happened?"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -9,34 +9,15 @@ from evaluator.compare.rows import TrialRow
 from evaluator.compare.success import WITH, WITHOUT, Answer, names_of
 from evaluator.measurements import (
     AGREED,
-    BREAK_EVEN_PRICE,
     BRIER,
     BRIER_OF_BASE_RATE,
-    BRIER_PERFECT,
     KAPPA,
     NPV,
     PHI,
     PPV,
 )
-from evaluator.result import Interval, Measurement, Table
-from evaluator.statistics.calibration import (
-    Perfect,
-    brier_interval,
-    perfect_forecaster,
-)
-from evaluator.statistics.gate import (
-    Confusion,
-    break_even,
-    brier,
-    brier_of_base_rate,
-    cost_curve,
-    kappa,
-    phi,
-)
-from evaluator.statistics.intervals import LEVEL
-
-REFUSAL_PRICES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)
-"""Of refusing a good plan, in bad executions, at which the gate is priced."""
+from evaluator.result import Measurement
+from evaluator.statistics.gate import Confusion, brier, brier_of_base_rate, kappa, phi
 
 
 def agreement(rows: Sequence[TrialRow], *, method: str = "wilson") -> list[Measurement]:
@@ -119,41 +100,6 @@ def _agreement_of(
     ]
 
 
-def gate_scorecard(rows: Sequence[TrialRow]) -> tuple[list[Measurement], tuple[Table, ...]]:
-    """Price the gate on the trials in which it was asked and not obeyed."""
-    asked = [r for r in rows if unheeded_verdict(r) is not None and r.recorded is not None]
-    counts = confusion_of(asked, unheeded_verdict)
-    measurements = [
-        measured(
-            BREAK_EVEN_PRICE.of(),
-            lambda: break_even(counts),
-            n=counts.n,
-            counted="trial",
-            reason_without_interval="a ratio of two counts, both in the confusion table",
-            episodes=names_of(asked),
-        ),
-    ]
-    return measurements, _cost_table(counts) if counts.n else ()
-
-
-def _cost_table(counts: Confusion) -> tuple[Table, ...]:
-    return (
-        Table(
-            id="gate_costs",
-            title="What the gate costs and avoids",
-            columns=("price of refusing a good plan", "obeying the gate", "executing everything"),
-            rows=tuple(
-                (cost.refusal_price, round(cost.with_gate, 4), round(cost.without_gate, 4))
-                for cost in cost_curve(counts, REFUSAL_PRICES)
-            ),
-            note=f"Mean cost per trial in bad executions, over {counts.n} trials in which the gate "
-            f"was asked and not obeyed: {counts.true_negative} bad executions avoided, "
-            f"{counts.false_negative} good plans refused, {counts.false_positive} bad plans let "
-            "through.",
-        ),
-    )
-
-
 def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
     """Judge the sampled success probability against the outcomes; nothing where none was said."""
     seen = [
@@ -167,13 +113,12 @@ def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
     make = partial(
         measured, n=len(seen), counted="trial", episodes=[episode for episode, _, _ in seen]
     )
-    ideal = perfect_forecaster(probabilities)
     measurements = [
         make(
             BRIER.of(),
-            lambda: (brier(probabilities, happened), brier_interval(probabilities, happened)),
+            lambda: brier(probabilities, happened),
+            reason_without_interval="beside it stands what knowing nothing reaches",
         ),
-        make(BRIER_PERFECT.of(), lambda: _shown(ideal), reason_without_interval=CERTAIN),
         make(
             BRIER_OF_BASE_RATE.of(),
             lambda: brier_of_base_rate(happened),
@@ -181,13 +126,3 @@ def reliability(rows: Sequence[TrialRow]) -> list[Measurement]:
         ),
     ]
     return measurements
-
-
-CERTAIN = "every stated probability is 0 or 1: a perfect forecaster shows nothing else"
-
-
-def _shown(perfect: Perfect) -> float | tuple[float, Interval]:
-    if perfect.low == perfect.high:
-        return perfect.mean
-    range_ = Interval(low=perfect.low, high=perfect.high, level=LEVEL, method="perfect-forecaster")
-    return perfect.mean, range_

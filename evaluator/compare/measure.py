@@ -8,7 +8,6 @@ from typing import TypeVar
 from evaluator.errors import AlikeNamesError, UndefinedStatisticError
 from evaluator.measurements import Defined, slug
 from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.coverage import Size, vouch
 from evaluator.statistics.intervals import RATE_INTERVALS
 
 Item = TypeVar("Item")
@@ -103,21 +102,14 @@ def measured(
     counted: str | None = None,
     reason_without_interval: str | None = None,
     episodes: Iterable[str] = (),
-    interval_n: Size | None = None,
-    coverage_key: str = "",
-    instead: str = "",
 ) -> Measurement:
     """Compute one statistic; ``compute`` gives a value, or a value with its interval.
 
     What is not finite is undefined and says so: one broken pose must not end an evaluation.
-    An interval that covers too little at ``interval_n`` (``n`` without it) is left out, with why
-    and what to use ``instead``.
 
     Args:
         compute: Gives the value, or the value with its interval; refuses by
             ``UndefinedStatisticError``.
-        interval_n: What the coverage of the interval depends on, where it is not ``n``.
-        coverage_key: Name in ``coverage.HOLDS_FROM``, where one method serves several statistics.
     """
     value: float | None = None
     interval: Interval | None = None
@@ -130,10 +122,6 @@ def measured(
     if value is not None and not math.isfinite(value):
         value, interval = None, None
         reason = "the recorded or replayed data hold values that are not finite"
-    if interval is not None:
-        size = n if interval_n is None else interval_n
-        interval, refusal = vouch(interval, size, key=coverage_key, instead=instead)
-        reason_without_interval = refusal or reason_without_interval
     return Measurement(
         **vars(defined),
         value=value,
@@ -157,20 +145,13 @@ def proportion(
     method: str = "wilson",
 ) -> Measurement:
     """Measure k/n with its interval, Wilson's unless another was asked for; undefined for n = 0."""
-    interval, refusal = vouched_rate(k, n, method) if n else (None, "")
     return Measurement(
         **vars(defined),
         value=k / n if n else None,
-        interval=interval,
+        interval=RATE_INTERVALS[method](k, n) if n else None,
         k=k,
         n=n,
         counted=counted,
         reason_if_undefined=None if n else reason_if_undefined,
-        reason_without_interval=refusal or None,
         episodes=tuple(episodes),
     )
-
-
-def vouched_rate(k: int, n: int, method: str) -> tuple[Interval | None, str]:
-    """Return the interval of k/n by a named method, or None and why it is not printed."""
-    return vouch(RATE_INTERVALS[method](k, n), n)

@@ -6,23 +6,17 @@ from fractions import Fraction
 from itertools import chain, groupby
 from typing import Any
 
+from evaluator.compare.agreement import SAYS_NOTHING
 from evaluator.compare.rows import RateGroup
 from evaluator.compare.trial import Trial
 from evaluator.errors import UndefinedStatisticError
 from evaluator.result import Measurement, Table
 from evaluator.run_reader.episodes import DerivedFile
 from evaluator.statistics.agreement import within_and_between
-from evaluator.statistics.hierarchical import METHOD
 
-SIGNIFICANT = 0.05
 LARGE_BIAS_PP = 5.0
 HIGH_R = 0.8
 FEW_GROUPS = 4
-
-SHARED_TASKS = (
-    "groups share tasks: simulated with few of them, the interval of r held the truth in 42 of 48 "
-    "studies of the two worst kinds (docs/metrics.md)"
-)
 
 Note = tuple[str, str]
 """About what, and the sentence."""
@@ -35,10 +29,10 @@ def notes(groups: Sequence[RateGroup], measurements: Sequence[Measurement]) -> l
         *_opposed(groups, by_id),
         *_units(groups),
         *_few_groups(by_id),
-        *_shared_tasks(groups, by_id),
+        *_says_nothing(by_id),
+        *_blind(by_id),
         *_hidden_bias(by_id),
         *_two_gains(by_id),
-        *_power(by_id),
     ]
 
 
@@ -85,20 +79,26 @@ def _few_groups(by_id: dict[str, Measurement]) -> list[Note]:
         (name, f"r over {m.n} groups has no interval: few points that rise together give a high r")
         for name, m in by_id.items()
         if name.startswith("agreement.pearson_r")
-        and not name.endswith("remeasured")
         and m.value is not None
         and (m.n or 0) < FEW_GROUPS
     ]
 
 
-def _shared_tasks(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list[Note]:
-    """Say that the model's interval of r is too narrow where groups share tasks."""
-    r = by_id.get("agreement.pearson_r")
-    if r is None or r.interval is None or not r.interval.method.startswith(METHOD):
-        return []
-    if len({group.task for group in groups}) == len(groups):
-        return []
-    return [("agreement.pearson_r", SHARED_TASKS)]
+def _says_nothing(by_id: dict[str, Measurement]) -> list[Note]:
+    return [
+        (name, f"the interval of r is {i.high - i.low:.2f} wide, of 2 possible: it says nothing")
+        for name, m in by_id.items()
+        if name.startswith("agreement.pearson_r") and (i := m.interval) is not None
+        if i.high - i.low >= SAYS_NOTHING
+    ]
+
+
+def _blind(by_id: dict[str, Measurement]) -> list[Note]:
+    return [
+        (name, f"the twin is probably blind here ({m.value:.2f}): {m.definition}")
+        for name, m in by_id.items()
+        if name.startswith("agreement.blind.") and m.value is not None
+    ]
 
 
 def _hidden_bias(by_id: dict[str, Measurement]) -> list[Note]:
@@ -125,9 +125,7 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
         within, between = within_and_between(list(tasks.values()))
     except UndefinedStatisticError:
         return []
-    inside, across = (by_id.get(f"agreement.model.r_{name}") for name in ("within", "between"))
-    disjoint = _disjoint(inside, across)
-    if within * between >= 0 and not disjoint:
+    if within * between >= 0:
         return []
     r = by_id.get("agreement.pearson_r")
     whole = (
@@ -136,21 +134,9 @@ def _opposed(groups: Sequence[RateGroup], by_id: dict[str, Measurement]) -> list
     text = (
         f"{whole}inside tasks r = {within:.2f}, between tasks r = {between:.2f} (Simpson's paradox)"
     )
-    opposed = by_id.get("agreement.model.opposed")
-    if disjoint:
-        text += "; without the noise of counting their intervals do not meet"
-    elif opposed is not None and opposed.value is not None:
-        text += f"; that the signs really differ has a probability of {opposed.value:.2f}"
     if within < 0:
         text += ". Inside a task, what the twin ranks higher did worse: do not choose by it"
     return [("agreement.pearson_r", text)]
-
-
-def _disjoint(first: Measurement | None, second: Measurement | None) -> bool:
-    """Whether two numbers have intervals that do not meet."""
-    if first is None or second is None or first.interval is None or second.interval is None:
-        return False
-    return first.interval.high < second.interval.low or second.interval.high < first.interval.low
 
 
 def _two_gains(by_id: dict[str, Measurement]) -> list[Note]:
@@ -163,27 +149,6 @@ def _two_gains(by_id: dict[str, Measurement]) -> list[Note]:
         "same recorded gain"
     )
     return [("gain", text)]
-
-
-def _power(by_id: dict[str, Measurement]) -> list[Note]:
-    found = []
-    for name, p in by_id.items():
-        if not name.startswith("unpaired.boschloo_p.recorded.") or name.endswith(".pooled"):
-            continue
-        group = name.removeprefix("unpaired.boschloo_p.recorded.")
-        needed = by_id.get(f"power.trials_needed.recorded.{group}")
-        gain = by_id.get(f"gain.pp.recorded.{group}")
-        if p.value is None or p.value < SIGNIFICANT or gain is None or not gain.value:
-            continue  # no gain at all is nothing that more trials would show
-        change = "a gain" if gain.value > 0 else "a loss"
-        text = (
-            f"{p.n} {p.counted}s per condition do not show {change} of {gain.value:+.0f} pp "
-            f"(Boschloo p = {p.value:.2f})"
-        )
-        if needed is not None and needed.value is not None:
-            text += f"; {needed.value:.0f} per condition would, with 80 % power"
-        found.append((group.removesuffix(".-"), f"underpowered: {text}"))
-    return found
 
 
 ABOUT = "replays"

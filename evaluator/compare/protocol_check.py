@@ -1,29 +1,19 @@
-"""A study against its locked protocol: every departure, and the answers to its questions."""
+"""A study against its locked protocol: every departure from it."""
 
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from scipy.special import ndtr
-
 from bridge.episode.metadata import treatment_of
 from bridge.task.protocol import FILE_NAME, Endpoint, Protocol
-from evaluator.compare.measure import Part, ends, measured, vouched_rate
+from evaluator.compare.measure import Part, measured
+from evaluator.compare.policies import Answer
 from evaluator.compare.rows import TrialRow, in_order
 from evaluator.compare.study import study_starts
 from evaluator.compare.success import CONDITION_OF_ARM
-from evaluator.errors import UndefinedStatisticError
-from evaluator.result import Cell, Exclusion, Interval, Measurement, Table
-from evaluator.statistics.differences import sign_test, tango_points
-from evaluator.statistics.planning import holm
-from evaluator.study_measurements import (
-    PROTOCOL_AGREEMENT,
-    PROTOCOL_AGREEMENT_P,
-    PROTOCOL_DEPARTURES,
-    PROTOCOL_DIFFERENCE,
-    PROTOCOL_DIFFERENCE_P,
-)
+from evaluator.result import Cell, Exclusion, Table
+from evaluator.study_measurements import PROTOCOL_DEPARTURES
 
 ARM_OF_CONDITION = {condition: arm for arm, condition in CONDITION_OF_ARM.items()}
 NO_HASH = "0" * 64
@@ -61,11 +51,16 @@ def protocol_results(
     rows: Sequence[TrialRow],
     protocol: Protocol | None,
     *,
+    answers: Sequence[Answer] = (),
     method: str = "wilson",
     left_out: Sequence[Exclusion] = (),
     task_hashes: Mapping[str, frozenset[str]] | None = None,
 ) -> Part:
-    """Compare a study with its design, and answer the design's questions; nothing without one."""
+    """Compare a study with its design; nothing without one.
+
+    Args:
+        answers: What the comparisons say that the design asked for.
+    """
     if protocol is None or protocol.primary is None:
         return Part()
     mine = [row for row in rows if row.study_arm]
@@ -77,10 +72,7 @@ def protocol_results(
         *_of_order(mine, protocol),
         *_of_exclusions(mine, protocol, left_out),
     ]
-    answers = _answers(mine, protocol, method)
-    if answers[0].p is None:
-        why = answers[0].reason
-        found.append(_Departure("primary question", answers[0].question, "an answer", why))
+    found += _unanswered(answers, protocol.primary)
     count = measured(
         PROTOCOL_DEPARTURES.of(),
         lambda: float(len(found)),
@@ -89,8 +81,8 @@ def protocol_results(
         reason_without_interval="a count",
     )
     return Part(
-        measurements=(count, *_measured(answers[0], protocol)),
-        tables=(_answer_table(answers, protocol), _departure_table(found, protocol)),
+        measurements=(count,),
+        tables=(_departure_table(found, protocol),),
     )
 
 
@@ -197,164 +189,16 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Answer:
-    """What the data say to one question."""
-
-    role: str
-    question: str
-    endpoint: Endpoint
-    n: int
-    value: float | None
-    """Percentage points, or a share of 1."""
-    interval: Interval | None
-    p: float | None
-    reason: str = ""
-    words: str = ""
-    episodes: tuple[str, ...] = ()
-
-
-def _answers(rows: Sequence[TrialRow], protocol: Protocol, method: str) -> list[_Answer]:
-    """Answer the primary question, it again in each task, then the secondary ones."""
-    starts, _ = study_starts(rows, protocol.void_causes)
-    used = {start.trials[arm].episode for start in starts for arm in start.trials}
-    kept = [row for row in rows if row.episode in used]
-    primary = protocol.primary
-    if primary is None:
-        return []
-    found = [_answer(kept, primary, "primary", "", method)]
-    if len(protocol.tasks) > 1:
-        found += [
-            _answer(
-                [row for row in kept if row.task == task.task], primary, "task", task.task, method
-            )
-            for task in protocol.tasks
-        ]
-    return found + [_answer(kept, each, "secondary", "", method) for each in protocol.secondary]
-
-
-def _answer(
-    rows: Sequence[TrialRow], endpoint: Endpoint, role: str, task: str, method: str
-) -> _Answer:
-    answer = _agreement if endpoint.kind == "agreement" else _difference
-    question = endpoint.words if not task else f"{task}: {endpoint.words}"
-    return replace(answer(rows, endpoint, method), role=role, question=question)
-
-
-def _difference(rows: Sequence[TrialRow], endpoint: Endpoint, _: str) -> _Answer:
-    """Count starts by both outcomes; what was not executed is a failure of its arm."""
-    sides = [
-        {(row.task, row.start_id): row for row in rows if (row.policy, row.study_arm) == arm}
-        for arm in (
-            (endpoint.against_policy, endpoint.against_arm),
-            (endpoint.policy, endpoint.arm),
-        )
-    ]
-    both = [key for key in sides[0] if key in sides[1]]
-    outcomes = [(sides[0][key].recorded is True, sides[1][key].recorded is True) for key in both]
-    improved = sum(after and not before for before, after in outcomes)
-    worsened = sum(before and not after for before, after in outcomes)
-    empty = _Answer(
-        role="", question="", endpoint=endpoint, n=len(both), value=None, interval=None, p=None
-    )
-    if not both:
-        return replace(empty, reason="no start was tried in both arms")
-    value, interval = tango_points(improved, worsened, len(both))
-    p = sign_test(improved, worsened)[1] if improved + worsened else 1.0
-    words = f"{improved} improved, {worsened} worsened of {len(both)} starts"
-    episodes = tuple(side[key].episode for key in both for side in sides)
-    return replace(empty, value=value, interval=interval, p=p, words=words, episodes=episodes)
-
-
-def _agreement(rows: Sequence[TrialRow], endpoint: Endpoint, method: str) -> _Answer:
-    """Test the share of trials in which twin and outcome agree against the limit."""
-    known = [
-        row
-        for row in rows
-        if (row.policy, row.study_arm) == (endpoint.policy, endpoint.arm)
-        and row.recorded is not None
-        and row.sim_planned is not None
-    ]
-    agreed, n = sum(row.recorded == row.sim_planned for row in known), len(known)
-    empty = _Answer(role="", question="", endpoint=endpoint, n=n, value=None, interval=None, p=None)
-    if not n:
-        return replace(empty, reason="no trial has a decided replay and an outcome")
-    share, limit = agreed / n, endpoint.limit
-    sd = (limit * (1 - limit) / n) ** 0.5
-    z = (share - limit) / sd if sd else (float("inf") if share > limit else 0.0)
-    p = 2 * (1 - float(ndtr(z))) if z > 0 else 1.0
-    interval, _ = vouched_rate(agreed, n, method)
-    words = f"{agreed} of {n} trials"
-    episodes = tuple(row.episode for row in known)
-    return replace(empty, value=share, interval=interval, p=p, words=words, episodes=episodes)
-
-
-def _measured(answer: _Answer, protocol: Protocol) -> list[Measurement]:
-    """Return value and p of the primary question."""
-
-    def known(value: float | None) -> float:
-        if value is None:
-            raise UndefinedStatisticError(statistic="primary question", reason=answer.reason)
-        return value
-
-    agreement = answer.endpoint.kind == "agreement"
-    value = PROTOCOL_AGREEMENT if agreement else PROTOCOL_DIFFERENCE
-    test = PROTOCOL_AGREEMENT_P if agreement else PROTOCOL_DIFFERENCE_P
-    about = f"{answer.question}: {answer.words or answer.reason}"
-    counted = "trial" if agreement else "pair"
-    return [
-        measured(
-            value.of(about=about),
-            lambda: (known(answer.value), answer.interval),
-            n=answer.n,
-            counted=counted,
-            episodes=answer.episodes,
-        ),
-        measured(
-            test.of(about=about, alpha=protocol.alpha),
-            lambda: known(answer.p),
-            n=answer.n,
-            counted=counted,
-            reason_without_interval="a p-value",
-            episodes=answer.episodes,
-        ),
-    ]
-
-
-def _answer_table(answers: Sequence[_Answer], protocol: Protocol) -> Table:
-    """Lay all questions out; Holm over tasks and secondary ones, the primary one stands alone."""
-    others = [each for each in answers[1:] if each.p is not None]
-    adjusted = dict(zip(map(id, others), holm([each.p or 0.0 for each in others]), strict=True))
-    rows: list[dict[str, Cell]] = []
-    for each in answers:
-        factor = 100.0 if each.endpoint.kind == "agreement" else 1.0
-        low, high = ends(each.interval, factor)
-        p = each.p if each.role == "primary" else adjusted.get(id(each))
-        shown = "not answered" if p is None else "shown" if p <= protocol.alpha else "not shown"
-        if each.endpoint.kind == "difference" and shown == "shown":
-            shown = "better" if (each.value or 0) > 0 else "worse"
-        rows.append(
-            {
-                "question": each.question,
-                "role": each.role,
-                "n": each.n,
-                "value (pp or %)": None if each.value is None else round(factor * each.value, 1),
-                "low": low,
-                "high": high,
-                "p": each.p,
-                "p after Holm": p,
-                "answer": shown if each.p is not None else each.reason,
-            }
-        )
-    return Table.of(
-        rows,
-        id="protocol_questions",
-        title="The questions that were fixed before the first trial",
-        note="Difference: McNemar's mid-p and Tango's interval over starts tried in both arms, "
-        "whatever was not executed a failure. Agreement: score test against the limit. The "
-        f"primary question is tested at {protocol.alpha:g} alone; the same in each task and the "
-        "secondary ones share that after Holm (1979).",
-    )
+def _unanswered(answers: Sequence[Answer], endpoint: Endpoint) -> Iterable[_Departure]:
+    """Say that the primary question has no answer at all."""
+    if endpoint.kind == "agreement":
+        why = "claims of agreement are no longer judged: read agreement.sim_planned.rate"
+        yield _Departure("primary question", endpoint.words, "an answer", why)
+        return
+    known = [each for each in answers if each.question.is_primary and not each.task]
+    if not any(each.reading.evidence.pairs for each in known):
+        why = "no start was tried in both arms"
+        yield _Departure("primary question", endpoint.words, "an answer", why)
 
 
 def _departure_table(found: Sequence[_Departure], protocol: Protocol) -> Table:

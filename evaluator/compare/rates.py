@@ -6,17 +6,19 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.exchange.trials_rates import RateRecord
-from evaluator.compare.agreement import agreement_intervals, group_agreement, usable_groups
+from evaluator.compare.agreement import group_agreement, usable_groups
 from evaluator.compare.conclusions import conclusions_table
-from evaluator.compare.gains import gain_tests, replanning_gains
-from evaluator.compare.measure import refuse_alike, vouched_rate
-from evaluator.compare.model import model_results
+from evaluator.compare.gains import replanning_gains
+from evaluator.compare.measure import refuse_alike
 from evaluator.compare.notes import notes, notes_table
+from evaluator.compare.policies import compare_counts, comparison_part
+from evaluator.compare.regret import regret_results
 from evaluator.compare.rows import Comparison, RateGroup
 from evaluator.compare.success import WITH, averages
 from evaluator.compare.tables import gains_table, layout_table, success_table
 from evaluator.measurements import RATE_AS_GIVEN
 from evaluator.result import Exclusion, Measurement
+from evaluator.statistics.intervals import RATE_INTERVALS
 
 
 def compare_records(
@@ -30,14 +32,15 @@ def compare_records(
     stand_in = True if "stand-in" in sides else (False if "real" in sides else None)
     groups, left_out = _rate_groups(records, method)
     word = Comparison(run=path.stem, source="rates", stand_in=stand_in).recorded_word
-    gains = replanning_gains(groups, method=method)
+    gains = replanning_gains(groups)
+    compared = comparison_part(answers := compare_counts(groups))
     measurements = (
         *(side for group in groups for side in (group.recorded, group.sim)),
         *averages(groups, method=method),
         *group_agreement(groups),
         *gains,
-        *gain_tests(groups),
-        *model_results(usable_groups(groups)),
+        *compared.measurements,
+        *regret_results(usable_groups(groups)),
     )
     return Comparison(
         run=path.stem,
@@ -46,11 +49,11 @@ def compare_records(
         groups=groups,
         measurements=measurements,
         tables=(
-            *conclusions_table(groups),
+            *compared.tables,
+            *conclusions_table(groups, answers),
             success_table(groups, word, "Rates as given."),
             *layout_table(groups, measurements, word),
             *gains_table(gains, word),
-            *agreement_intervals(groups),
             *notes_table(notes(groups, measurements)),
         ),
         exclusions=tuple(left_out),
@@ -102,9 +105,9 @@ def _rate(
     record: RateRecord | None, side: str, key: tuple[str, str, str, str], method: str
 ) -> Measurement:
     task, condition, policy, unit = key
-    interval, why = None, "no n"
+    interval = None
     if record is not None and record.k is not None and record.n is not None:
-        interval, why = vouched_rate(record.k, record.n, method)
+        interval = RATE_INTERVALS[method](record.k, record.n)
     where = "" if record is None else f" in row {record.row} ({record.side})"
     parts = {"task": task, "condition": condition, "policy": policy, "unit": unit}
     defined = RATE_AS_GIVEN.of(side=side, where=where, **parts)
@@ -116,5 +119,5 @@ def _rate(
         n=record.n if record is not None else None,
         counted=unit,
         reason_if_undefined="not in the table" if record is None else None,
-        reason_without_interval=None if interval is not None else why,
+        reason_without_interval=None if interval is not None else "no n",
     )

@@ -14,7 +14,6 @@ from evaluator.cache import SummaryCache
 from evaluator.compare.baselines import with_rule
 from evaluator.compare.end_points import compare_imported
 from evaluator.compare.from_rows import compare_rows
-from evaluator.compare.gains import START_LIMIT_M
 from evaluator.compare.images.renders import compare_renders
 from evaluator.compare.images.scores import open_nets
 from evaluator.compare.images.views import ViewReport, compare_views
@@ -22,6 +21,7 @@ from evaluator.compare.labels import label_results
 from evaluator.compare.measure import Part
 from evaluator.compare.motion import motion_results
 from evaluator.compare.notes import check_settings, with_notes
+from evaluator.compare.policies import START_LIMIT_M, compare_policies
 from evaluator.compare.protocol_check import as_designed, protocol_results
 from evaluator.compare.rows import Comparison, TrialRow, stand_in_of
 from evaluator.compare.spreadsheet import imported_rows
@@ -176,6 +176,7 @@ def compare_read(
         ),
         method=method,
         void_causes=tuple(dict.fromkeys(cause for r in reads for cause in r.void_causes)),
+        protocol=reads[0].protocol if len(reads) == 1 else None,
     )
     trials = [trial for read in reads for trial in read.trials]
     derived = [file for read in reads for file in read.contents.derived]
@@ -204,6 +205,7 @@ def _of_protocol(read: ReadRun, method: str) -> Part:
     return protocol_results(
         read.rows,
         read.protocol,
+        answers=compare_policies(read.rows, read.protocol, read.void_causes),
         method=method,
         left_out=read.unread,
         task_hashes=_task_hashes(read.contents),

@@ -30,7 +30,6 @@ from evaluator.run_reader.object_states import (
     recorded_states,
     replayed_states,
 )
-from evaluator.statistics.bootstrap import student_interval
 from evaluator.statistics.intervals import cluster_means, median_interval
 
 PLAN, PLANNED, EXECUTED, RECORDED = "plan", "planned", "executed", "recorded"
@@ -222,9 +221,6 @@ UNKNOWN = {
     "extents": "not both sides know the shape",
 }
 """Why a quantity has no value although its position has."""
-MEAN_KEY = "student-t:length"
-"""Coverage of Student's interval for lengths with now and then a miss."""
-USE_MEDIAN = "the median with its interval"
 
 
 def state_results(states: Sequence[StateSummary]) -> Part:
@@ -272,7 +268,6 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
             n=len(values),
             counted="object",
             episodes=list(dict.fromkeys(episodes)),
-            interval_n=len(of_episode),
         )
         found.append(
             make(
@@ -286,9 +281,7 @@ def _measure(key: Group, states: Sequence[StateSummary]) -> list[Measurement]:
                 make(
                     _defined(key, name, "mean", **words),
                     partial(_mean, of_episode, states, name),
-                    reason_without_interval=interval_or_reason(student_interval, of_episode)[1],
-                    coverage_key=MEAN_KEY,
-                    instead=USE_MEDIAN,
+                    reason_without_interval="the median has one",
                 )
             )
     return found
@@ -301,11 +294,9 @@ def _median(
     return float(median(values)), interval_or_reason(median_interval, values)[0]
 
 
-def _mean(
-    values: Sequence[float], states: Sequence[StateSummary], quantity: str
-) -> float | tuple[float, Interval | None]:
+def _mean(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> float:
     _some(values, states, quantity)
-    return sum(values) / len(values), interval_or_reason(student_interval, values)[0]
+    return sum(values) / len(values)
 
 
 def _some(values: Sequence[float], states: Sequence[StateSummary], quantity: str) -> None:

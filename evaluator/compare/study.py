@@ -6,28 +6,16 @@ starts would look better. A start is left out only for a cause that was named be
 all arms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from bridge.episode.metadata import RETRY, EpisodeInfo, Outcome, treatment_of
 from bridge.task.protocol import VOID_CAUSES
-from evaluator.compare.measure import ends, measured, proportion
+from evaluator.compare.measure import proportion
 from evaluator.compare.rows import TrialRow
-from evaluator.measurements import Defined
 from evaluator.result import Cell, Exclusion, Measurement, Table
-from evaluator.statistics.differences import mcnemar, tango_points
-from evaluator.study_measurements import (
-    STUDY_GAIN,
-    STUDY_GAIN_EXECUTED,
-    STUDY_GAIN_POOLED,
-    STUDY_NOT_EXECUTED,
-    STUDY_P,
-    STUDY_P_EXECUTED,
-)
+from evaluator.study_measurements import STUDY_NOT_EXECUTED
 
-WITH = "with"
-AGAINST = ("without", "control")
 SCOPE = "study of replanning"
 
 
@@ -98,16 +86,13 @@ def study_results(
     *,
     method: str = "wilson",
 ) -> tuple[list[Measurement], tuple[Table, ...], list[Exclusion]]:
-    """Measure the gain of *with* over the other arms: pooled test, and each task's interval.
+    """Measure what each arm did not execute, and lay its successes out; nothing without a study.
 
-    Returns:
-        Measurements ``study.*``, the table of the arms and that of the gains, and what was left
-        out; nothing without a study.
+    Which arm is better is a comparison, as of any two candidates.
     """
     starts, left_out = study_starts(rows, void_causes)
     measurements: list[Measurement] = []
     lines: list[tuple[Cell, ...]] = []
-    gains: list[tuple[Cell, ...]] = []
     for policy in dict.fromkeys(start.policy for start in starts):
         mine = [start for start in starts if start.policy == policy]
         tasks = list(dict.fromkeys(start.task for start in mine))
@@ -116,16 +101,9 @@ def study_results(
             for arm in of_task[0].trials:
                 measurements.append(_not_executed(of_task, arm, method))
                 lines.append(_arm_line(of_task, arm))
-        for against in AGAINST:
-            paired = [start for start in mine if {WITH, against} <= start.trials.keys()]
-            if not paired:
-                continue
-            found, told = _gains(paired, against, policy)
-            measurements += found
-            gains += told
     if not starts:
         return [], (), left_out
-    return measurements, (_arms_table(lines), *_gains_table(gains)), left_out
+    return measurements, (_arms_table(lines),), left_out
 
 
 def _not_executed(starts: Sequence[StudyStart], arm: str, method: str) -> Measurement:
@@ -160,84 +138,6 @@ def _arm_line(starts: Sequence[StudyStart], arm: str) -> tuple[Cell, ...]:
     )
 
 
-def _gains(
-    starts: Sequence[StudyStart], against: str, policy: str
-) -> tuple[list[Measurement], list[tuple[Cell, ...]]]:
-    """Pooled over tasks first, then each task alone; per protocol beside each."""
-    tasks = list(dict.fromkeys(start.task for start in starts))
-    executed = [start for start in starts if start.executed(WITH, against)]
-    parts = {"against": against, "policy": policy}
-    count = len(tasks)
-    pooled = _gain(partial(STUDY_GAIN_POOLED.of, **parts, count=count), starts, against)
-    test = _test(partial(STUDY_P.of, **parts, count=count), starts, against)
-    test_executed = _test(partial(STUDY_P_EXECUTED.of, **parts, count=count), executed, against)
-    measurements = [pooled, test, test_executed]
-    lines = [_gain_line("all tasks", policy, against, pooled, test, test_executed)]
-    for task in tasks:
-        all_ = [start for start in starts if start.task == task]
-        both = [start for start in executed if start.task == task]
-        gain = _gain(partial(STUDY_GAIN.of, **parts, task=task), all_, against)
-        alone = _gain(partial(STUDY_GAIN_EXECUTED.of, **parts, task=task), both, against)
-        measurements += [gain, alone]
-        lines.append(_gain_line(task, policy, against, gain, None, alone))
-    return measurements, lines
-
-
-Named = Callable[..., Defined]
-
-
-def _gain(name: Named, starts: Sequence[StudyStart], against: str) -> Measurement:
-    improved, worsened, words = _counted(starts, against)
-    return measured(
-        name(words=words),
-        partial(tango_points, improved, worsened, len(starts)),
-        n=len(starts),
-        counted="pair",
-        episodes=_episodes(starts, against),
-    )
-
-
-def _test(name: Named, starts: Sequence[StudyStart], against: str) -> Measurement:
-    _, _, words = _counted(starts, against)
-    pairs = [(start.succeeded(against), start.succeeded(WITH)) for start in starts]
-    return measured(
-        name(words=words),
-        lambda: mcnemar(pairs).p_mid,
-        n=len(starts),
-        counted="pair",
-        reason_without_interval="a p-value",
-        episodes=_episodes(starts, against),
-    )
-
-
-def _counted(starts: Sequence[StudyStart], against: str) -> tuple[int, int, str]:
-    improved = sum(start.succeeded(WITH) and not start.succeeded(against) for start in starts)
-    worsened = sum(start.succeeded(against) and not start.succeeded(WITH) for start in starts)
-    return improved, worsened, f"{improved} improved, {worsened} worsened of {len(starts)} starts"
-
-
-def _episodes(starts: Sequence[StudyStart], against: str) -> list[str]:
-    return [start.trials[arm].episode for start in starts for arm in (against, WITH)]
-
-
-def _gain_line(
-    task: str,
-    policy: str,
-    against: str,
-    gain: Measurement,
-    test: Measurement | None,
-    alone: Measurement,
-) -> tuple[Cell, ...]:
-    p_mid = None if test is None else test.value
-    executed = alone.value if test is None else None
-    executed_p = alone.value if test is not None else None
-    low, high = ends(gain.interval)
-    return (
-        *(task, policy, against, gain.n, gain.value, low, high, p_mid),
-        *(alone.n, executed, executed_p),
-    )
-
-
 def _arms_table(lines: Sequence[tuple[Cell, ...]]) -> Table:
     return Table(
         id="study_arms",
@@ -247,25 +147,6 @@ def _arms_table(lines: Sequence[tuple[Cell, ...]]) -> Table:
         note="without: the planner's first plan. with: the first of at most K plans that the gate "
         "accepts. control: plans chosen by a coin with the gate's share of yes. Every start was "
         "tried in each arm; what was not executed is a failure.",
-    )
-
-
-def _gains_table(lines: Sequence[tuple[Cell, ...]]) -> tuple[Table, ...]:
-    if not lines:
-        return ()
-    return (
-        Table(
-            id="study_gains",
-            title="Study of replanning: gain of the arm with",
-            columns=(
-                *("task", "policy", "against", "starts", "gain (pp)", "low", "high", "mid-p"),
-                *("executed in both", "gain of these (pp)", "mid-p of these"),
-            ),
-            rows=tuple(lines),
-            note="Whatever was not executed is a failure of its arm; beside it, per protocol, only "
-            "the starts executed in both arms. Tango intervals; McNemar's exact mid-p over all "
-            "tasks.",
-        ),
     )
 
 

@@ -14,7 +14,6 @@ from evaluator.errors import UndefinedStatisticError
 from evaluator.measurements import (
     AVERAGE_MACRO,
     AVERAGE_POOLED,
-    NEVER_SENT,
     RATE_BY_UNIT,
     RATE_VARIED,
     RATES,
@@ -133,24 +132,6 @@ def _counted_rate(key: Key, members: Sequence[TrialRow], method: str) -> list[Me
             reason_if_undefined=f"trials are counted in different units: {firsts}",
             episodes=names_of(counted),
             method=method,
-        )
-    ]
-
-
-def never_sent(rows: Sequence[TrialRow]) -> list[Measurement]:
-    """Count the plans that were published and never executed; a trials CSV does not say."""
-    planned = [row for row in rows if row.num_plans]
-    if not planned:
-        return []
-    made = sum(row.num_plans for row in planned)
-    return [
-        measured(
-            NEVER_SENT.of(),
-            lambda: float(made - sum(row.num_plans_sent for row in planned)),
-            n=made,
-            counted="plan",
-            reason_without_interval="a count",
-            episodes=names_of(planned),
         )
     ]
 

@@ -40,8 +40,10 @@ METHOD_NAMES = {
     "wilson": "Wilson",
     "clopper-pearson": "Clopper-Pearson",
     "jeffreys": "Jeffreys",
-    "newcombe-10, unpaired": "Newcombe",
-    "clopper-pearson-difference, unpaired": "Clopper-Pearson (difference)",
+    "score": "score",
+    "tango": "Tango",
+    "repeated-score": "repeated score",
+    "populations": "model of populations",
 }
 
 
@@ -50,10 +52,7 @@ def _brackets(shown: Sequence[Measurement]) -> str:
     found = [m.interval.method for m in shown if m.interval is not None]
     known = {name: METHOD_NAMES.get(name.removeprefix("mean-"), name) for name in found}
     names = " and ".join(dict.fromkeys(known.values()))
-    text = f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
-    if any("; use " in (m.reason_without_interval or "") for m in shown):
-        text += " One that would cover too little is left out; measurements say which to use."
-    return text
+    return f"Brackets: 95 % {names} intervals." if found else "There are no intervals."
 
 
 def success_table(groups: Sequence[RateGroup], word: str, source_note: str = "") -> Table:

@@ -51,14 +51,8 @@ class Wanted:
     """Expected gain over it, which is to be shown: 0.2 is 20 percentage points."""
     correlation: float = 0.0
     """Expected correlation of both outcomes of a start; 0 asks for more starts than more would."""
-    agreement: Annotated[float | None, RARE] = None
-    """Expected share of trials in which twin and outcome agree."""
-    width: float | None = None
-    """Wanted width of the gain's interval, from end to end."""
-    agrees_above: Annotated[float | None, RARE] = None
-    """The claim that twin and outcome agree in more than this share of trials."""
     power: float = 0.8
-    """Chance with which gain and claim are to be shown."""
+    """Chance with which the gain is to be shown."""
     alpha: float = 0.05
     """Chance of a false alarm."""
     starts: int | None = None
@@ -66,14 +60,12 @@ class Wanted:
 
     def __post_init__(self) -> None:
         """Refuse what is no share."""
-        shares = dict.fromkeys(("rate", "agreement", "agrees_above"), (0, 1))
         refuse_outside(
             self,
             {
-                **shares,
+                "rate": (0, 1),
                 "gain": (-1, 1),
                 "correlation": (-1, 1),
-                "width": (0.01, 2),
                 "power": (0.05, 0.999),
                 "alpha": (0.0001, 0.5),
                 "starts": (1, 1000),

@@ -28,16 +28,13 @@ from evaluator.compare.success import CONDITION_OF_ARM
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.errors import UndefinedStatisticError
 from evaluator.statistics.intervals import RATE_INTERVALS
-from evaluator.statistics.planning import (
-    paired_chances,
-    paired_width,
+from evaluator.statistics.sequential import (
+    Chances,
+    chances,
+    look_pairs,
     pairs_for_power,
-    pairs_for_width,
-    power_above,
-    rate_width,
-    trials_above,
+    plan_power,
 )
-from evaluator.statistics.power import power_paired
 
 ORDER_FILE = "order.csv"
 """In the run folder; with its outcomes filled in it is a trials CSV."""
@@ -46,32 +43,25 @@ NO_TASK_FILE = "0" * 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class Goal:
-    """One thing that the study is to show, and what it takes."""
-
-    what: str
-    counted: str
-    """pairs or trials."""
-    needed: int | None
-    """Of them; None where nothing was asked for."""
-    starts: int
-    """Of each task, for this goal."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Expected:
-    """What is expected of each task, with where it is from."""
+    """What is expected of the arm compared with and of the other one."""
 
-    rates: dict[str, tuple[float, float]]
-    """Of the arm compared with, and of the other one, by task."""
+    rates: tuple[float, float]
     correlation: float
-    agreement: float | None
-    source: str
 
-    def chances(self) -> tuple[float, float]:
-        """Return the chances of a pair to improve and to worsen, over all tasks."""
-        each = [paired_chances(*pair, self.correlation) for pair in self.rates.values()]
-        return sum(a for a, _ in each) / len(each), sum(b for _, b in each) / len(each)
+    @property
+    def of_pair(self) -> Chances:
+        """Chances of a pair of one start."""
+        return chances(*self.rates, self.correlation)
+
+    @property
+    def words(self) -> str:
+        """What is expected in words."""
+        first, second = (f"{100 * rate:.0f} %" for rate in self.rates)
+        return (
+            f"expected rates: {first} and {second}; correlation of both outcomes of a start "
+            f"{self.correlation:g}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +69,8 @@ class Design:
     """A study, its size, and how that came about."""
 
     protocol: Protocol
-    goals: tuple[Goal, ...]
+    needed: int | None
+    """Pairs that show the gain with the power that was asked for; None where no gain was given."""
     shows: tuple[str, ...]
     """What the study can show at its size."""
     expected: Expected
@@ -92,30 +83,24 @@ def design(study: StudyOptions, wanted: Wanted) -> Design:
         UsageError: When an option contradicts another, or nothing is asked for.
     """
     base = _protocol(study, wanted)
-    expected = _expected(base, wanted)
-    goals = _goals(base, wanted, expected)
-    most = max((goal.starts for goal in goals), default=0)
-    starts = wanted.starts or most
+    expected = _expected(wanted)
+    needed = None
+    if expected.rates[0] != expected.rates[1]:
+        try:
+            needed = pairs_for_power(expected.of_pair, power=wanted.power, alpha=wanted.alpha)
+        except UndefinedStatisticError as error:
+            raise UsageError(f"{error} Expect a larger difference.") from error
+    starts = wanted.starts or math.ceil((needed or 0) / len(base.tasks))
     if not starts:
         raise UsageError(
-            "nothing says how large the study is to be: give --gain with --rate, --width, "
-            "--agrees-above with --agreement, or --starts."
+            "nothing says how large the study is to be: give --gain with --rate, or --starts."
         )
     if starts > 1000:
         raise UsageError(f"{starts} starts of each task would be needed; a study has 1000 at most.")
     tasks = tuple(replace(task, starts=starts) for task in base.tasks)
-    sized = replace(base, tasks=tasks)
-    shows = tuple(_shows(sized, wanted, expected))
-    return Design(
-        protocol=replace(sized, reasons=(expected.source, *map(_words, goals), *shows)),
-        goals=tuple(goals),
-        shows=shows,
-        expected=expected,
-    )
-
-
-def _words(goal: Goal) -> str:
-    return f"{goal.what}: {goal.needed} {goal.counted}, {goal.starts} starts of each task"
+    shows = tuple(_shows(starts * len(tasks), wanted, expected))
+    protocol = replace(base, tasks=tasks, reasons=(expected.words, *shows))
+    return Design(protocol=protocol, needed=needed, shows=shows, expected=expected)
 
 
 def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
@@ -131,12 +116,13 @@ def _protocol(study: StudyOptions, wanted: Wanted) -> Protocol:
         PolicyArms(policy=first, arms=tuple(dict.fromkeys(study.arms))),
         *(PolicyArms(policy=each, arms=("without",)) for each in others),
     )
-    primary, *secondary = _endpoints(policies, wanted)
+    primary, *secondary = _endpoints(policies)
     protocol = Protocol(
         tasks=tuple(_task(name, study) for name in dict.fromkeys(study.task)),
         policies=policies,
         rounds=study.rounds,
         study_seed=study.study_seed,
+        stopping="sequential",
         primary=primary,
         secondary=tuple(secondary),
         interval=study.interval,
@@ -160,7 +146,7 @@ def _task(name: str, study: StudyOptions) -> StudyTask:
     )
 
 
-def _endpoints(policies: Sequence[PolicyArms], wanted: Wanted) -> list[Endpoint]:
+def _endpoints(policies: Sequence[PolicyArms]) -> list[Endpoint]:
     """List the questions, the primary one first."""
     first = policies[0]
     found = [
@@ -185,19 +171,12 @@ def _endpoints(policies: Sequence[PolicyArms], wanted: Wanted) -> list[Endpoint]
             )
             for other in policies[1:]
         ]
-    if wanted.agrees_above is not None:
-        arm = first.arms[0]
-        claim = Endpoint(kind="agreement", policy=first.policy, arm=arm, limit=wanted.agrees_above)
-        found.append(claim)
     if not found:
-        raise UsageError(
-            "there is nothing to compare: give two arms, two policies, or --agrees-above."
-        )
+        raise UsageError("there is nothing to compare: give two arms or two policies.")
     return found
 
 
-def _expected(protocol: Protocol, wanted: Wanted) -> Expected:
-    """Lay out what is expected of each task."""
+def _expected(wanted: Wanted) -> Expected:
     first = 0.5 if wanted.rate is None else wanted.rate
     second = first + (wanted.gain or 0.0)
     if not 0 <= second <= 1:
@@ -205,95 +184,20 @@ def _expected(protocol: Protocol, wanted: Wanted) -> Expected:
             f"a rate of {100 * first:.0f} % and a gain of {100 * (second - first):.0f} points "
             f"make {100 * second:.0f} %: give another --rate or --gain."
         )
-    return Expected(
-        rates={task.task: (first, second) for task in protocol.tasks},
-        correlation=wanted.correlation,
-        agreement=wanted.agreement,
-        source=f"expected rates: {100 * first:.0f} % and {100 * second:.0f} %; correlation of both "
-        f"outcomes of a start {wanted.correlation:g}",
-    )
+    return Expected(rates=(first, second), correlation=wanted.correlation)
 
 
-def _goals(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[Goal]:
-    """Size the study for everything that was asked for."""
-    difference = protocol.primary is not None and protocol.primary.kind == "difference"
-    found: list[Goal] = []
-    try:
-        if difference and any(a != b for a, b in expected.rates.values()):
-            found.append(_gain_goal(wanted, expected))
-        if difference and wanted.width is not None:
-            found.append(_width_goal(wanted, expected))
-        if wanted.agrees_above is not None:
-            found.append(_agreement_goal(protocol, wanted, expected))
-    except UndefinedStatisticError as error:
-        raise UsageError(f"{error} Expect a larger difference, or a wider interval.") from error
-    return found
-
-
-def _gain_goal(wanted: Wanted, expected: Expected) -> Goal:
-    what = f"gain shown with {100 * wanted.power:g} % power (McNemar's mid-p, {wanted.alpha:.3g})"
-    needed = pairs_for_power(*expected.chances(), power=wanted.power, alpha=wanted.alpha)
-    starts = math.ceil(needed / len(expected.rates))
-    return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
-
-
-def _width_goal(wanted: Wanted, expected: Expected) -> Goal:
-    width = wanted.width or 0.0
-    what = f"interval of the gain {100 * width:g} points wide (Tango)"
-    needed = pairs_for_width(*expected.chances(), width)
-    starts = math.ceil(needed / len(expected.rates))
-    return Goal(what=f"{what} over all tasks", counted="pairs", needed=needed, starts=starts)
-
-
-def _agreement_goal(protocol: Protocol, wanted: Wanted, expected: Expected) -> Goal:
-    limit = wanted.agrees_above or 0.0
-    if expected.agreement is None:
-        raise UsageError(
-            "--agrees-above needs --agreement, the expected share of trials in which twin and "
-            "outcome agree."
+def _shows(pairs: int, wanted: Wanted, expected: Expected) -> list[str]:
+    """Say when a study of so many pairs is looked at, and how likely it is decided by then."""
+    looks = look_pairs(pairs)
+    listed = ", ".join(map(str, looks))
+    found = [f"looked at after {listed} starts that all arms tried; it may stop at each"]
+    if expected.rates[0] != expected.rates[1]:
+        by = plan_power(pairs, expected.of_pair, alpha=wanted.alpha)
+        each = ", ".join(
+            f"{100 * chance:.0f} % by {n}" for n, chance in zip(looks, by, strict=True)
         )
-    needed = trials_above(
-        expected.agreement,
-        limit,
-        power=wanted.power,
-        alpha=wanted.alpha,
-        method=protocol.interval,
-    )
-    return Goal(
-        what=f"twin agrees in more than {100 * limit:g} %, expected {100 * expected.agreement:.0f}"
-        f" %, shown with {100 * wanted.power:g} % power",
-        counted="trials of one arm",
-        needed=needed,
-        starts=math.ceil(needed / len(protocol.tasks)),
-    )
-
-
-def _shows(protocol: Protocol, wanted: Wanted, expected: Expected) -> list[str]:
-    """Say what the study can show at its size."""
-    starts, count = protocol.tasks[0].starts, len(protocol.tasks)
-    found = []
-    if protocol.primary is not None and protocol.primary.kind == "difference":
-        chances = expected.chances()
-        pairs = starts * count
-        width = paired_width(*chances, pairs)
-        found.append(f"interval of the gain over {pairs} pairs: {100 * width:.0f} points wide")
-        if chances[0] != chances[1]:
-            power = power_paired(*chances, pairs, alpha=wanted.alpha, mid=True)
-            found.append(f"power for the gain over {pairs} pairs: {100 * power:.0f} %")
-    ends = sorted({rate for pair in expected.rates.values() for rate in pair})
-    widths = [rate_width(rate, starts, method=protocol.interval) for rate in ends]
-    found.append(
-        f"interval of a task's rate over {starts} trials: up to {100 * max(widths):.0f} points wide"
-    )
-    if wanted.agrees_above is not None and expected.agreement is not None:
-        power = power_above(
-            expected.agreement,
-            wanted.agrees_above,
-            starts * count,
-            alpha=wanted.alpha,
-            method=protocol.interval,
-        )
-        found.append(f"power for the claim that the twin agrees: {100 * power:.0f} %")
+        found.append(f"if the rates are as expected it is decided: {each}")
     return found
 
 
@@ -347,9 +251,9 @@ def design_text(made: Design, written: Protocol, run_path: Path, study: StudyOpt
         f"{len(protocol.order())} trials",
         f"Primary question: {primary}",
         *(f"Secondary: {each.words}" for each in protocol.secondary),
-        *(f"Needed: {_words(goal)}" for goal in made.goals),
+        *([] if made.needed is None else [f"Needed: {made.needed} starts over all tasks"]),
         *(f"At this size: {each}" for each in made.shows),
-        made.expected.source.capitalize(),
+        made.expected.words.capitalize(),
         f"Locked: {run_path / FILE_NAME}, sha256 {written.sha256}",
         f"Order: {run_path / ORDER_FILE}, interleaved by --study-seed {protocol.study_seed}"
         + (", arms by code" if protocol.codes else ""),
@@ -381,7 +285,7 @@ def design_record(made: Design, written: Protocol) -> dict[str, Any]:
     return {
         "starts": made.protocol.tasks[0].starts,
         "trials": len(made.protocol.order()),
-        "goals": [vars(goal) for goal in made.goals],
+        "needed": made.needed,
         "shows": list(made.shows),
         "sha256": written.sha256,
     }

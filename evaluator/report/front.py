@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from evaluator.compare.conclusions import direction
+from evaluator.compare.policies import ALL_TASKS
 from evaluator.quantity import noun
 from evaluator.report.wording import agreeing_side
 from evaluator.result import Cell, Measurement, Results, Table
@@ -12,6 +13,7 @@ from evaluator.result import Cell, Measurement, Results, Table
 SHOWN_TASKS = 8
 """Tasks with a line; the table holds the others."""
 SHOWN_MISSING = 6
+SHOWN_ANSWERS = 3
 LONGEST = 150
 """Characters of one reason; the whole stands further down."""
 LONGEST_NOTE = 260
@@ -50,7 +52,9 @@ def front(results: Results) -> Front:
     opposed = [text for _, text in about if SIMPSON in text]
     about = [(name, text) for name, text in about if text not in opposed]
     return Front(
-        summary=" ".join([*(f"{text}." for text in opposed), _summary(results, len(rows))]),
+        summary=" ".join(
+            [*_compared(results), *(f"{t}." for t in opposed), _summary(results, len(rows))]
+        ),
         tasks=[(str(row["task"]), sentence(row)) for row in rows[:SHOWN_TASKS]],
         more_tasks=max(0, len(rows) - SHOWN_TASKS),
         notes=[(_about(a), _short(b, LONGEST_NOTE)) for a, b in about[:2]],
@@ -58,6 +62,19 @@ def front(results: Results) -> Front:
         missing=[_short(text) for text in missing[:SHOWN_MISSING]],
         more_missing=max(0, len(missing) - SHOWN_MISSING),
     )
+
+
+def _compared(results: Results) -> list[str]:
+    """Say which candidate is better, of the questions over all tasks, and what the twin's cost."""
+    table = next((t for t in results.tables if t.id == "comparisons"), None)
+    rows = [] if table is None else [dict(zip(table.columns, r, strict=True)) for r in table.rows]
+    sentences = [str(row["answer"]) for row in rows if row["task"] == ALL_TASKS]
+    found = [f"{text[0].upper()}{text[1:]}." for text in sentences[:SHOWN_ANSWERS]]
+    regret = next((m for m in results.measurements if m.id == "decision.regret_pp"), None)
+    if regret is not None and regret.value is not None:
+        ends = _ends(regret, ".0f")
+        found.append(f"Taking what sim ranks first costs {_points(regret.value)}{ends}.")
+    return found
 
 
 def conclusions(results: Results) -> list[Row]:

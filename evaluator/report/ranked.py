@@ -8,7 +8,8 @@ MOST_TABLES = 12
 """In a report; ``--all`` shows the rest too."""
 TABLES: dict[str, str] = {
     "published": "whether a printed number may be quoted",
-    "protocol_questions": "whether the study's questions are answered",
+    "comparisons": "which candidate to use, and whether to run more trials",
+    "standing": "which candidates to keep",
     "conclusions": "for which task the twin may stand in for the robot",
     "layout": "whether to run with replanning",
     "success": "which candidate to use",
@@ -18,10 +19,7 @@ TABLES: dict[str, str] = {
     "image_methods": "which reconstruction to use",
     "confusion": "whether the twin's yes may start the robot, and its no may stop it",
     "gate_baselines": "whether the twin is worth more than a rule without one",
-    "gate_costs": "whether to obey the gate",
-    "study_gains": "whether replanning is worth its time",
     "gains": "whether replanning is worth its time",
-    "agreement_intervals": "whether the agreement would hold for other tasks",
     "funnel": "on which stage to work",
     "failures": "which cause to remove first",
     "end_points_*": "whether the engine's friction and timing are right",

@@ -26,7 +26,7 @@ HEADLINES: tuple[tuple[str, str], ...] = (
     ("agreement.mmrv_recorded_gap", "MMRV (gap of recorded rates)"),
     ("gain.pp.recorded.average", "Replanning gain, mean of tasks"),
     ("gain.relative.recorded.average", "The same, relative"),
-    ("paired.mcnemar_p_mid.recorded", "Replanning, paired starts (McNemar mid-p)"),
+    ("decision.regret_pp", "Loss of taking what sim ranks first"),
     ("motion.planned.position_mean_m", "Tool: recorded to planned replay"),
     ("motion.executed.position_mean_m", "Tool: recorded to executed replay"),
     ("views.all.psnr_db", "PSNR of held-out views, raw"),
@@ -51,7 +51,7 @@ SHOWN_UNITS: dict[str, tuple[float, str, str]] = {
 """Factor, unit and digits in which a reader thinks."""
 PLAIN = (1.0, "", ".3f")
 SHARES = ("average.", "rate.")
-UNSIGNED = ("agreement.mae_pp",)
+UNSIGNED = ("agreement.mae_pp", "decision.regret_pp", "decision.wrong_pairs_pp")
 """Sizes in percentage points that are never below 0: a plus would look like a direction."""
 HUGE = 1e7
 """Nobody reads more digits before the point; evidence may have hundreds."""

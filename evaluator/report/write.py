@@ -23,8 +23,9 @@ SHOWN = (
     "published",
     "success",
     "layout",
+    "comparisons",
+    "standing",
     "study_arms",
-    "study_gains",
     "gains",
     "retries",
     "image_methods",
@@ -35,7 +36,7 @@ SHOWN = (
 GROUPS = "success"
 """The table of success rates; ``groups.parquet`` holds it too."""
 
-HEADLINE_TABLES = ("conclusions", "success", "layout", "study_gains", "gains", "confusion")
+HEADLINE_TABLES = ("conclusions", "success", "layout", "comparisons", "gains", "confusion")
 """Those that ``--latex`` writes for a paper."""
 OLD_FIGURES = ("confusion", "order", "bands", "tasks", "costs", "reliability", "funnel")
 """Drawn by editions before."""

@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from evaluator.errors import UndefinedStatisticError
-from evaluator.result import Interval
-from evaluator.statistics.intervals import LEVEL, normal_quantile
 
 MIN_GROUPS = 3
 """Two points always lie on a line."""
@@ -186,10 +184,6 @@ def mean_rate(rates: Sequence[Number]) -> float:
     return float(floats(rates).mean())
 
 
-MIN_GROUPS_INTERVAL = 4
-"""Fisher's standard error is 1/sqrt(n - 3)."""
-
-
 def pearson(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """Return Pearson's r over groups; exact on counts, so that rates on a line give 1 and not less.
 
@@ -224,25 +218,3 @@ def spearman(recorded: Sequence[Number], sim: Sequence[Number]) -> float:
     """
     x, y = varying("Spearman rho", recorded, sim)
     return pearson(ranks(x), ranks(y))
-
-
-def fisher_interval(r: float, num_groups: int, *, level: float = LEVEL) -> Interval:
-    """Return Fisher's z interval of Pearson's r. The groups must be independent of each other.
-
-    Raises:
-        UndefinedStatisticError: Below 4 groups, or when r is exactly 1 or -1.
-    """
-    if num_groups < MIN_GROUPS_INTERVAL:
-        raise UndefinedStatisticError(
-            statistic="Fisher interval of r",
-            reason=f"{num_groups} groups; it needs at least {MIN_GROUPS_INTERVAL}",
-        )
-    if abs(r) >= 1:
-        raise UndefinedStatisticError(
-            statistic="Fisher interval of r", reason=f"r is {r:+.0f} exactly"
-        )
-    z = math.atanh(r)
-    half = normal_quantile(0.5 + level / 2) / math.sqrt(num_groups - 3)
-    return Interval(
-        low=math.tanh(z - half), high=math.tanh(z + half), level=level, method="fisher-z"
-    )

@@ -3,7 +3,7 @@
 import importlib.util
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -12,7 +12,6 @@ from typing import Any
 import lean_checks
 import numpy as np
 import pytest
-from coarse_model import coarse_model
 
 from bridge.episode import schema
 from bridge.episode.cdr.messages import PoseSample
@@ -313,7 +312,7 @@ def evaluation_run_once(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="session")
 def everything(evaluation_run_once: RunFolder) -> Comparison:
-    with lean_checks.unchecked(), coarse_model():
+    with lean_checks.unchecked():
         return compare_run(evaluation_run_once)
 
 
@@ -321,10 +320,3 @@ def everything(evaluation_run_once: RunFolder) -> Comparison:
 def load_golden_script() -> Callable[[str], ModuleType]:
     """For tests in the folders below, which cannot import this file."""
     return golden_script
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_nodes() -> Iterator[None]:
-    """Be coarse everywhere; tests of the model itself replace this by a fixture of this name."""
-    with coarse_model():
-        yield

@@ -60,10 +60,13 @@ def test_a_point_of_the_scatter_compares_the_same_trials(six_trials: Any) -> Non
 
 def test_starts_are_paired_across_conditions(six_trials: Any) -> None:
     results = compare_run(six_trials.run).results()
-    p = results.get("paired.mcnemar_p_exact.recorded")
-    assert p.n == 3
-    assert p.value == 1.0  # one discordant pair can show nothing
-    assert "1 improved, 0 worsened of 3" in p.definition
+    name = "scripted_with_replanning.against.scripted_without_replanning"
+    found = results.get(f"comparison.pp.{name}")
+    assert (found.n, found.value) == (6, pytest.approx(100 / 3))
+    assert "with replanning 2 of 3, without replanning 1 of 3" in found.definition
+    counts = next(table for table in results.tables if table.id == "comparison_numbers")
+    line = dict(zip(counts.columns, counts.rows[0], strict=True))
+    assert (line["shared starts"], line["decided"]) == (3, "no")
 
 
 def test_gain_is_given_in_points_and_relative(six_trials: Any) -> None:

@@ -17,6 +17,7 @@ from evaluator.compare.run import compare_run
 from evaluator.design.config import StudyOptions, Wanted
 from evaluator.design.plan import ORDER_FILE, Design, design, design_text, lock, trials_command
 from evaluator.result import Results
+from evaluator.statistics.sequential import look_pairs
 
 STUDY = StudyOptions(task=("pour", "stack"), any_task=True, policies=("act",), blind=True)
 WANTED = Wanted(rate=0.4, gain=0.4)
@@ -63,16 +64,14 @@ def test_a_study_carried_out_as_designed_has_no_departure(tmp_path: Path, made: 
     assert written.sha256
     results = filled(tmp_path)
     assert results.get("protocol.departures").value == 0
-    questions = rows_of(results, "protocol_questions")
-    assert [row["role"] for row in questions] == ["primary", "task", "task"]
-    primary = results.get("protocol.primary.difference_pp")
-    assert primary.n == 2 * made.protocol.tasks[0].starts
-    assert primary.value == results.get("study.gain_pp.without.act").value
-    p = results.get("protocol.primary.difference_p").value
-    assert p == results.get("study.mcnemar_p_mid.without.act").value
-    assert questions[0]["answer"] == "better"
-    in_tasks = [float(row["p"]) for row in questions[1:]]
-    assert float(questions[1]["p after Holm"]) == pytest.approx(min(1, 2 * min(in_tasks)))
+    questions = rows_of(results, "comparison_numbers")
+    assert [row["task"] for row in questions] == ["all tasks", "pour", "stack"]
+    assert questions[0]["decided"] == "better"
+    starts = 2 * made.protocol.tasks[0].starts
+    assert int(questions[0]["shared starts"]) == starts == int(questions[0]["n"])
+    assert float(questions[0]["decided after (pairs)"]) in look_pairs(starts)
+    said = rows_of(results, "comparisons")[0]["answer"]
+    assert said.endswith("stop here")
 
 
 def leave_blank(lines: list[Line]) -> None:
@@ -147,16 +146,6 @@ def test_the_list_of_a_blinded_operator_names_no_arm(tmp_path: Path, made: Desig
     assert "act,with_replanning" in (tmp_path / "open" / ORDER_FILE).read_text()
 
 
-def test_the_size_follows_from_the_largest_of_what_is_asked() -> None:
-    one = design(STUDY, WANTED)
-    both = design(STUDY, replace(WANTED, width=0.3))
-    most = design(STUDY, replace(WANTED, width=0.3, agreement=0.8, agrees_above=0.75))
-    sizes = [each.protocol.tasks[0].starts for each in (one, both, most)]
-    assert sizes == sorted(set(sizes))
-    assert sizes[2] == max(goal.starts for goal in most.goals)
-    assert design(STUDY, replace(WANTED, starts=7)).protocol.tasks[0].starts == 7
-
-
 @pytest.mark.parametrize(
     ("study", "wanted", "words"),
     [
@@ -166,7 +155,6 @@ def test_the_size_follows_from_the_largest_of_what_is_asked() -> None:
         (replace(STUDY, arms=("without", "with", "control")), WANTED, "needs --coin"),
         (STUDY, Wanted(rate=0.9, gain=0.3), "make 120 %"),
         (STUDY, Wanted(rate=0.5, gain=0.01), "more than 4000"),
-        (STUDY, Wanted(agrees_above=0.7), "needs --agreement"),
         (replace(STUDY, any_task=False), WANTED, "no task named 'pour'"),
         (replace(STUDY, interval="wald"), WANTED, "There are: wilson"),
     ],

@@ -7,12 +7,12 @@ import pytest
 from bridge.episode.executions import NO_PLAN
 from bridge.episode.metadata import EpisodeInfo, Outcome, treatment_of
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.policies import compare_policies
 from evaluator.compare.rows import TrialRow
 from evaluator.compare.study import retry_table, study_results, study_starts
 from evaluator.compare.success import rate_groups, side_rates
 from evaluator.compare.tables import success_table
 from evaluator.result import Measurement
-from evaluator.statistics.differences import sign_test, tango_difference
 
 ARMS = ("without", "with", "control")
 CONDITION = {
@@ -57,25 +57,6 @@ FIRST = study([(False, True, False)] * 6 + [(True, False, True)] * 1 + [(True, T
 SECOND = study([(False, True, True)] * 3 + [(False, False, False)] * 2, task="push")
 
 
-def test_the_pooled_test_counts_the_starts_that_differ_over_all_tasks() -> None:
-    found = by_id(FIRST + SECOND)
-    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(9, 1)[1]
-    assert found["study.mcnemar_p_mid.control.nominal"].value == sign_test(6, 1)[1]
-    assert found["study.gain_pp.without.nominal"].value == pytest.approx(100 * (9 - 1) / 15)
-
-
-def test_each_task_has_its_gain_with_tangos_interval_also_where_it_holds_zero() -> None:
-    found = by_id(FIRST + SECOND)
-    for task, counts in (("stack", (6, 1, 10)), ("push", (3, 0, 5))):
-        gain = found[f"study.gain_pp.without.{task}.nominal"]
-        expected = tango_difference(*counts)
-        assert gain.interval is None or gain.interval.low == pytest.approx(100 * expected.low)
-        assert gain.value == pytest.approx(100 * (counts[0] - counts[1]) / counts[2])
-        assert gain.interval is not None or gain.reason_without_interval
-    zero = found["study.gain_pp.control.push.nominal"]
-    assert zero.value == 0.0
-
-
 @pytest.mark.parametrize(
     "label",
     [
@@ -93,9 +74,10 @@ def test_what_was_not_executed_is_a_failure_and_per_protocol_it_is_left_out(
         for each in FIRST
     ]
     found, full = by_id(rows), by_id(FIRST)
-    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(5, 1)[1]
-    alone = found["study.executed_gain_pp.without.stack.nominal"]
-    assert (alone.n, alone.value) == (9, pytest.approx(100 * (5 - 1) / 9))
+    answers = compare_policies(rows)
+    assert [(each.counts, each.reading.evidence.strata[0].improved) for each in answers] == [
+        (((4, 10), (8, 10)), 5)
+    ]
     assert found["study.not_executed.with.stack.nominal"].value == pytest.approx(0.1)
     assert full["study.not_executed.with.stack.nominal"].value == 0.0
 
@@ -137,19 +119,12 @@ def test_the_control_is_a_group_of_its_own_and_pairs_only_in_the_study() -> None
     assert groups["without_replanning"].recorded.n == 10
     ids = [each.id for each in found.measurements]
     assert any(each.startswith("rate.recorded.stack.control") for each in ids)
-    assert {"study_arms", "study_gains"} <= {table.id for table in found.tables}
+    assert {"study_arms", "comparisons"} <= {table.id for table in found.tables}
 
 
 def test_without_a_study_there_is_nothing_of_it() -> None:
     rows = [replace(each, study_arm="") for each in FIRST if each.study_arm != "control"]
     assert study_results(rows) == ([], (), [])
-
-
-def test_without_a_control_only_the_other_arm_is_compared() -> None:
-    two = [each for each in FIRST if each.study_arm != "control"]
-    found = by_id(two)
-    assert found["study.mcnemar_p_mid.without.nominal"].value == sign_test(6, 1)[1]
-    assert not [name for name in found if "control" in name]
 
 
 def test_retries_are_counted_by_treatment_and_nothing_else_is() -> None:

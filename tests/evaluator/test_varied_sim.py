@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 
+from bridge.task.verdict import Factor, Verdict
 from evaluator.compare import compare_run
 from evaluator.compare.success import varied_sim
+from evaluator.run_reader.episodes import summarise_verdict
 
 
 def test_sim_is_estimated_again_beside_the_replay_that_chose_the_plan(maker: Any) -> None:
@@ -54,3 +56,22 @@ def test_varied_replays_beside_a_plain_one_are_found(maker: Any) -> None:
     maker.replay("a", tag="b", varied=(1, 4))
     again, _ = varied_sim(compare_run(maker.run).rows)
     assert (again.value, again.n) == (0.25, 1)
+
+
+def test_how_far_answers_are_trusted_does_not_change_how_many_succeed() -> None:
+    """After ``calibrate --posterior`` the stated probability is less than the share."""
+    yes = Factor(value=True)
+    verdict = Verdict(
+        plan_id="p",
+        trajectory="planned",
+        mode="dynamic",
+        ik=yes,
+        clearance=yes,
+        terminal=yes,
+        engine="fake",
+        seed=0,
+        p_success={"value": 0.6, "low": 0.3, "high": 0.8, "k": 6, "n": 8},
+    )
+    summary = summarise_verdict(verdict)
+    assert (summary.p_success, summary.varied_share) == (0.6, 0.75)
+    assert summarise_verdict(replace(verdict, p_success=None)).varied_share is None

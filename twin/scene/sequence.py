@@ -27,7 +27,6 @@ from twin.robot.surface import PosedSurface
 from twin.scene.frames.camera_poses import unknown_mask
 from twin.scene.image_agreement import (
     ImageAgreement,
-    Mesh,
     describe_agreement,
     part_masks,
 )
@@ -43,6 +42,7 @@ from twin.scene.render import (
     sized_camera,
 )
 from twin.scene.settings import RenderConfig
+from twin.scene.shape.mesh import Mesh
 from twin.scene.store.folder import Scene, read_scene
 from twin.scene.trial import TrialInScene, open_trial
 

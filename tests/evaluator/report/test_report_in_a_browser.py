@@ -16,8 +16,6 @@ pytestmark = pytest.mark.slow
 
 WHOLE = """
 import sys, robot_gst
-from evaluator.statistics.hierarchical import AgreementModel
-AgreementModel._enough = lambda _: 512  # what it loads and shows does not depend on it
 code = robot_gst.run(["evaluate", sys.argv[1], "--out", sys.argv[2], "--quiet"])
 heavy = ("twin", "torch", "open3d", "mujoco", "pybullet", "zenoh")
 print(code, [name for name in heavy if name in sys.modules])

@@ -1,0 +1,531 @@
+"""Which of two candidates is better as recorded: policies, or one without and with replanning.
+
+Each pair that was asked gets one answer, the same that ``robot-gst design`` plans for: a sequential
+comparison (``evaluator/statistics/sequential.py``) over all tasks, paired where both tried a start.
+A trial that was made and has no outcome is a failure of its candidate, unless the protocol declares
+its cause void: a policy that trips the arm must not gain by it.
+"""
+
+import math
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import TypeVar
+
+import numpy as np
+from bridge.episode.catalogue_store import UNLABELLED
+
+from bridge.task.protocol import VOID_CAUSES, Protocol
+from evaluator.compare.measure import Part, ends, measured
+from evaluator.compare.rows import RateGroup, TrialRow, in_order
+from evaluator.compare.success import CONDITION_OF_ARM, WITH, WITHOUT
+from evaluator.errors import UndefinedStatisticError
+from evaluator.quantity import noun
+from evaluator.result import Cell, Interval, Measurement, Table
+from evaluator.statistics.sequential import Evidence, Look, Plan, Stratum
+from evaluator.study_measurements import COMPARED, COMPARED_IN_TASK
+
+Item = TypeVar("Item")
+
+START_LIMIT_M = 0.03
+"""Trials whose objects started further apart than this are not of the same start."""
+MOST_CANDIDATES = 12
+"""Beyond, pairs that nobody asked about are too many to be shown anything."""
+CLOSE = 0.10
+"""A difference that lies within this, whatever it is, needs no further trial."""
+ALL_TASKS = "all tasks"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """What is chosen between."""
+
+    policy: str
+    condition: str
+
+    @property
+    def words(self) -> str:
+        """Policy and condition as a reader has them."""
+        parts = (self.policy, self.condition.replace("_", " "))
+        return ", ".join(part for part in parts if part) or "unnamed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """Whether the second candidate is better than the first."""
+
+    first: Candidate
+    second: Candidate
+    is_primary: bool = False
+    """Tested at the whole alpha; the others share it (Holm 1979)."""
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Both in words, without what they have in common."""
+        first, second = self.first, self.second
+        if first.policy == second.policy:
+            return tuple(c.condition.replace("_", " ") for c in (first, second))  # type: ignore[return-value]
+        if first.condition == second.condition:
+            return first.policy, second.policy
+        return first.words, second.words
+
+
+def questions(found: Iterable[Candidate], protocol: Protocol | None = None) -> list[Question]:
+    """Return what a protocol asks; without one replanning of each policy, and each two policies."""
+    if protocol is not None and protocol.primary is not None:
+        return [
+            Question(
+                first=Candidate(
+                    policy=each.against_policy, condition=CONDITION_OF_ARM[each.against_arm]
+                ),
+                second=Candidate(policy=each.policy, condition=CONDITION_OF_ARM[each.arm]),
+                is_primary=each == protocol.primary,
+            )
+            for each in (protocol.primary, *protocol.secondary)
+            if each.kind == "difference"
+        ]
+    kept = list(dict.fromkeys(found))
+    asked = [
+        Question(first=a, second=b)
+        for a in kept
+        for b in kept
+        if a.policy == b.policy and (a.condition, b.condition) == (WITHOUT, WITH)
+    ]
+    if len({each.policy for each in kept}) > MOST_CANDIDATES:
+        return asked
+    return asked + [
+        Question(first=a, second=b)
+        for a, b in combinations(kept, 2)
+        if a.policy != b.policy and a.condition == b.condition
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Try:
+    """One trial of one of two candidates."""
+
+    task: str
+    start: str
+    is_second: bool
+    succeeded: bool
+    has_outcome: bool
+    row: TrialRow
+
+
+def tries_of(rows: Sequence[TrialRow], question: Question, void_causes: Sequence[str]) -> list[Try]:
+    """Return the trials of both candidates in the order in which they were made."""
+    sides = {
+        (c.policy, c.condition): is_second
+        for is_second, c in ((False, question.first), (True, question.second))
+    }
+    void = {(row.task, row.start_id) for row in rows if _is_void(row, void_causes)}
+    found = []
+    for row in in_order(rows):
+        side = sides.get((row.policy, row.condition))
+        is_void = _is_void(row, void_causes) or (
+            row.start_id is not None and bool(row.study_arm) and (row.task, row.start_id) in void
+        )
+        was_made = row.recorded is not None or row.nothing_executed
+        was_made |= row.why_unknown not in ("", UNLABELLED)
+        if side is None or is_void or not was_made:
+            continue
+        found.append(
+            Try(
+                task=row.task,
+                start=row.start_id or "",
+                is_second=side,
+                succeeded=row.recorded is True,
+                has_outcome=row.recorded is not None,
+                row=row,
+            )
+        )
+    return found
+
+
+def _is_void(row: TrialRow, void_causes: Sequence[str]) -> bool:
+    return row.recorded is None and row.why_unknown.startswith(tuple(void_causes))
+
+
+def evidence_of(tries: Sequence[Try], *, task: str = "") -> Evidence:
+    """Count some trials: pairs of one start, and the others of each task."""
+    by_task: dict[str, list[Try]] = {}
+    for each in tries:
+        if not task or each.task == task:
+            by_task.setdefault(each.task, []).append(each)
+    return Evidence(strata=tuple(_stratum(members) for members in by_task.values()))
+
+
+def _stratum(tries: Sequence[Try]) -> Stratum:
+    starts: dict[str, tuple[list[Try], list[Try]]] = {}
+    for place, each in enumerate(tries):
+        name = each.start or f"unnamed {place}"
+        starts.setdefault(name, ([], []))[each.is_second].append(each)
+    counts = {(a, b): 0 for a in (False, True) for b in (False, True)}
+    left: tuple[list[Try], list[Try]] = ([], [])
+    for first, second in starts.values():
+        together = first and second and _is_same_start(first[0].row, second[0].row)
+        if together:
+            counts[first[0].succeeded, second[0].succeeded] += 1
+        for side, members in enumerate((first, second)):
+            left[side].extend(members[1:] if together else members)
+    alone = [(sum(each.succeeded for each in side), len(side)) for side in left]
+    return Stratum(
+        improved=counts[False, True],
+        worsened=counts[True, False],
+        pairs=sum(counts.values()),
+        first=alone[0],
+        second=alone[1],
+    )
+
+
+def _is_same_start(first: TrialRow, second: TrialRow) -> bool:
+    shared = first.start_positions_m.keys() & second.start_positions_m.keys()
+    gaps = (
+        np.subtract(first.start_positions_m[name], second.start_positions_m[name])
+        for name in shared
+    )
+    return all(float(np.linalg.norm(gap)) <= START_LIMIT_M for gap in gaps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What the trials say to one question, by one plan."""
+
+    evidence: Evidence
+    decided: Look | None
+    """The look at which it was decided."""
+    better: int
+    """1 where the second is better, -1 where it is worse, 0 undecided."""
+    interval: Interval | None
+    more: int | None
+    """Further trials of each candidate after which a decision is likely; None where none is."""
+
+
+def read(plan: Plan, all_: Evidence, until: Callable[[float], Evidence]) -> Reading:
+    """Look at the trials as planned: ``until`` gives what was counted after so many pairs."""
+    limit = math.inf
+    decided, better = None, 0
+    if all_.pairs:
+        for look in plan.looks(all_.kind):
+            passed = look.pairs <= all_.pairs + 1e-9
+            if not passed and math.isfinite(limit):
+                break
+            limit = look.limit
+            if not passed:
+                break
+            z = until(look.pairs).z()
+            if decided is None and abs(z) >= look.limit - 1e-9:
+                decided, better = look, 1 if z > 0 else -1
+    likely = plan.likely_at(all_) if decided is None else None
+    return Reading(
+        evidence=all_,
+        decided=decided,
+        better=better,
+        interval=all_.interval(limit) if all_.pairs else None,
+        more=None if likely is None else max(1, math.ceil(likely - all_.pairs)),
+    )
+
+
+def read_tries(plan: Plan, tries: Sequence[Try]) -> Reading:
+    """Read trials in their order."""
+    pairs = _pairs_after(tries)
+
+    def until(wanted: float) -> Evidence:
+        return evidence_of(tries[: bisect_left(pairs, wanted - 1e-9) + 1])
+
+    return read(plan, evidence_of(tries), until)
+
+
+def _pairs_after(tries: Sequence[Try]) -> list[float]:
+    """Pairs that the first so many trials are worth, for each number of trials."""
+    seen: dict[tuple[str, str], list[Try | None]] = {}
+    shared: Counter[str] = Counter()
+    left: dict[str, list[int]] = {}
+    counted: dict[str, float] = {}
+    total, found = 0.0, []
+    for place, each in enumerate(tries):
+        start = seen.setdefault((each.task, each.start or f"unnamed {place}"), [None, None])
+        others = left.setdefault(each.task, [0, 0])
+        other = start[not each.is_second]
+        others[each.is_second] += 1
+        if start[each.is_second] is None:
+            start[each.is_second] = each
+            if other is not None and _is_same_start(each.row, other.row):
+                shared[each.task] += 1
+                others[0] -= 1
+                others[1] -= 1
+        n, m = others
+        now = shared[each.task] + (2 * n * m / (n + m) if n and m else 0.0)
+        total += now - counted.get(each.task, 0.0)
+        counted[each.task] = now
+        found.append(total)
+    return found
+
+
+def with_holm(
+    items: Sequence[Item], plan: Plan, read_one: Callable[[Plan, Item], Reading]
+) -> list[Reading]:
+    """Read several questions that share alpha; each that is decided leaves its share."""
+    found: list[Reading | None] = [None] * len(items)
+    open_ = list(range(len(items)))
+    while open_:
+        shared = replace(plan, alpha=plan.alpha / len(open_))
+        now = {place: read_one(shared, items[place]) for place in open_}
+        for place, reading in now.items():
+            found[place] = reading
+        left = [place for place in open_ if now[place].decided is None]
+        if len(left) == len(open_):
+            break
+        open_ = left
+    return [each for each in found if each is not None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """One question, what was counted, and what it says."""
+
+    question: Question
+    task: str
+    counts: tuple[tuple[int, int], tuple[int, int]]
+    reading: Reading
+    no_outcome: tuple[int, int] = (0, 0)
+    """Trials without an outcome that count as failures."""
+    without_these: float | None = None
+    """The difference if they did not count."""
+    episodes: tuple[str, ...] = field(default=(), repr=False)
+
+    @property
+    def sentence(self) -> str:
+        """The answer in words."""
+        first, second = self.question.names
+        (k, n), (j, m) = self.counts
+        pairs = self.reading.evidence.pairs
+        if not pairs:
+            return f"{second} and {first} cannot be compared: no task was tried by both"
+        difference = 100 * self.reading.evidence.difference
+        low, high = (100 * (end or 0.0) for end in ends(self.reading.interval))
+        counts = [f"{j} of {m}", f"{k} of {n}"]
+        if self.reading.better < 0:
+            first, second, difference, low, high = second, first, -difference, -high, -low
+            counts.reverse()
+        points = f"{round(difference):+d} points [{round(low):+d}, {round(high):+d}]"
+        if self.reading.better:
+            return (
+                f"{second} is better than {first}: {' against '.join(counts)}, {points}; stop here"
+            )
+        found = f"{second} {counts[0]}, {first} {counts[1]}, {points}"
+        if max(-low, high) <= 100 * CLOSE:
+            return f"no difference of more than 10 points: {found}; stop here"
+        more = self.reading.more
+        rest = (
+            f"likely to be decided after {more} more {noun('trial', more)} of each"
+            if more is not None
+            else "no number of trials worth running is likely to decide it"
+        )
+        return f"undecided: {found}; {rest}"
+
+
+def compare_policies(
+    rows: Sequence[TrialRow],
+    protocol: Protocol | None = None,
+    void_causes: Sequence[str] = VOID_CAUSES,
+) -> list[Answer]:
+    """Answer every question over all tasks, then in each task where there are several."""
+    found = (Candidate(policy=row.policy, condition=row.condition) for row in rows)
+    asked = questions(found, protocol)
+    made = {q: tries_of(rows, q, void_causes) for q in asked}
+    asked = [q for q in asked if {each.is_second for each in made[q]} == {False, True}]
+    plan = plan_of(protocol)
+    primary = [q for q in asked if q.is_primary]
+    answers = [_answer(q, made[q], read_tries(plan, made[q]), "") for q in primary]
+    others = [q for q in asked if not q.is_primary]
+    readings = with_holm(others, plan, lambda part, q: read_tries(part, made[q]))
+    answers += [_answer(q, made[q], r, "") for q, r in zip(others, readings, strict=True)]
+    parts = [
+        (q, task)
+        for q in asked
+        for task in dict.fromkeys(each.task for each in made[q])
+        if len({each.task for each in made[q]}) > 1
+    ]
+    each_task = plan_of(protocol, of_task=True)
+
+    def of_task(part: Plan, item: tuple[Question, str]) -> Reading:
+        return read_tries(part, [each for each in made[item[0]] if each.task == item[1]])
+
+    for (q, task), reading in zip(parts, with_holm(parts, each_task, of_task), strict=True):
+        answers.append(_answer(q, made[q], reading, task))
+    return answers
+
+
+def plan_of(protocol: Protocol | None, *, of_task: bool = False) -> Plan:
+    """Return the plan that a protocol locked; one that is supposed without."""
+    if protocol is None or protocol.primary is None:
+        return Plan()
+    starts = [task.starts for task in protocol.tasks]
+    pairs = max(starts) if of_task else sum(starts)
+    return Plan(pairs=max(4, pairs), locked=not protocol.edited, alpha=protocol.alpha)
+
+
+def _answer(question: Question, tries: Sequence[Try], reading: Reading, task: str) -> Answer:
+    mine = [each for each in tries if not task or each.task == task]
+    sides = [[t for t in mine if t.is_second == is_second] for is_second in (False, True)]
+    counts = [(sum(t.succeeded for t in side), len(side)) for side in sides]
+    unknown = [sum(not t.has_outcome for t in side) for side in sides]
+    known = evidence_of([each for each in mine if each.has_outcome])
+    return Answer(
+        question=question,
+        task=task,
+        counts=(counts[0], counts[1]),
+        reading=reading,
+        no_outcome=(unknown[0], unknown[1]),
+        without_these=known.difference if any(unknown) and known.pairs else None,
+        episodes=tuple(each.row.episode for each in mine),
+    )
+
+
+def compare_counts(groups: Sequence[RateGroup]) -> list[Answer]:
+    """Answer the same of a table of rates; nothing of what has no n, or counts parts of trials."""
+    counted = [g for g in groups if g.unit == "trial" and g.recorded.k is not None and g.recorded.n]
+    cells = {(g.task, Candidate(policy=g.policy, condition=g.condition)): g for g in counted}
+    asked = []
+    for question in questions(c for _, c in cells):
+        tasks = [t for t, c in cells if c == question.first and (t, question.second) in cells]
+        sides = [
+            [(m.k or 0, m.n or 0) for t in tasks for m in (cells[t, c].recorded,)]
+            for c in (question.first, question.second)
+        ]
+        if tasks:
+            asked.append((question, sides))
+
+    def evidence(sides: list[list[tuple[int, int]]]) -> Evidence:
+        pairs = zip(*sides, strict=True)
+        return Evidence(strata=tuple(Stratum(first=a, second=b) for a, b in pairs))
+
+    readings = with_holm(
+        asked, Plan(), lambda plan, item: read(plan, all_ := evidence(item[1]), lambda _: all_)
+    )
+    return [
+        Answer(question=question, task="", counts=tuple(map(_sum, sides)), reading=reading)  # type: ignore[arg-type]
+        for (question, sides), reading in zip(asked, readings, strict=True)
+    ]
+
+
+def _sum(side: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    return sum(k for k, _ in side), sum(n for _, n in side)
+
+
+def comparison_part(answers: Sequence[Answer], protocol: Protocol | None = None) -> Part:
+    """Lay answers out; the first column that a reader needs is the sentence."""
+    if not answers:
+        return Part()
+    sentences: list[dict[str, Cell]] = [
+        {"answer": each.sentence, "task": each.task or ALL_TASKS} for each in answers
+    ]
+    plan = plan_of(protocol)
+    words = (
+        f"planned: {plan.pairs} pairs"
+        if plan.locked
+        else f"no plan was locked: as if {plan.pairs} pairs had been planned"
+    )
+    table = Table.of(
+        sentences,
+        id="comparisons",
+        title="Which is better, as recorded",
+        note=f"Group-sequential score test, {words}, extended by doubling; alpha {plan.alpha:g} "
+        "holds however often one looks. All questions share it (Holm), a primary one has it alone, "
+        "and the same in each task share another. Intervals hold at every look. Trials without an "
+        "outcome are failures.",
+    )
+    numbers = Table.of(
+        [_row(each) for each in answers],
+        id="comparison_numbers",
+        title="The counts behind these answers",
+        note="Pairs: starts that both tried, else one trial of each.",
+    )
+    return Part(
+        measurements=tuple(_measured(each) for each in answers),
+        tables=(table, *_standing(answers), numbers),
+    )
+
+
+def _row(answer: Answer) -> dict[str, Cell]:
+    reading = answer.reading
+    (k, n), (j, m) = answer.counts
+    first, second = answer.question.names
+    known = reading.evidence.pairs > 0
+    low, high = ends(reading.interval, 100.0)
+    return {
+        "task": answer.task or ALL_TASKS,
+        "better?": second,
+        "than": first,
+        "k": j,
+        "n": m,
+        "k of the other": k,
+        "n of the other": n,
+        "shared starts": sum(each.pairs for each in reading.evidence.strata),
+        "difference (pp)": 100 * reading.evidence.difference if known else None,
+        "low": low,
+        "high": high,
+        "decided": {1: "better", -1: "worse", 0: "no"}[reading.better],
+        "decided after (pairs)": None if reading.decided is None else reading.decided.pairs,
+        "more trials of each": reading.more,
+        "without an outcome": sum(answer.no_outcome) or None,
+        "difference without these (pp)": None
+        if answer.without_these is None
+        else 100 * answer.without_these,
+    }
+
+
+def _measured(answer: Answer) -> Measurement:
+    question, evidence = answer.question, answer.reading.evidence
+    parts = {
+        "second": f"{question.second.policy}_{question.second.condition}".strip("_") or "unnamed",
+        "first": f"{question.first.policy}_{question.first.condition}".strip("_") or "unnamed",
+        "words": answer.sentence,
+    }
+    defined = (
+        COMPARED_IN_TASK.of(**parts, task=answer.task) if answer.task else COMPARED.of(**parts)
+    )
+
+    def compute() -> tuple[float, Interval | None]:
+        if not evidence.pairs or answer.reading.interval is None:
+            reason = "no task was tried by both"
+            raise UndefinedStatisticError(statistic="comparison", reason=reason)
+        found = answer.reading.interval
+        points = replace(found, low=100 * found.low, high=100 * found.high)
+        return 100 * evidence.difference, points
+
+    n = sum(n for _, n in answer.counts)
+    return measured(defined, compute, n=n, counted="trial", episodes=answer.episodes)
+
+
+def _standing(answers: Sequence[Answer]) -> tuple[Table, ...]:
+    """Say who may be best, of three candidates and more: whoever nobody was shown to be better."""
+    beaten: dict[Candidate, list[str]] = {}
+    rates: dict[Candidate, tuple[int, int]] = {}
+    for each in answers:
+        if each.task:
+            continue
+        pair = (each.question.first, each.question.second)
+        for side, candidate in enumerate(pair):
+            rates.setdefault(candidate, each.counts[side])
+            beaten.setdefault(candidate, [])
+        if each.reading.better:
+            loser, winner = pair if each.reading.better > 0 else pair[::-1]
+            beaten[loser].append(winner.words)
+    if len(beaten) < 3:
+        return ()
+    rows: list[dict[str, Cell]] = [
+        {
+            "candidate": candidate.words,
+            "k": rates[candidate][0],
+            "n": rates[candidate][1],
+            "may be best": "no" if by else "yes",
+            "beaten by": ", ".join(by) or None,
+        }
+        for candidate, by in beaten.items()
+    ]
+    note = "Not a ranking: whoever is not shown to be worse than another may be the best."
+    return (Table.of(rows, id="standing", title="Who may be best", note=note),)

@@ -1,0 +1,137 @@
+"""What it costs to take what the twin ranks first, and which pairs of candidates it confuses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from evaluator.compare.measure import measured
+from evaluator.compare.rows import RateGroup
+from evaluator.errors import UndefinedStatisticError
+from evaluator.measurements import REGRET, WRONG_BY, WRONG_PAIRS
+from evaluator.result import Interval, Measurement
+from evaluator.statistics.intervals import LEVEL, normal_quantile
+from evaluator.statistics.sequential import ALPHA, Evidence, Stratum
+
+METHOD = "multiple-comparisons-with-the-best"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """Candidates over the tasks that all of them have."""
+
+    kind: str
+    """policy or condition."""
+    names: tuple[str, ...]
+    members: tuple[tuple[RateGroup, ...], ...]
+    """Groups of each candidate, in the same order of tasks."""
+
+    def rates(self, side: str) -> list[float]:
+        """Mean rate of each candidate, recorded or of the twin."""
+        found = [[float(getattr(g, f"{side}_rate") or 0) for g in each] for each in self.members]
+        return [sum(each) / len(each) for each in found]
+
+
+def choice_of(groups: Sequence[RateGroup]) -> Choice | None:
+    """Return what is chosen between: policies, else conditions; None where there is one alone."""
+    kinds = ("policy", "condition")
+    kind = next((k for k in kinds if len({getattr(g, k) for g in groups}) > 1), None)
+    if kind is None:
+        return None
+    other = kinds[1 - kinds.index(kind)]
+    names = tuple(dict.fromkeys(getattr(group, kind) for group in groups))
+    cells: dict[tuple[str, str], dict[str, RateGroup]] = {}
+    for group in groups:
+        cells.setdefault((group.task, getattr(group, other)), {})[getattr(group, kind)] = group
+    shared = [cell for cell in cells.values() if len(cell) == len(names)]
+    if not shared:
+        return None
+    members = tuple(tuple(cell[name] for cell in shared) for name in names)
+    return Choice(kind=kind, names=names, members=members)
+
+
+def regret_results(groups: Sequence[RateGroup]) -> list[Measurement]:
+    """Measure the loss of taking the twin's first, and the pairs that it orders wrongly.
+
+    Args:
+        groups: With both rates.
+    """
+    choice = choice_of(groups)
+    if choice is None:
+        return []
+    recorded, sim = choice.rates("recorded"), choice.rates("sim")
+    first = [place for place, rate in enumerate(sim) if rate == max(sim)]
+    words = " or ".join(choice.names[place].replace("_", " ") for place in first)
+    episodes = [name for each in choice.members for group in each for name in group.episodes]
+    loss = 100 * (max(recorded) - sum(recorded[place] for place in first) / len(first))
+    interval = _with_the_best(choice, first)
+    count = len(choice.names)
+    found = [
+        measured(
+            REGRET.of(words=words),
+            lambda: (loss, interval),
+            n=count,
+            counted=choice.kind,
+            reason_without_interval="the number of trials of a group is not known",
+            episodes=episodes,
+        )
+    ]
+    pairs = [(i, j) for j in range(count) for i in range(j) if recorded[i] != recorded[j]]
+    wrong = [(i, j) for i, j in pairs if (recorded[i] - recorded[j]) * (sim[i] - sim[j]) <= 0]
+    named = [f"{choice.names[i]} and {choice.names[j]}" for i, j in wrong[:4]]
+
+    def share() -> float:
+        if not pairs:
+            reason = "all candidates have the same recorded rate"
+            raise UndefinedStatisticError(statistic="wrong pairs", reason=reason)
+        return len(wrong) / len(pairs)
+
+    def size() -> float:
+        if not wrong:
+            raise UndefinedStatisticError(statistic="wrong pairs", reason="no pair is wrong")
+        return 100 * sum(abs(recorded[i] - recorded[j]) for i, j in wrong) / len(wrong)
+
+    shown = f": {', '.join(named).replace('_', ' ')}" if named else ""
+    for quantity, compute in ((WRONG_PAIRS, share), (WRONG_BY, size)):
+        found.append(
+            measured(
+                quantity.of(words=shown),
+                compute,
+                n=len(pairs),
+                counted="pair",
+                reason_without_interval="the pairs are these; each has its comparison",
+            )
+        )
+    return found
+
+
+def _with_the_best(choice: Choice, first: Sequence[int]) -> Interval | None:
+    """Hsu 1984: the loss lies between the largest lower and the largest upper end to the others."""
+    z = normal_quantile(1 - ALPHA / (2 * (len(choice.names) - 1)))
+    lows, highs = [], []
+    for mine in first:
+        ends = [
+            found
+            for other in range(len(choice.names))
+            if other != mine
+            for found in (_difference(choice.members[mine], choice.members[other], z),)
+        ]
+        if None in ends:
+            return None
+        known = [each for each in ends if each is not None]
+        lows.append(max(0.0, *(each.low for each in known)))
+        highs.append(max(0.0, *(each.high for each in known)))
+    return Interval(low=100 * min(lows), high=100 * max(highs), level=LEVEL, method=METHOD)
+
+
+def _difference(
+    first: Sequence[RateGroup], second: Sequence[RateGroup], z: float
+) -> Interval | None:
+    strata = []
+    for a, b in zip(first, second, strict=True):
+        if a.unit != "trial" or b.unit != "trial":
+            continue  # parts of one trial are not independent
+        if a.recorded.k is None or not a.recorded.n or b.recorded.k is None or not b.recorded.n:
+            return None
+        strata.append(
+            Stratum(first=(a.recorded.k, a.recorded.n), second=(b.recorded.k, b.recorded.n))
+        )
+    return Evidence(strata=tuple(strata)).interval(z) if strata else None

@@ -1,0 +1,325 @@
+"""How far the twin follows over all groups of this kind, and in which groups it may be blind.
+
+A population of groups is two curves of log-odds and a copula between them, and a share of groups in
+which the twin is blind: there it says something that has nothing to do with what is recorded. Some
+thousand populations are drawn once from the prior, each laid out as chances of pairs of rates; what
+was counted weighs them. So one product of two matrices gives the posterior, and equal counts give
+equal numbers. Where fewer than ``FEW`` populations would count, the weights are flattened until so
+many do: intervals are wider then, never narrower than the drawn populations can tell. Groups that
+share tasks or policies count as fewer, by how much their rates have in common.
+"""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.special import betainc, expit, ndtr, ndtri
+
+from evaluator.errors import UndefinedStatisticError
+from evaluator.result import Interval
+from evaluator.statistics.intervals import LEVEL
+
+METHOD = "populations"
+MIN_GROUPS = 3
+NODES = 16_384
+FEW = 60.0
+CELLS = 21
+EDGES = np.concatenate([[-np.inf], np.linspace(-4.6, 4.6, CELLS - 1), [np.inf]])
+"""Log-odds between which rates are as good as alike."""
+CENTRES = np.concatenate([[-5.3], (EDGES[1:-2] + EDGES[2:-1]) / 2, [5.3]])
+MOST = 100
+"""A larger side is taken as one of so many trials: its rate is as good as known then."""
+AT_END = 0.02
+"""An interval that ends this close to 1 or -1 holds it: no population was drawn at the end."""
+QUADRATURE = np.linspace(-3.4, 3.4, 21)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupCounts:
+    """What was counted in one group."""
+
+    recorded: tuple[int, int]
+    """Successes and trials that have no partner in the twin."""
+    sim: tuple[int, int]
+    """The twin's, of trials without a recorded partner."""
+    pairs: tuple[int, int, int, int] = (0, 0, 0, 0)
+    """Paired trials in which both succeed, only sim, only recorded, neither."""
+    shares: tuple[Hashable, ...] = ()
+    """What it may share with other groups: its task, its policy."""
+
+    @property
+    def totals(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Successes and trials, recorded and in the twin, over paired and other trials."""
+        both, only_sim, only_recorded, _ = self.pairs
+        n = sum(self.pairs)
+        recorded = (self.recorded[0] + both + only_recorded, self.recorded[1] + n)
+        return recorded, (self.sim[0] + both + only_sim, self.sim[1] + n)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Populations:
+    """Populations drawn from the prior."""
+
+    seeing: Float32[np.ndarray, "nodes cells"]
+    """Chance of each pair of cells, recorded by twin, where the twin is not blind."""
+    recorded: Float32[np.ndarray, "nodes rates"]
+    blind: Float32[np.ndarray, "nodes rates"]
+    """Of what a blind twin says."""
+    share: Float64[np.ndarray, " nodes"]
+    """Of groups in which it is blind."""
+    r: Float64[np.ndarray, " nodes"]
+    bias: Float64[np.ndarray, " nodes"]
+
+
+@lru_cache(maxsize=2)
+def _drawn(nodes: int = NODES, seed: int = 0) -> _Populations:
+    rng = np.random.default_rng(seed)
+    z, u = rng.standard_normal((nodes, 8)), rng.random((nodes, 5))
+    recorded_at = 1.6 * z[:, 0]
+    sim_at = recorded_at + 1.2 * z[:, 1]
+    size = np.maximum(np.abs(2 * z[:, 2]), 0.02)
+    sim_size = np.maximum(size * np.exp(0.5 * z[:, 3]), 0.02)
+    rho = np.sin(np.pi * (u[:, 0] - 0.5))
+    share = np.where(u[:, 1] < 0.5, 0.0, 0.5 * u[:, 2])
+    bends = (
+        np.where(u[:, 3] < 0.6, 0.0, u[:, 3] * 0.95),
+        np.where(u[:, 4] < 0.6, 0.0, u[:, 4] * 0.95),
+    )
+    blind_at, blind_size = 2 * z[:, 4], np.maximum(np.abs(z[:, 5]), 0.05)
+    sides = [
+        _masses(at, spread, bend)
+        for at, spread, bend in (
+            (recorded_at, size, bends[0]),
+            (sim_at, sim_size, bends[1]),
+            (blind_at, blind_size, np.zeros(nodes)),
+        )
+    ]
+    (x, middle_x), (y, middle_y), (blind, _) = sides
+    near = np.clip(rho, -0.97, 0.97)[:, None, None]
+    a, b = middle_x[:, :, None], middle_y[:, None, :]
+    seeing = np.exp(-(near**2 * (a * a + b * b) - 2 * near * a * b) / (2 * (1 - near**2)))
+    seeing *= x[:, :, None] * y[:, None, :]
+    seeing /= seeing.sum(axis=(1, 2), keepdims=True)
+    r, bias = _moments(
+        (recorded_at, size, bends[0]),
+        (sim_at, sim_size, bends[1]),
+        rho,
+        share,
+        blind_at,
+        blind_size,
+    )
+    return _Populations(
+        seeing=seeing.reshape(nodes, -1).astype(np.float32),
+        recorded=seeing.sum(axis=2).astype(np.float32),
+        blind=blind.astype(np.float32),
+        share=share,
+        r=r,
+        bias=bias,
+    )
+
+
+def _bent(z: np.ndarray, bend: np.ndarray | float) -> np.ndarray:
+    """A straight line, or by ``bend`` two levels with little between them."""
+    return np.asarray((1 - bend) * z + bend * 1.25 * np.tanh(3 * z))
+
+
+def _masses(at: np.ndarray, size: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Chance of each cell of log-odds, and the normal number in its middle."""
+    z = np.linspace(-6, 6, 241)
+    ends = (EDGES[None, 1:-1] - at[:, None]) / size[:, None]
+    found = ends.copy()
+    for node in np.flatnonzero(bend):
+        found[node] = np.interp(ends[node], _bent(z, float(bend[node])), z)
+    below = np.concatenate([np.zeros((len(at), 1)), ndtr(found), np.ones((len(at), 1))], axis=1)
+    middle = ndtri(np.clip((below[:, 1:] + below[:, :-1]) / 2, 1e-9, 1 - 1e-9))
+    return np.diff(below, axis=1) + 1e-12, middle
+
+
+Side = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _moments(
+    recorded: Side,
+    sim: Side,
+    rho: np.ndarray,
+    share: np.ndarray,
+    blind_at: np.ndarray,
+    blind_size: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation and mean difference of both rates in each population."""
+    w = np.exp(-0.5 * QUADRATURE**2)
+    w /= w.sum()
+    z = QUADRATURE[None, :]
+    at, size, bend = (each[:, None] for each in recorded)
+    x = expit(at + size * _bent(z, bend))
+    at, size, bend = (each[:, None, None] for each in sim)
+    other = rho[:, None, None] * z[:, :, None] + np.sqrt(1 - rho**2)[:, None, None] * z[:, None, :]
+    y = expit(at + size * _bent(other, bend))
+    given = y @ w
+    of_blind = expit(blind_at[:, None] + blind_size[:, None] * z)
+    mean_x, square_x = x @ w, x**2 @ w
+    mean_y = (1 - share) * (given @ w) + share * (of_blind @ w)
+    square_y = (1 - share) * ((y**2 @ w) @ w) + share * (of_blind**2 @ w)
+    both = (1 - share) * ((x * given) @ w) + share * mean_x * (of_blind @ w)
+    spread = (square_x - mean_x**2) * (square_y - mean_y**2)
+    r = (both - mean_x * mean_y) / np.sqrt(np.maximum(spread, 1e-14))
+    return np.clip(r, -1, 1), mean_y - mean_x
+
+
+@dataclass(frozen=True, kw_only=True)
+class GapModel:
+    """What some groups say of the population that they are from."""
+
+    groups: tuple[GroupCounts, ...]
+    nodes: int = NODES
+    seed: int = 0
+    weights: Float64[np.ndarray, " nodes"] = field(init=False, repr=False)
+    blind_groups: Float64[np.ndarray, " groups"] = field(init=False, repr=False)
+    """Probability of each group that the twin is blind in it."""
+
+    def __post_init__(self) -> None:
+        """Weigh the populations.
+
+        Raises:
+            UndefinedStatisticError: Below three groups, or when a side of one has no trial.
+        """
+        reason = ""
+        if len(self.groups) < MIN_GROUPS:
+            reason = f"{len(self.groups)} groups; it needs at least {MIN_GROUPS}"
+        elif any(n == 0 for group in self.groups for _, n in group.totals):
+            reason = "a group has no trial on one side"
+        if reason:
+            raise UndefinedStatisticError(statistic="model of agreement", reason=reason)
+        there = self.populations
+        odds = common_log_odds(self.groups)
+        table = np.stack([_likelihood(group, odds) for group in self.groups])
+        seeing = there.seeing @ table.reshape(len(table), -1).T.astype(np.float32)
+        of_blind = np.einsum("gxy,ny->ngx", table, there.blind, optimize=True)
+        blind = np.einsum("ngx,nx->ng", of_blind, there.recorded)
+        share = there.share[:, None]
+        chance = np.maximum((1 - share) * seeing + share * blind, 1e-35)
+        logs = np.log(chance).sum(axis=1) / self.design_effect
+        weights = _flattened(logs)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "blind_groups", weights @ (share * blind / chance))
+
+    @property
+    def populations(self) -> _Populations:
+        """The populations that are weighed."""
+        return _drawn(self.nodes, self.seed)
+
+    @cached_property
+    def design_effect(self) -> float:
+        """How many groups count as one, by the tasks and policies that they share."""
+        rates = np.array([[k / n for k, n in group.totals] for group in self.groups])
+        found = 1.0
+        for place in range(len(self.groups[0].shares)):
+            names = [group.shares[place] for group in self.groups]
+            found += max(_shared(names, side) for side in rates.T)
+        return found
+
+    @property
+    def r(self) -> Interval:
+        """Correlation of true rates over all groups of this kind."""
+        low, high = self._ends(self.populations.r)
+        return Interval(
+            low=-1.0 if low < AT_END - 1 else low,
+            high=1.0 if high > 1 - AT_END else high,
+            level=LEVEL,
+            method=METHOD,
+        )
+
+    @property
+    def bias(self) -> Interval:
+        """Mean of the twin's rate - recorded rate over all groups of this kind."""
+        low, high = self._ends(self.populations.bias)
+        return Interval(low=low, high=high, level=LEVEL, method=METHOD)
+
+    @property
+    def blind_share(self) -> tuple[float, Interval]:
+        """Share of groups of this kind in which the twin is blind: mean and interval."""
+        share = self.populations.share
+        low, high = self._ends(share)
+        found = Interval(low=low, high=high, level=LEVEL, method=METHOD)
+        return float(self.weights @ share), found
+
+    def _ends(self, values: Float64[np.ndarray, " nodes"]) -> tuple[float, float]:
+        order = np.argsort(values, kind="stable")
+        middle = np.cumsum(self.weights[order]) - self.weights[order] / 2
+        tail = (1 - LEVEL) / 2
+        low, high = np.interp([tail, 1 - tail], middle, values[order])
+        return float(low), float(high)
+
+
+def _shared(names: Sequence[Hashable], rates: Float64[np.ndarray, " groups"]) -> float:
+    """Groups of a name less one, times how much of the variance of rates names share."""
+    places = [np.flatnonzero([other == name for other in names]) for name in dict.fromkeys(names)]
+    many = len(names) / len(places)
+    if len(places) < 2 or many <= 1:
+        return many - 1 if many > 1 and len(places) > 1 else 0.0
+    inside = sum(((rates[p] - rates[p].mean()) ** 2).sum() for p in places)
+    inside /= len(names) - len(places)
+    between = sum(len(p) * (rates[p].mean() - rates.mean()) ** 2 for p in places)
+    between /= len(places) - 1
+    variance = max((between - inside) / many, 0.0)
+    return float((many - 1) * variance / max(variance + inside, 1e-12))
+
+
+def _flattened(logs: Float64[np.ndarray, " nodes"]) -> Float64[np.ndarray, " nodes"]:
+    """Return weights of sum 1, flattened by a power until enough populations count."""
+    power, weights = 1.0, logs
+    for _ in range(60):
+        weights = np.exp(power * (logs - logs.max()))
+        weights /= weights.sum()
+        if 1 / (weights**2).sum() >= FEW:
+            break
+        power *= 0.9
+    return np.asarray(weights)
+
+
+def _likelihood(group: GroupCounts, odds: float) -> Float64[np.ndarray, "rates rates"]:
+    """Chance of a group's counts for each pair of cells, up to a factor."""
+    found = np.outer(_binomial(*group.recorded), _binomial(*group.sim))
+    if not sum(group.pairs):
+        return found
+    p, q = expit(CENTRES)[:, None], expit(CENTRES)[None, :]
+    both = _both(p, q, float(np.exp(odds)))
+    scale = min(1.0, MOST / sum(group.pairs))
+    logs = np.zeros_like(found)
+    for n, chance in zip(group.pairs, (both, q - both, p - both, 1 - p - q + both), strict=True):
+        logs += scale * n * np.log(np.maximum(chance, 1e-300))
+    return np.asarray(found * np.exp(logs - logs.max()))
+
+
+def _binomial(k: int, n: int) -> Float64[np.ndarray, " rates"]:
+    """Mean chance of a count over the rates of each cell, 1 without trials."""
+    if not n:
+        return np.ones(CELLS)
+    scale = min(1.0, MOST / n)
+    a, b = scale * k + 1, scale * (n - k) + 1
+    rates = expit(EDGES)
+    return np.asarray(np.diff(betainc(a, b, rates)) / np.diff(rates))
+
+
+def common_log_odds(groups: Sequence[GroupCounts]) -> float:
+    """Return the log odds ratio of paired outcomes within groups (Mantel and Haenszel 1959).
+
+    Half a pair is added to each cell in all; 0 without pairs.
+    """
+    tables = [group.pairs for group in groups if sum(group.pairs)]
+    if not tables:
+        return 0.0
+    agree = sum(a * d / (a + b + c + d) for a, b, c, d in tables) + 0.25
+    differ = sum(b * c / (a + b + c + d) for a, b, c, d in tables) + 0.25
+    return float(np.clip(np.log(agree / differ), -5.0, 5.0))
+
+
+def _both(p: np.ndarray, q: np.ndarray, odds: float) -> np.ndarray:
+    """Chance that both succeed, from both rates and the odds ratio (Plackett 1965)."""
+    if abs(odds - 1) < 1e-9:
+        return np.asarray(p * q)
+    total = 1 + (odds - 1) * (p + q)
+    root = np.sqrt(np.maximum(total**2 - 4 * odds * (odds - 1) * p * q, 0.0))
+    return np.asarray(2 * odds * p * q / (total + root))

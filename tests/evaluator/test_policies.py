@@ -1,0 +1,169 @@
+"""Which candidate is better: what is a pair, who may be best, and that advice may be followed."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+from evaluator.compare.policies import (
+    Answer,
+    compare_counts,
+    compare_policies,
+    comparison_part,
+    read_tries,
+    tries_of,
+)
+from evaluator.compare.regret import regret_results
+from evaluator.compare.rows import TrialRow
+from evaluator.compare.success import rate_groups, side_rates
+from evaluator.result import Measurement
+from evaluator.statistics.sequential import Plan
+
+
+def row(number: int, policy: str, success: bool | None, **more: object) -> TrialRow:
+    values: dict[str, object] = {
+        "episode": f"t{number}",
+        "task": "cup",
+        "condition": "",
+        "policy": policy,
+        "start_id": None,
+        "cell": "",
+        "stand_in": None,
+        "recorded": success,
+    }
+    return TrialRow(**{**values, **more})  # type: ignore[arg-type]
+
+
+def interleaved(outcomes: Mapping[str, Sequence[bool]], *, starts: bool = True) -> list[TrialRow]:
+    count = max(map(len, outcomes.values()))
+    return [
+        row(100 * place + side, policy, bool(made[place]), start_id=f"s{place}" if starts else None)
+        for place in range(count)
+        for side, (policy, made) in enumerate(outcomes.items())
+        if place < len(made)
+    ]
+
+
+def only(answers: Sequence[Answer]) -> Answer:
+    assert len(answers) == 1
+    return answers[0]
+
+
+CLEAR = {"A": [True, False, False, False] * 10, "B": [True, True, True, False] * 10}
+
+
+@pytest.mark.parametrize("starts", [True, False])
+def test_the_better_one_is_named_with_its_counts_and_the_look(starts: bool) -> None:
+    answer = only(compare_policies(interleaved(CLEAR, starts=starts)))
+    assert answer.counts == ((10, 40), (30, 40))
+    assert answer.sentence.startswith("B is better than A: 30 of 40 against 10 of 40, +50 points [")
+    assert answer.sentence.endswith("stop here")
+    assert answer.reading.decided is not None
+    assert answer.reading.decided.pairs in (5, 10, 15, 20, 30, 40)
+    assert answer.reading.evidence.strata[0].pairs == (40 if starts else 0)
+    turned = only(compare_policies(interleaved(dict(reversed(CLEAR.items())), starts=starts)))
+    assert turned.sentence == answer.sentence
+
+
+def test_what_was_decided_at_a_look_does_not_hang_on_what_came_later() -> None:
+    """The limit was reached at a look; later trials change the interval and not the winner."""
+    rows = interleaved({"A": [False] * 20 + [True] * 8, "B": [True] * 20 + [False] * 8})
+    answer = only(compare_policies(rows))
+    assert answer.reading.better == 1
+    assert answer.reading.decided is not None
+    assert answer.reading.decided.pairs <= 20
+
+
+def test_a_trial_without_an_outcome_is_a_failure_unless_its_cause_is_void() -> None:
+    rows = interleaved(CLEAR)
+    stopped = [
+        row(9000 + place, "B", None, start_id=f"x{place}", why_unknown="protective stop")
+        for place in range(10)
+    ]
+    answer = only(compare_policies([*rows, *stopped]))
+    assert answer.counts[1] == (30, 50)
+    assert answer.no_outcome == (0, 10)
+    assert answer.without_these == pytest.approx(0.5)
+    void = only(compare_policies([*rows, *stopped], void_causes=("protective stop",)))
+    assert void.counts[1] == (30, 40)
+
+
+def test_starts_that_were_localised_apart_or_overlap_in_part_are_not_pairs() -> None:
+    rows = interleaved({"A": [True] * 6, "B": [False] * 4})
+    (stratum,) = only(compare_policies(rows)).reading.evidence.strata
+    assert (stratum.pairs, stratum.first, stratum.second) == (4, (2, 2), (0, 0))
+    moved = [
+        row(7, policy, True, start_id="s", start_positions_m={"cup": (x, 0.0, 0.0)})
+        for policy, x in (("A", 0.4), ("B", 0.45))
+    ]
+    assert only(compare_policies(moved)).reading.evidence.strata[0].pairs == 0
+    again = [*interleaved({"A": [True], "B": [True]}), row(5, "A", True, start_id="s0")]
+    assert only(compare_policies(again)).reading.evidence.strata[0].first == (1, 1)
+
+
+def test_of_several_whoever_is_not_shown_to_be_worse_may_be_best() -> None:
+    rows = interleaved({**CLEAR, "C": [True, True, False, True] * 10})
+    part = comparison_part(compare_policies(rows))
+    standing = next(table for table in part.tables if table.id == "standing")
+    found = {line[0]: line[3] for line in standing.rows}
+    assert found == {"A": "no", "B": "yes", "C": "yes"}
+
+
+def test_advice_may_be_followed_and_equal_candidates_still_get_hardly_a_winner() -> None:
+    """Ten looks, each after as many more trials as the one before advised."""
+    rng = np.random.default_rng(11)
+    winners, studies = 0, 60
+    for _ in range(studies):
+        outcomes = {"A": list(rng.random(200) < 0.5), "B": list(rng.random(200) < 0.5)}
+        size = 10
+        for _ in range(10):
+            rows = interleaved({name: made[:size] for name, made in outcomes.items()}, starts=False)
+            reading = only(compare_policies(rows)).reading
+            if reading.better or reading.more is None or size + reading.more > 150:
+                winners += bool(reading.better)
+                break
+            size += reading.more
+    assert winners <= 0.05 * studies + 2 * np.sqrt(0.05 * 0.95 * studies)
+
+
+def test_pairs_grow_as_they_are_counted() -> None:
+    rng = np.random.default_rng(2)
+    rows = [
+        row(n, "AB"[n % 2], True, start_id=f"s{rng.integers(0, 12)}", task=f"t{rng.integers(0, 2)}")
+        for n in range(60)
+    ]
+    answers = compare_policies(rows)
+    tries = tries_of(rows, answers[0].question, ())
+    assert read_tries(Plan(pairs=4), tries).evidence.pairs == answers[0].reading.evidence.pairs
+
+
+def measurements(rates: dict[str, tuple[int, int]]) -> dict[str, Measurement]:
+    """Ten trials each: successes as recorded, and of the twin."""
+    rows = [
+        row(n, policy, n < recorded, sim_planned=n < sim, start_id=f"{policy}{n}")
+        for policy, (recorded, sim) in rates.items()
+        for n in range(10)
+    ]
+    return {each.id: each for each in regret_results(rate_groups(rows, side_rates(rows)))}
+
+
+def test_regret_is_what_taking_the_twins_first_costs() -> None:
+    found = measurements({"A": (9, 5), "B": (6, 8), "C": (2, 1)})
+    regret = found["decision.regret_pp"]
+    assert regret.value == pytest.approx(30)
+    assert "(B)" in regret.definition
+    assert regret.interval is not None
+    assert regret.interval.low <= 30 <= regret.interval.high
+    assert found["decision.wrong_pairs"].value == pytest.approx(1 / 3)
+    assert found["decision.wrong_pairs_pp"].value == pytest.approx(30)
+    right = measurements({"A": (9, 9), "B": (6, 7)})
+    assert right["decision.regret_pp"].value == 0
+    assert right["decision.wrong_pairs_pp"].value is None
+    assert measurements({"A": (9, 9)}) == {}
+
+
+def test_rates_with_n_are_compared_without_their_trials() -> None:
+    rows = interleaved(CLEAR, starts=False)
+    answer = only(compare_counts(rate_groups(rows, side_rates(rows))))
+    assert answer.counts == ((10, 40), (30, 40))
+    assert answer.reading.better == 1
