@@ -44,9 +44,7 @@ GONE: dict[str, str] = {
         "A playback begins at once and plays once; --start-s and --rate say from where, how fast.",
     ),
     "ls --parquet": "robot-gst ls RUN --json; pandas and DuckDB read its list of episodes.",
-    "recover --in-place": (
-        "Free some space, or move the file to another disk: a copy is made beside it."
-    ),
+    "recover --in-place": "Free some space, or move the file: a copy is made beside it.",
     "import kinova": "Run python datasets/kinova/make_episodes.py DIR RUN.",
     "import splats": "robot-gst rebuild makes scenes; splat viewers open scene/background.ply.",
     **dict.fromkeys(
@@ -65,6 +63,7 @@ GONE: dict[str, str] = {
     "design --past": "Say what is expected: --rate, --gain, --agreement.",
     "design --rate-width": "--width is that of the gain's interval.",
     "design --per-task": "A study asks for its gain over all tasks together.",
+    "evaluate --force": "Delete RUN/results/cache; nothing else remembers a file.",
     "evaluate --masks": "Masks of a run's own views are scored (views.all.psnr_MASK_db).",
     "render --rate-hz": "One frame is drawn for each recorded image.",
     **dict.fromkeys(

@@ -4,13 +4,17 @@ An id is a pattern: ``gain.pp.{side}.{task}.{policy}``. ``Quantity.of`` fills in
 what a ``Measurement`` is made with, so no other module spells an id.
 """
 
+import math
+import sys
+from pathlib import Path
+
 from evaluator import motion_measurements as motion_measurements
 from evaluator import study_measurements as study_measurements
 from evaluator.metrics import image
 from evaluator.metrics.image_protocol import ImageMetric
 from evaluator.metrics.image_scores import METRICS
 from evaluator.quantity import REGISTRY as REGISTRY
-from evaluator.quantity import Better
+from evaluator.quantity import SIGNED, UP, Better, with_tables
 from evaluator.quantity import Defined as Defined
 from evaluator.quantity import Quantity as Quantity
 from evaluator.quantity import new_quantity as _new
@@ -103,6 +107,7 @@ GAIN_RELATIVE = _new(
     "1",
     "higher",
     "relative gain with replanning ({side}), (with - without) / without: {words}; not percentage points",
+    (-1.0, math.inf),
 )
 GAIN_POINTS_AVERAGE = _new(
     "gain.pp.{side}.average",
@@ -115,6 +120,7 @@ GAIN_RELATIVE_AVERAGE = _new(
     "1",
     "higher",
     "relative gain with replanning of the unrounded mean rates of {count} tasks ({side}); not percentage points",
+    (-1.0, math.inf),
 )
 BOSCHLOO = _new(
     "unpaired.boschloo_p.{side}.{task}.{policy}",
@@ -162,8 +168,14 @@ START_DISTANCE = {
 # Agreement over groups. ``{what}`` says over which.
 
 
-def _agreement(name: str, unit: str, better: Better, definition: str) -> Quantity:
-    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}")
+def _agreement(
+    name: str,
+    unit: str,
+    better: Better,
+    definition: str,
+    allowed: tuple[float, float] | None = None,
+) -> Quantity:
+    return _new(f"agreement.{name}", unit, better, f"{definition}{{resampled}}", allowed)
 
 
 PEARSON_R = _agreement(
@@ -171,39 +183,49 @@ PEARSON_R = _agreement(
     "1",
     "higher",
     "Pearson r of the twin's and the recorded success rates {what}",
+    SIGNED,
 )
 PEARSON_R_OF_CONDITION = _new(
-    "agreement.pearson_r.{condition}", "1", "higher", PEARSON_R.definition
+    "agreement.pearson_r.{condition}",
+    "1",
+    "higher",
+    PEARSON_R.definition,
+    SIGNED,
 )
 PEARSON_R_REMEASURED = _new(
     "agreement.pearson_r_remeasured",
     "1",
     "higher",
     "the same r {what}; its band is where r would fall if the same groups were measured again with as many trials",
+    SIGNED,
 )
 MODEL_R = _new(
     "agreement.model.r",
     "1",
     "higher",
     "correlation of the true rates of these groups: the noise of counting is taken out",
+    SIGNED,
 )
 MODEL_R_OTHERS = _new(
     "agreement.model.r_others",
     "1",
     "higher",
     "the same over all groups of this kind; its interval is that of Pearson r",
+    SIGNED,
 )
 MODEL_WITHIN = _new(
     "agreement.model.r_within",
     "1",
     "higher",
     "correlation of log-odds between groups of one task, noise of counting taken out",
+    SIGNED,
 )
 MODEL_BETWEEN = _new(
     "agreement.model.r_between",
     "1",
     "higher",
     "correlation of the mean log-odds of tasks, noise of counting taken out",
+    SIGNED,
 )
 MODEL_OPPOSED = _new(
     "agreement.model.opposed",
@@ -246,6 +268,7 @@ SPEARMAN = _agreement(
     "1",
     "higher",
     "Spearman rank correlation of the same rates {what}; average ranks",
+    SIGNED,
 )
 BIAS = _agreement(
     "bias_pp",
@@ -253,7 +276,13 @@ BIAS = _agreement(
     "none",
     "mean of sim rate - recorded rate {what}; above 0 the twin is optimistic",
 )
-MAE = _agreement("mae_pp", "pp", "lower", "mean |sim rate - recorded rate| {what}")
+MAE = _agreement(
+    "mae_pp",
+    "pp",
+    "lower",
+    "mean size of sim rate - recorded rate {what}",
+    (0.0, 100.0),
+)
 ORDER_ACCURACY = _agreement(
     "order_accuracy",
     "1",
@@ -265,24 +294,6 @@ MMRV_RECORDED = _agreement(
     "1",
     "lower",
     "mean maximum rank violation {what}; convention: gap of recorded rates (SIMPLER equation 1); it grows with the number of groups",
-)
-VARIED_R = _agreement(
-    "varied.pearson_r",
-    "1",
-    "higher",
-    "Pearson r of recorded rates and the twin's of varied replays (each trial's share that succeed, averaged) {what}",
-)
-VARIED_BIAS = _agreement(
-    "varied.bias_pp",
-    "pp",
-    "none",
-    "the twin's rate of varied replays - recorded rate, averaged {what}",
-)
-VARIED_MMRV = _agreement(
-    "varied.mmrv_recorded_gap",
-    "1",
-    "lower",
-    "mean maximum rank violation of varied replays {what}; convention: gap of recorded rates (SIMPLER equation 1)",
 )
 # Trial by trial: the replay, the verdict, the gate. ``{by}`` is sim_planned, verdict and so on.
 
@@ -297,12 +308,14 @@ PHI = _new(
     "1",
     "higher",
     "phi coefficient of {words} and the labelled outcome over trials",
+    SIGNED,
 )
 KAPPA = _new(
     "agreement.{by}.kappa",
     "1",
     "higher",
     "Cohen's kappa of {words} and the labelled outcome over trials",
+    SIGNED,
 )
 PPV = _new(
     "agreement.{by}.ppv",
@@ -358,6 +371,7 @@ BREAK_EVEN_PRICE = _new(
     "1",
     "higher",
     "bad executions avoided / good plans refused, by verdicts that were not obeyed: what refusing a good plan may cost, in bad executions, for the gate to pay",
+    UP,
 )
 _WHOSE = "the probability is the planned replay's, where it has none the verdict's before motion; with replanning the twin selected these plans"
 BRIER = _new(
@@ -401,6 +415,7 @@ def _image(images: str, metric: ImageMetric, variant: str) -> Quantity:
         metric.unit,
         "higher" if metric.higher_is_better else "lower",
         f"{metric.definition}{{protocol}}",
+        UP if metric.id.startswith("lpips") else SIGNED if metric.unit == "1" else UP,
     )
 
 
@@ -412,7 +427,11 @@ VIEWS, RENDERS = (
 )  # fmt: skip
 """By the metric, and whether the images were compared as they are stored."""
 LPIPS_MISSING = _new(
-    "views.{part}.lpips", "1", "lower", "learned perceptual image patch similarity"
+    "views.{part}.lpips",
+    "1",
+    "lower",
+    "learned perceptual image patch similarity",
+    UP,
 )
 DEPTHS = {
     name: _new(
@@ -428,3 +447,9 @@ DEPTHS = {
     )
 }
 """By the field of ``DepthScore``."""
+
+
+if __name__ == "__main__":  # python -m evaluator.measurements docs/metrics.md
+    for name in sys.argv[1:]:
+        page = Path(name)
+        page.write_text(with_tables(page.read_text()))

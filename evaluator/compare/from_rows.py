@@ -40,7 +40,6 @@ from evaluator.compare.tables import (
     success_table,
     trials_table,
 )
-from evaluator.compare.varied_agreement import varied_agreement
 from evaluator.result import Exclusion, Measurement, Table
 
 
@@ -103,7 +102,6 @@ def _measure(rows: Sequence[TrialRow], method: str, void_causes: Sequence[str]) 
         *gains,
         *gain_tests(groups),
         *varied_sim(rows),
-        *varied_agreement(rows, groups),
         *study,
         *paired_gain(pairs),
         *start_distances(pairs),

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from bridge.episode.provenance import hash_file, software
 from bridge.episode.run_folder import RunFolder
-from bridge.exchange.results_intake import PUBLISHED, Taken, take
 from bridge.exchange.table_text import AS_SAVED, TableOptions
 from bridge.exchange.trials_csv import TrialRecord, read_trials, trials_path
 from evaluator.compare.from_rows import compare_rows
+from evaluator.compare.intake import PUBLISHED, Taken, take
 from evaluator.compare.names import settle_names
 from evaluator.compare.published import check_published
 from evaluator.compare.rates import compare_records

@@ -96,7 +96,7 @@ def _write(
     rows = [] if comparison is None else list(comparison.rows)
     motions = () if comparison is None else comparison.motions
     far_m = {
-        motion.episode: motion.position_max_m
+        motion.episode: motion.path_max_m
         for motion in motions
         if (motion.side, motion.against) == ("recorded", "planned")
     }

@@ -64,9 +64,6 @@ SECTIONS: tuple[Section, ...] = (
             ("agreement.pearson_r.without_replanning", "Pearson r, without replanning"),
             ("agreement.pearson_r.with_replanning", "Pearson r, with replanning"),
             ("agreement.pearson_r_remeasured", "Pearson r, were it measured again"),
-            ("agreement.varied.pearson_r", "Pearson r of varied replays"),
-            ("agreement.varied.mmrv_recorded_gap", "MMRV of varied replays, gap of recorded rates"),
-            ("agreement.varied.bias_pp", "Bias of varied replays: sim minus labelled"),
             ("agreement.spearman_rho", "Spearman's rank correlation"),
             ("agreement.model.r", "r without the noise of counting, these groups"),
             ("agreement.model.r_within", "r of log-odds within tasks"),
@@ -99,7 +96,6 @@ SECTIONS: tuple[Section, ...] = (
             ("study.*", ""),
         ),
         tables=("study_arms", "study_gains", "gains", "retries"),
-        figures=("gains",),
     ),
     Section(
         id="gate",
@@ -154,16 +150,14 @@ SECTIONS: tuple[Section, ...] = (
             (f"motion.{against}.{quantity}", f"{words}, {against} replay")
             for against in ("planned", "executed")
             for quantity, words in (
-                ("position_mean_m", "Tool, mean distance"),
+                ("lag_s", "Tool, lag behind the replay"),
+                ("path_mean_m", "Tool, mean distance of the paths, lag taken out"),
+                ("path_max_m", "Tool, largest distance of the paths"),
                 ("end_point_m", "Tool, distance at the end"),
-                ("rotation_mean_rad", "Tool, mean angle"),
-                ("lag_s", "Delay of the recorded motion"),
-                ("without_lag_mean_m", "Mean distance without the delay"),
                 ("joint_rms_rad", "Joints, root mean square"),
             )
         ),
-        tables=("motion*", "end_points_*", "runs_of_end_points_*"),
-        figures=("motions",),
+        tables=("motion*", "end_points_*"),
     ),
     Section(
         id="states",
@@ -172,7 +166,6 @@ SECTIONS: tuple[Section, ...] = (
         "replay left them; and whether labels and localised goals agree.",
         numbers=(("label.*", ""),),
         tables=("final_states", "label*"),
-        figures=("states",),
     ),
     Section(
         id="views",
@@ -190,7 +183,6 @@ SECTIONS: tuple[Section, ...] = (
             ("image.*", ""),
         ),
         tables=("views*", "image*"),
-        figures=("views",),
     ),
     Section(
         id="sequences",

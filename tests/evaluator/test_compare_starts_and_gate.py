@@ -92,7 +92,7 @@ def test_plans_that_were_never_sent_are_counted_apart(six_trials: Any) -> None:
 def test_the_largest_tool_error_is_not_lost_between_samples(maker: Any) -> None:
     maker.trial("t1", num_poses=900)
     maker.replay("t1", num_poses=900, astray=301)
-    largest = compare_run(maker.run).results().get("motion.planned.position_max_m")
+    largest = compare_run(maker.run).results().get("motion.planned.path_max_m")
     assert largest.value == pytest.approx(1.0)
 
 
