@@ -94,12 +94,13 @@ def compare_taken(
 def unknown_sides(rows: Sequence[TrialRow]) -> list[Exclusion]:
     """Trials that lack a side; of an unpaired group all do, and each side counts on its own."""
     unpaired = unpaired_keys(rows)
+    has_twin = any(row.sim_planned is not None for row in rows)
     return [
         Exclusion(episode=row.episode, scope="agreement", reason=reason)
         for row in rows
         for reason, lacks in (
             ("the outcome is unknown", row.recorded is None),
-            ("sim_planned is unknown", row.sim_planned is None),
+            ("sim_planned is unknown", row.sim_planned is None and has_twin),
         )
         if lacks
         and (

@@ -101,7 +101,8 @@ def page(
         .get_template("report.html")
         .render(
             results=results,
-            title=f"{results.run}: how far to trust the twin",
+            title=f"{results.run}: {_question(results).lower()}",
+            question=_question(results),
             shared_mark=Markup(NO_SHARED),
             source=SOURCES.get(results.source, results.source),
             banner=wording.stand_in_sentence(results),
@@ -121,6 +122,13 @@ def page(
             next_figure=count(1).__next__,
         )
     )
+
+
+def _question(results: Results) -> str:
+    """What the page answers; a study without a twin asks for no trust in one."""
+    names = ("rate.sim", "agreement.", "views.", "image.", "motion.")
+    has_twin = any(m.value is not None and m.id.startswith(names) for m in results.measurements)
+    return "How far to trust the twin" if has_twin else "What succeeded, and how surely"
 
 
 def name_shared(report: Path) -> None:

@@ -157,6 +157,8 @@ def headlines(results: Results) -> list[tuple[str, str, Measurement]]:
             if not name.startswith("motion.planned.")
         )
     found = [(label, by_id[name]) for name, label in listed if name in by_id]
+    if results.source not in ("run", "images"):  # who gave a table knows what is not in it
+        found = [(label, m) for label, m in found if m.value is not None]
     return [(label, measurement_text(m), m) for label, m in found]
 
 

@@ -167,7 +167,7 @@ def summary_text(results: Results, written: Written) -> str:
     shown = [t for t in results.tables if t.id in SHOWN or t.id.startswith("end_points_")]
     parts += [as_text(table) for table in shown]
     lines = [f"{label}: {text}" for label, text, _ in headlines(results)]
-    if lines or not results.measurements:
+    if lines or not any(m.value is not None for m in results.measurements):
         parts.append("\n".join(lines) if lines else "Nothing could be measured.")
     if results.exclusions:
         parts.append(
