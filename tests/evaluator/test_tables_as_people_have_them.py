@@ -177,10 +177,6 @@ READ: dict[str, tuple[str, Rates | Trials]] = {
         [("cup", "ACT", True, None), ("cup", "ACT", False, None), ("cup", "ACT", True, None)]
         + [("cup", "ACT", None, True)] * 3,
     ),
-    "percent on one side, fractions on the other": (
-        "policy,real (%),sim\nACT,70,0.75\nDP,85.5,0.9\n",
-        fractions("table", "7/10 171/200", "3/4 9/10"),
-    ),
     "a footnote below": (
         "policy,real,sim\nACT,50%,60%\nDP,70%,80%\n* all on Monday,,\n",
         fractions("table", "1/2 7/10", "3/5 4/5"),
@@ -206,10 +202,6 @@ READ: dict[str, tuple[str, Rates | Trials]] = {
         "task,policy,real,sim\ncup,ACT,7/10,8/10\n,DP,5/10,6/10\ncube,ACT,3/10,5/10\n"
         ",DP,1/10,2/10\n",
         counts("cup", "7/10 5/10", "8/10 6/10") | counts("cube", "3/10 1/10", "5/10 2/10"),
-    ),
-    "success rates in percent by side": (
-        "Task,Model,Environment,Success rate (%),Trials\ncup,ACT,real,70,10\ncup,ACT,sim,85,20\n",
-        {("cup", "ACT", "real"): (7, 10), ("cup", "ACT", "sim"): (17, 20)},
     ),
     "a name that says sim or real": (
         "experiment,policy,success,trials\ncup_real,ACT,7,10\ncup_sim,ACT,8,10\n",
@@ -410,11 +402,6 @@ def test_a_date_of_a_workbook_is_no_count(write_book: Callable[..., Path]) -> No
     path = write_book([["policy", "real", "sim"], ["ACT", datetime(2026, 10, 7), "8/10"]])
     with pytest.raises(BridgeError, match=r"row 2.*date"):
         take(path)
-
-
-def test_the_trials_of_a_workbook(write_book: Callable[..., Path]) -> None:
-    path = write_book([["Task", "Policy", "Success"], ["cup", "ACT", True], ["cup", "ACT", 0]])
-    check(take(path), [("cup", "ACT", True, None), ("cup", "ACT", False, None)])
 
 
 def test_every_rate_of_up_to_forty_trials_is_counted_at_full_precision(tmp_path: Path) -> None:

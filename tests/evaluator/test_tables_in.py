@@ -106,15 +106,6 @@ def test_a_trial_that_cannot_be_is_refused_with_its_row(
         read_trials(write_table(text))
 
 
-def test_46_percent_of_ten_trials_is_refused(write_table: Callable[[str], Path]) -> None:
-    path = write_table("task,side,unit,n,rate_percent\nducks,real,trial,10,46.0\n")
-    with pytest.raises(
-        TableError, match=r"row 2: 0.46 x 10 = 4.6 .*4/10.*5/10.*23 of 50"
-    ) as caught:
-        read_rates(path)
-    assert caught.value.row == 2
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -143,15 +134,6 @@ def test_rates_that_cannot_be_are_refused(
         return
     with pytest.raises(TableError, match=message):
         read_rates(path)
-
-
-def test_rates_without_n_have_no_interval(write_table: Callable[[str], Path]) -> None:
-    path = write_table("task,side,rate\na,sim,0.5\na,real,0.4\n")
-    results = compare_csv(path).results()
-    rate = results.get("rate.recorded.a.-.-")
-    assert rate.interval is None
-    assert rate.reason_without_interval == "no n"
-    assert results.get("agreement.pearson_r").reason_if_undefined == "1 group; it needs at least 3"
 
 
 def test_a_table_that_is_neither_is_refused(

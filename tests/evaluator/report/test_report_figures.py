@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from evaluator.compare import Comparison, compare_csv
-from evaluator.report.figures import DARK, LIGHT, WIDTH, Drawing, drawings_of, scatter, success
+from evaluator.report.figures import DARK, LIGHT, WIDTH, Drawing, drawings_of, scatter
 from evaluator.report.ranked import FIGURES
 from evaluator.report.sections import SECTIONS
 from evaluator.report.write import write_report
@@ -97,11 +97,6 @@ def test_nothing_is_drawn_beyond_the_edge(drawn: list[Drawing]) -> None:
                 assert 0 <= float(mark.get(name) or 0) <= most, (item.id, ET.tostring(mark))
             for name in ("y", "y1", "y2", "cy"):
                 assert 0 <= float(mark.get(name) or 0) <= item.height
-
-
-def test_there_is_no_figure_without_cells() -> None:
-    assert scatter([], "real") is None
-    assert success([], "real") is None
 
 
 def test_a_figure_that_has_lost_its_data_is_removed(tmp_path: Path, paper: Comparison) -> None:
