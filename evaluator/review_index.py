@@ -61,6 +61,8 @@ class IndexedTrial:
     began_ns: int
     distance_m: float | None
     """Largest distance of the recorded tool's path from the planned replay's, the lag taken out."""
+    lag_s: float | None = None
+    """By how much the recorded tool comes later than the planned replay's."""
     fail_cause: str = ""
     """What kind of failure it is (``FailureKind``); empty for one that failed on neither side."""
     fail_stage: str = ""
